@@ -1,0 +1,261 @@
+"""What flows between the stages: frozen dataclasses of arrays, and nothing that computes.
+
+Letters: N keyframes, M features, D descriptor length, C candidate closures, E edges, T samples in time.
+Poses are (4, 4) float64 in metres; `a_from_b` maps points in b to a, so `a_from_b @ b_from_c` chains by eye.
+6-vectors and (6, 6) matrices are rotation first (rad), then translation (m), in the frame of the body that
+moves (b of a_from_b), as GTSAM has them. Stamps are int64 nanoseconds since the epoch of the log's clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Float32s = NDArray[np.float32]
+    Ints = NDArray[np.int64]
+    Int32s = NDArray[np.int32]
+    Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera and where it sits on the body."""
+
+    name: str
+    matrix: Floats | None
+    """(3, 3) pinhole matrix in px of the full image, None where the log holds no calibration."""
+    distortion_model: str
+    """`none`, `plumb_bob` (OpenCV's 4 or 5 coefficients), `rational_polynomial` (8+) or `equidistant` (fisheye, 4)."""
+    distortion: Floats
+    """(K,) coefficients of the model, empty for `none`."""
+    width: int
+    height: int
+    body_from_camera: Floats
+    """(4, 4); the camera looks along its z, x right, y down."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One decoded image. Streamed, never kept."""
+
+    stamp_ns: int
+    camera: Camera
+    image: Bytes
+    """(H, W) uint8 grey."""
+    depth: Float32s | None = None
+    """(H, W) float32 m along the camera's z, NaN where unknown; registered to the image. None without a depth topic."""
+    right: Bytes | None = None
+    """(H, W) uint8 grey of the right camera of a stereo pair."""
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """The drive's own estimate of its motion, one row per sample, increasing stamps."""
+
+    stamp_ns: Ints
+    odom_from_body: Floats
+    """(T, 4, 4)."""
+    covariance: Floats | None
+    """(T, 6, 6) as logged, in the body frame; a row is NaN where that sample's is unusable, None where all are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gps:
+    """Satellite fixes, WGS84."""
+
+    stamp_ns: Ints
+    latitude_deg: Floats
+    longitude_deg: Floats
+    altitude_m: Floats
+    covariance: Floats
+    """(T, 3, 3) m^2, east-north-up; NaN where unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframes:
+    """The frames that become nodes."""
+
+    drive: str
+    stamp_ns: Ints
+    """(N,) strictly increasing."""
+    odom_from_body: Floats
+    """(N, 4, 4) odometry interpolated to the frame's stamp."""
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Local features of one image, strongest first."""
+
+    points: Float32s
+    """(M, 2) px, (0, 0) the centre of the top-left pixel."""
+    sizes: Float32s
+    """(M,) px, diameter of the described neighbourhood."""
+    descriptors: Bytes
+    """(M, D) uint8."""
+    depth_m: Float32s
+    """(M,) depth along the camera's z, NaN unknown."""
+    width: int
+    """Width of the image in px, the frame of `points`."""
+    height: int
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """The places of a map that are most like a query, best first."""
+
+    rows: Int32s
+    """(K,) rows of the map."""
+    score: Float32s
+    """(K,) decreasing; its scale is the recogniser's own."""
+
+
+class Verdict(StrEnum):
+    """What became of a candidate closure. A rejected loop is a value with a reason, never an exception."""
+
+    ACCEPTED = "accepted"
+    TOO_FEW_MATCHES = "too_few_matches"
+    TOO_FEW_LANDMARKS = "too_few_landmarks"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    POOR_SPREAD = "poor_spread"
+    DEGENERATE_MOTION = "degenerate_motion"
+    NO_CALIBRATION = "no_calibration"
+    IMPLAUSIBLE_POSE = "implausible_pose"
+    REJECTED_BY_SOLVER = "rejected_by_solver"
+
+    @property
+    def sentence(self) -> str:
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Verdict.ACCEPTED: "Verified by geometry and kept by the robust solve.",
+    Verdict.TOO_FEW_MATCHES: "The two images share too few feature matches to be checked.",
+    Verdict.TOO_FEW_LANDMARKS: "Too few matches have a known 3D position in the map frame.",
+    Verdict.TOO_FEW_INLIERS: "No single camera pose explains enough of the matches.",
+    Verdict.POOR_SPREAD: "The matches that agree cover too small a part of the image to fix a pose.",
+    Verdict.DEGENERATE_MOTION: "The map frames around the match moved too little or too straight for triangulation.",
+    Verdict.NO_CALIBRATION: "The images agree by epipolar geometry, but without calibration there is no metric pose.",
+    Verdict.IMPLAUSIBLE_POSE: "The pose found would put the camera further away than a shared view can be.",
+    Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Closures:
+    """The ledger: one row per candidate closure, the rejected ones too, ordered by query, then rank."""
+
+    query: Int32s
+    """(C,) keyframe row, the later one."""
+    match: Int32s
+    """(C,) keyframe row, the earlier one."""
+    rank: Int32s
+    """(C,) 0 is the query's best candidate."""
+    score: Float32s
+    """(C,) the recogniser's similarity."""
+    support: Int32s
+    """(C,) neighbours of the pair that agree by sequence; 0 where no sequence was used."""
+    matches: Int32s
+    """(C,) feature matches that passed the ratio and mutual tests."""
+    landmarks: Int32s
+    """(C,) matches with a known 3D position in the map frame."""
+    inliers: Int32s
+    """(C,) matches that agree with the pose, or with the epipolar geometry where there is no pose."""
+    spread: Float32s
+    """(C,) share of the query image that the inliers' bounding box covers, 0..1."""
+    match_from_query: Floats
+    """(C, 4, 4) body frames, NaN where no pose was found."""
+    information: Floats
+    """(C, 6, 6) of match_from_query, NaN where no pose was found."""
+    verdict: list[Verdict]
+    residual_before: Floats
+    """(C,) sigma: Mahalanobis distance of the closure to the odometry, NaN where not in the graph."""
+    residual_after: Floats
+    """(C,) sigma: the same after the solve."""
+    weight: Floats
+    """(C,) 0..1 of the robust solve, NaN where not in the graph."""
+
+    def __len__(self) -> int:
+        return len(self.query)
+
+
+class EdgeKind(StrEnum):
+    ODOMETRY = "odometry"
+    LOOP = "loop"
+    GPS = "gps"
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Nodes and what was measured between them."""
+
+    world_from_body: Floats
+    """(N, 4, 4) initial."""
+    a: Int32s
+    b: Int32s
+    a_from_b: Floats
+    """(E, 4, 4)."""
+    information: Floats
+    """(E, 6, 6), in the frame of b."""
+    kind: list[EdgeKind]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What an optimiser made of a pose graph."""
+
+    world_from_body: Floats
+    """(N, 4, 4)."""
+    weight: Floats
+    """(E,) 0..1; 1 for every edge that is not robust."""
+    error_before: float
+    """Half the chi-square of the graph at its initial poses, over the edges kept."""
+    error_after: float
+    iterations: int
+    converged: bool
+    reason: str
+    """One sentence: why it stopped, or why odometry was kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Every odometry sample, corrected."""
+
+    stamp_ns: Ints
+    world_from_body: Floats
+    """(T, 4, 4)."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a log, as found."""
+
+    name: str
+    type: str
+    encoding: str
+    count: int
+    role: str
+    """`image`, `depth`, `camera_info`, `odometry`, `gps`, `tf_static`, `tf`, or `` where vplog has no use for it."""
+    used: bool
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """What is in a log and what would be used of it: the answer of `vplog info`."""
+
+    path: str
+    kind: str
+    """`mcap`, `ros1`, `ros2-mcap`, `ros2-db3` or `images`."""
+    start_ns: int
+    end_ns: int
+    messages: int
+    topics: list[Topic]
+    warnings: list[str] = field(default_factory=list)

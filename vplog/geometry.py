@@ -1,0 +1,172 @@
+"""SE(3) on stacks of (..., 4, 4) float64 matrices. Tangent vectors are rotation first (rad), then translation (m)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+
+_SMALL_ANGLE = 1e-7
+"""rad; below it the Taylor series is exact to double precision."""
+
+
+def pose(rotation: Floats, translation: Floats) -> Floats:
+    """(..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    result = np.zeros((*shape, 4, 4))
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = translation
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def inverse(a_from_b: Floats) -> Floats:
+    """b_from_a for rigid (..., 4, 4)."""
+    rotation = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return pose(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
+
+
+def between(world_from_a: Floats, world_from_b: Floats) -> Floats:
+    """a_from_b."""
+    return inverse(world_from_a) @ world_from_b
+
+
+def transform(a_from_b: Floats, points: Floats) -> Floats:
+    """Points (..., 3) in b, moved to a."""
+    return points @ np.swapaxes(a_from_b[..., :3, :3], -1, -2) + a_from_b[..., None, :3, 3]
+
+
+def skew(v: Floats) -> Floats:
+    """(..., 3, 3) with skew(v) @ x = cross(v, x)."""
+    result = np.zeros((*v.shape[:-1], 3, 3))
+    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return result
+
+
+def so3_exp(omega: Floats) -> Floats:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3): Rodrigues' formula."""
+    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
+    k = skew(omega)
+    small = angle < _SMALL_ANGLE
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: Floats) -> Floats:
+    """Rotation vectors (..., 3), angle in 0..pi, of rotation matrices (..., 3, 3)."""
+    q = quaternion(rotation)  # through the quaternion: stable up to pi
+    norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(norm, q[..., 3:])
+    scale = np.where(norm < _SMALL_ANGLE, 2.0, angle / np.where(norm < _SMALL_ANGLE, 1.0, norm))
+    return q[..., :3] * scale
+
+
+def exp(xi: Floats) -> Floats:
+    """(..., 4, 4) of twists (..., 6): the exact exponential, as GTSAM's Pose3.Expmap."""
+    omega, v = xi[..., :3], xi[..., 3:]
+    return pose(so3_exp(omega), (_left_jacobian(omega) @ v[..., None])[..., 0])
+
+
+def log(a_from_b: Floats) -> Floats:
+    """Twists (..., 6) of poses (..., 4, 4); the inverse of exp for angles below pi."""
+    omega = so3_log(a_from_b[..., :3, :3])
+    v = np.linalg.solve(_left_jacobian(omega), a_from_b[..., :3, 3:])[..., 0]
+    return np.concatenate([omega, v], axis=-1)
+
+
+def _left_jacobian(omega: Floats) -> Floats:
+    """V of the exponential: translation = V @ v."""
+    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
+    k = skew(omega)
+    small = angle < 1e-5  # the quotient below loses digits earlier than sin(x)/x does
+    safe = np.where(small, 1.0, angle)
+    b = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    c = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) + b * k + c * (k @ k)
+
+
+def adjoint(a_from_b: Floats) -> Floats:
+    """(..., 6, 6) that moves a twist in b to a: exp(Ad xi) = T exp(xi) T^-1."""
+    rotation = a_from_b[..., :3, :3]
+    result = np.zeros((*a_from_b.shape[:-2], 6, 6))
+    result[..., :3, :3] = rotation
+    result[..., 3:, 3:] = rotation
+    result[..., 3:, :3] = skew(a_from_b[..., :3, 3]) @ rotation
+    return result
+
+
+def interpolate(a: Floats, b: Floats, share: Floats) -> Floats:
+    """The pose `share` (0..1, shape (...)) of the way along the geodesic from a to b."""
+    return a @ exp(np.asarray(share)[..., None] * log(between(a, b)))
+
+
+def interpolate_at(stamp_ns: np.ndarray, poses: Floats, at_ns: np.ndarray) -> Floats:
+    """Poses at the stamps asked for, (len(at_ns), 4, 4); `stamp_ns` increases and covers them."""
+    right = np.clip(np.searchsorted(stamp_ns, at_ns), 1, len(stamp_ns) - 1)
+    left = right - 1
+    share = (at_ns - stamp_ns[left]) / (stamp_ns[right] - stamp_ns[left])
+    result = interpolate(poses[left], poses[right], share)
+    for end in (left, right):  # no rounding where a sample is hit
+        hit = stamp_ns[end] == at_ns
+        result[hit] = poses[end[hit]]
+    return result
+
+
+def angle(rotation: Floats) -> Floats:
+    """Rotation angle in rad of (..., 3, 3) or (..., 4, 4)."""
+    return np.asarray(np.linalg.norm(so3_log(rotation[..., :3, :3]), axis=-1), np.float64)
+
+
+def quaternion(rotation: Floats) -> Floats:
+    """(..., 4) x y z w with w >= 0 of rotation matrices (..., 3, 3). Shepperd 1978: the largest component first."""
+    m = rotation
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + trace], axis=-1)
+    sum_xy, sum_xz, sum_yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    dif_x, dif_y, dif_z = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], sum_xy, sum_xz, dif_x], axis=-1),
+            np.stack([sum_xy, squares[..., 1], sum_yz, dif_y], axis=-1),
+            np.stack([sum_xz, sum_yz, squares[..., 2], dif_z], axis=-1),
+            np.stack([dif_x, dif_y, dif_z, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)[..., None, None]
+    q = np.take_along_axis(rows, np.broadcast_to(best, (*best.shape[:-2], 1, 4)), axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def rotation(q: Floats) -> Floats:
+    """(..., 3, 3) of quaternions (..., 4) x y z w, normalised here; NaN where the quaternion is zero."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def umeyama(source: Floats, target: Floats, with_scale: bool = False) -> tuple[Floats, float]:
+    """target_from_source (4, 4) and the scale that align points (T, 3) with least squares: Umeyama 1991, eq. 40-43."""
+    mean_source, mean_target = source.mean(0), target.mean(0)
+    x, y = source - mean_source, target - mean_target
+    u, d, vt = np.linalg.svd(y.T @ x / len(source))
+    s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    r = (u * s) @ vt
+    variance = (x**2).sum() / len(source)
+    scale = float((d * s).sum() / variance) if with_scale and variance > 0 else 1.0
+    return pose(r, mean_target - scale * r @ mean_source), scale

@@ -1,0 +1,103 @@
+"""Every plug-in point on one screen. A method is a frozen settings object that makes its state."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    import pyarrow as pa
+
+    from vplog.data import Bytes, Camera, Features, Frame, Gps, Ints, LogInfo, Odometry, PoseGraph, Ranking, Solution
+
+
+class EncodedFrame(Protocol):
+    """An image as the log holds it. Reading is sequential; decoding is the workers' job, and only for keyframes."""
+
+    stamp_ns: int
+
+    def decode(self) -> Frame:
+        """The grey image with its depth. Raises LogError where the bytes are not an image."""
+        ...
+
+
+@runtime_checkable
+class Log(Protocol):
+    """One recorded drive. `vplog.logs.open(path)` tells the kind by content."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found wrong so far, one sentence each; grows while reading."""
+        ...
+
+    def info(self) -> LogInfo: ...
+
+    def camera(self) -> Camera: ...
+
+    def stamps(self) -> Ints:
+        """(F,) header stamps of the chosen camera's frames in ns, increasing, without decoding one."""
+        ...
+
+    def frames(self, stamp_ns: Ints) -> Iterator[EncodedFrame]:
+        """The frames with these stamps, in order of time."""
+        ...
+
+    def odometry(self) -> Odometry | None: ...
+
+    def gps(self) -> Gps | None: ...
+
+
+class Extractor(Protocol):
+    def __call__(self, image: Bytes, depth_m: object | None = None) -> Features: ...
+
+
+class PlaceIndex(Protocol):
+    """A map of places, rebuilt from descriptors alone."""
+
+    def query(self, descriptor: object, k: int, stop: int | None = None) -> Ranking:
+        """The k best rows below `stop` (all rows where None). Rows that share nothing are left out."""
+        ...
+
+
+class PlaceState(Protocol):
+    """A recogniser that has learned its library or vocabulary. Safe to share between threads."""
+
+    @property
+    def arrow_type(self) -> pa.DataType:
+        """How one place is stored in a table."""
+        ...
+
+    @property
+    def hash(self) -> str:
+        """sha256 over all that descriptors depend on; descriptors of different hashes do not compare."""
+        ...
+
+    @property
+    def bits(self) -> int:
+        """Size of one place descriptor, in bits."""
+        ...
+
+    def describe(self, features: Features) -> object: ...
+
+    def to_arrow(self, descriptors: Sequence[object]) -> pa.Array: ...
+
+    def from_arrow(self, column: pa.Array) -> Sequence[object]: ...
+
+    def index(self, descriptors: Sequence[object]) -> PlaceIndex: ...
+
+    def save(self, folder: Path) -> None: ...
+
+
+class Recogniser(Protocol):
+    def learn(self, references: Iterable[tuple[Bytes, Features]], threads: int) -> PlaceState: ...
+
+    def load(self, folder: Path, threads: int) -> PlaceState: ...
+
+
+class Optimiser(Protocol):
+    def __call__(self, graph: PoseGraph) -> Solution: ...
