@@ -1,0 +1,24 @@
+"""In: MCAP, ROS 1 and ROS 2 bags and folders of images become one kind of Log. `open(path)` is the way in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vplog.logs.select import TopicChoice
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.stages import Log
+
+__all__ = ["TopicChoice", "open"]
+
+
+def open(path: Path, topics: TopicChoice | None = None) -> Log:
+    """The drive at `path`, its kind told by content, its topics chosen by the rules of `select.py` or by name.
+
+    Raises LogError where there is no log, or where a topic asked for is not in it.
+    """
+    from vplog.logs.detect import open_log  # OpenCV, rosbags and mcap load here, not with the package
+
+    return open_log(path, topics or TopicChoice())

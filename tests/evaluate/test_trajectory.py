@@ -1,0 +1,185 @@
+"""ATE and RPE against evo, on random and on real trajectories."""
+
+from __future__ import annotations
+
+import copy
+import json
+import zipfile
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from evo.core import metrics, sync
+from evo.core.trajectory import PoseTrajectory3D
+from evo.core.units import Unit
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from vplog import geometry
+from vplog.data import Trajectory
+from vplog.errors import TruthError
+from vplog.evaluate.trajectory import associate, ate, rpe
+from vplog.evaluate.truth import read_truth
+
+from .data import data
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+
+NOW_NS = 1_305_031_102_175_304_031
+
+
+def walk(seed: int, count: int, period_ns: int = 100_000_000, start_ns: int = NOW_NS, noise: float = 0.0) -> Trajectory:
+    """A smooth path in space with jittered stamps, each pose off by `noise` rad and m."""
+    rng = np.random.default_rng(seed)
+    steps = geometry.exp(np.tile([0.01, 0.02, 0.05, 0.8, 0.1, 0.05], (count, 1)) * rng.normal(1.0, 0.3, (count, 6)))
+    poses = np.empty((count, 4, 4))
+    poses[0] = np.eye(4)
+    for row in range(1, count):
+        poses[row] = poses[row - 1] @ steps[row]
+    jitter = rng.integers(-period_ns // 5, period_ns // 5, count)
+    stamps = start_ns + period_ns * np.arange(count) + jitter
+    return Trajectory(stamps, poses @ geometry.exp(noise * rng.normal(size=(count, 6))))
+
+
+def moved(trajectory: Trajectory, a_from_world: Floats) -> Trajectory:
+    return Trajectory(trajectory.stamp_ns, a_from_world @ trajectory.world_from_body)
+
+
+def in_evo(trajectory: Trajectory) -> PoseTrajectory3D:
+    stamps = np.array([stamp / 10**9 for stamp in trajectory.stamp_ns.tolist()])
+    return PoseTrajectory3D(poses_se3=list(trajectory.world_from_body), timestamps=stamps)
+
+
+def evo_ate(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
+    reference, aligned = sync.associate_trajectories(in_evo(truth), in_evo(estimate))
+    aligned = copy.deepcopy(aligned)
+    aligned.align(reference)
+    metric = metrics.APE(metrics.PoseRelation.translation_part)
+    metric.process_data((reference, aligned))
+    return {**metric.get_all_statistics(), "count": reference.num_poses}
+
+
+def evo_rpe(estimate: Trajectory, truth: Trajectory, relation: Any, delta_m: float | None) -> dict[str, Any]:
+    unit, delta = (Unit.frames, 1) if delta_m is None else (Unit.meters, delta_m)
+    metric = metrics.RPE(relation, delta=delta, delta_unit=unit)
+    metric.process_data(sync.associate_trajectories(in_evo(truth), in_evo(estimate)))
+    return {**metric.get_all_statistics(), "count": len(metric.error)}
+
+
+def assert_agrees_with_evo(estimate: Trajectory, truth: Trajectory) -> None:
+    ours, theirs = ate(estimate, truth), evo_ate(estimate, truth)
+    assert ours.count == theirs["count"]
+    for name in ("rmse", "mean", "median", "max"):
+        assert getattr(ours, f"{name}_m") == pytest.approx(theirs[name], abs=1e-7), name
+    for delta_m in (None, 0.5, 3.0):
+        steps = rpe(estimate, truth, delta_m)
+        for relation, part, unit in (
+            (metrics.PoseRelation.translation_part, "translation", "m"),
+            (metrics.PoseRelation.rotation_angle_deg, "rotation", "deg"),
+        ):
+            theirs = evo_rpe(estimate, truth, relation, delta_m)
+            assert steps.count == theirs["count"]
+            for name in ("rmse", "mean", "max"):
+                # evo's angle of nearly equal rotations comes from a trace and keeps half the digits
+                assert getattr(steps, f"{part}_{name}_{unit}") == pytest.approx(theirs[name], abs=2e-6), (part, name)
+
+
+@pytest.mark.parametrize(("estimated", "true"), [(80, 80), (80, 300), (300, 80)])
+def test_random_walks_agree_with_evo(estimated: int, true: int) -> None:
+    shortest = min(estimated, true)
+    truth = walk(1, true, 100_000_000 * shortest // true)
+    estimate = moved(walk(1, estimated, 100_000_000 * shortest // estimated, noise=0.1), geometry.exp(np.full(6, 0.7)))
+    assert_agrees_with_evo(estimate, truth)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "truth"),
+    [
+        ("freiburg1_xyz-rgbdslam", "freiburg1_xyz-groundtruth"),
+        ("freiburg1_xyz-rgbdslam_drift", "freiburg1_xyz-groundtruth"),
+        ("fr2_desk_ORB", "fr2_desk_groundtruth"),
+        ("fr2_desk_ORB_kf_mono", "fr2_desk_groundtruth"),
+    ],
+)
+def test_real_trajectories_agree_with_evo(estimate: str, truth: str) -> None:
+    folder = "trajectories/evo"
+    assert_agrees_with_evo(read_truth(data(f"{folder}/{estimate}.txt")), read_truth(data(f"{folder}/{truth}.txt")))
+
+
+@pytest.mark.parametrize(("method", "file"), [("orb", "KITTI_00_ORB"), ("sptam", "KITTI_00_SPTAM")])
+def test_kitti_agrees_with_the_published_results(method: str, file: str) -> None:
+    folder = "trajectories/evo"
+    stamps = np.loadtxt(data(f"{folder}/KITTI_00_gt_times.txt"))
+    trajectories = []
+    for name in (file, "KITTI_00_gt"):
+        poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+        poses[:, :3] = np.loadtxt(data(f"{folder}/{name}.txt")).reshape(-1, 3, 4)
+        trajectories.append(Trajectory(np.round(stamps * 1e9).astype(np.int64), poses))
+    with zipfile.ZipFile(data(f"{folder}/res_files/{method}_ape.zip")) as archive:
+        published = json.loads(archive.read("stats.json"))
+    ours = ate(*trajectories)
+    for name in ("rmse", "mean", "median", "max"):
+        assert getattr(ours, f"{name}_m") == pytest.approx(published[name], abs=1e-6)
+
+
+@given(
+    st.lists(st.integers(0, 400), min_size=1, max_size=20, unique=True),
+    st.lists(st.integers(0, 400), min_size=1, max_size=20, unique=True),
+)
+def test_association_is_evos(estimate_ms: list[int], truth_ms: list[int]) -> None:
+    """Ties at the very limit of 10 ms included: stamps are whole milliseconds, compared as floats."""
+    trajectories = []
+    for stamps_ms in (estimate_ms, truth_ms):
+        stamp_ns = NOW_NS + 1_000_000 * np.sort(np.array(stamps_ms))
+        trajectories.append(Trajectory(stamp_ns, np.tile(np.eye(4), (len(stamp_ns), 1, 1))))
+    estimate, truth = trajectories
+    seconds = [in_evo(trajectory).timestamps for trajectory in (estimate, truth)]
+    if len(estimate_ms) > len(truth_ms):
+        there, here = sync.matching_time_indices(seconds[1], seconds[0])
+    else:
+        here, there = sync.matching_time_indices(seconds[0], seconds[1])
+    if not here:
+        with pytest.raises(TruthError):
+            associate(estimate, truth)
+        return
+    found = associate(estimate, truth)
+    assert (found[0].tolist(), found[1].tolist()) == (here, there)
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.floats(-3, 3), min_size=6, max_size=6))
+def test_a_rigid_motion_of_the_estimate_changes_nothing(seed: int, xi: list[float]) -> None:
+    truth, estimate = walk(seed, 12), walk(seed, 12, noise=0.05)
+    assume(len(associate(estimate, truth)[0]) == 12)
+    before, after = ate(estimate, truth), ate(moved(estimate, geometry.exp(np.array(xi))), truth)
+    assert after.rmse_m == pytest.approx(before.rmse_m, abs=1e-9)
+    assert ate(moved(truth, geometry.exp(np.array(xi))), truth).max_m == pytest.approx(0, abs=1e-9)
+
+
+def test_a_straight_drive_is_scored() -> None:
+    """The rotation about the line is free there, the distance is not."""
+    truth = walk(0, 20)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = np.arange(20)
+    longer = poses.copy()
+    longer[:, 0, 3] *= 1.1
+    found = ate(Trajectory(truth.stamp_ns, longer), Trajectory(truth.stamp_ns, poses))
+    assert found.rmse_m == pytest.approx(0.1 * np.std(np.arange(20)))
+
+
+def test_too_little_to_compare_is_one_line() -> None:
+    truth = walk(0, 20)
+    nothing = Trajectory(truth.stamp_ns[:0], truth.world_from_body[:0])
+    two = Trajectory(truth.stamp_ns[:2], truth.world_from_body[:2])
+    later = Trajectory(truth.stamp_ns + 10**12, truth.world_from_body)
+    broken = Trajectory(truth.stamp_ns, np.where(np.arange(20)[:, None, None] == 7, np.nan, truth.world_from_body))
+    for estimate, says in ((nothing, "no pose"), (two, "needs 3"), (later, "within 0.01 s"), (broken, "not finite")):
+        with pytest.raises(TruthError, match=says) as caught:
+            ate(estimate, truth)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_drive_shorter_than_the_step_has_no_rpe() -> None:
+    truth = walk(0, 20)
+    found = rpe(truth, truth, delta_m=1000.0)
+    assert (found.delta, found.count, found.translation_rmse_m, found.rotation_max_deg) == ("1000 m", 0, None, None)

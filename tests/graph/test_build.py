@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vplog import geometry
+from vplog.data import EdgeKind, Verdict
+from vplog.errors import GraphError
+from vplog.graph.build import build_graph, checked
+from vplog.graph.gnc import GncSettings
+
+from .drive import ledger, ring, with_entry, without_loops
+
+DRIVE = ring(30, 3)
+N = 30
+
+
+def test_only_accepted_rows_become_loops_in_order() -> None:
+    query, match = np.array([10, 12, 20, 25]), np.array([1, 2, 3, 4])
+    rows = ledger(query, match, geometry.between(DRIVE.true[match], DRIVE.true[query]))
+    verdict = [Verdict.ACCEPTED, Verdict.TOO_FEW_INLIERS, Verdict.ACCEPTED, Verdict.POOR_SPREAD]
+    # what was rejected has no pose
+    rows = replace(rows, verdict=verdict, match_from_query=with_entry(rows.match_from_query, (1,), np.nan))
+    covariance = np.eye(6) * np.arange(1, N)[:, None, None]
+    graph, ledger_rows, warnings = build_graph(DRIVE.keyframes, covariance, rows)
+    assert ledger_rows.tolist() == [0, 2]
+    assert graph.kind == [EdgeKind.ODOMETRY] * (N - 1) + [EdgeKind.LOOP] * 2
+    assert graph.a[-2:].tolist() == [1, 3]
+    assert graph.b[-2:].tolist() == [10, 20]
+    np.testing.assert_allclose(graph.information[4], np.eye(6) / 5)
+    assert warnings == []
+
+
+def test_no_ledger_gives_odometry_alone() -> None:
+    graph, rows, _ = build_graph(DRIVE.keyframes, np.eye(6) + np.zeros((N - 1, 1, 1)), None)
+    assert (len(graph.a), len(rows)) == (N - 1, 0)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -2.5])
+def test_bad_information_is_named_with_its_value(value: float) -> None:
+    graph = replace(DRIVE.graph, information=with_entry(DRIVE.graph.information, (30, 2, 2), value))
+    for act in (checked, GncSettings()):
+        with pytest.raises(GraphError, match=rf"edge 30 .*{value:.6g}"):
+            act(graph)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 2.0])
+def test_bad_poses_are_refused(value: float) -> None:
+    with pytest.raises(GraphError, match="Edge 3 "):
+        checked(replace(DRIVE.graph, a_from_b=with_entry(DRIVE.graph.a_from_b, (3, 0, 0), value)))
+    with pytest.raises(GraphError, match="Pose 3 "):
+        checked(replace(DRIVE.graph, world_from_body=with_entry(DRIVE.graph.world_from_body, (3, 0, 0), value)))
+
+
+@pytest.mark.parametrize(("a", "b"), [(5, 5), (9, 4), (-1, 4), (3, N)])
+def test_closures_must_join_an_earlier_to_a_later_keyframe(a: int, b: int) -> None:
+    with pytest.raises(GraphError, match=f"Closure 0 joins keyframes {a} and {b}"):
+        build_graph(
+            DRIVE.keyframes, np.eye(6) + np.zeros((N - 1, 1, 1)), ledger(np.array([b]), np.array([a]), np.eye(4)[None])
+        )
+
+
+def test_an_index_out_of_range_and_a_cut_graph_are_refused() -> None:
+    alone = without_loops(DRIVE.graph)
+    with pytest.raises(GraphError, match=r"poses 0\.\.29"):
+        checked(replace(alone, b=with_entry(alone.b, (7,), 99)))
+    with pytest.raises(GraphError, match=r"from pose 0 to pose 8 \(22 of 30"):
+        checked(replace(alone, a=with_entry(alone.a, (7,), 9), b=with_entry(alone.b, (7,), 10)))
+
+
+def test_indefinite_information_is_repaired_with_a_warning() -> None:
+    information = DRIVE.graph.information.copy()
+    information[4, 0, 1] = information[4, 1, 0] = 2.0 * information[4, 0, 0]
+    graph, warnings = checked(replace(DRIVE.graph, information=information))
+    assert np.linalg.eigvalsh(graph.information[4])[0] > 0
+    assert len(warnings) == 1
+    assert "edge 4" in warnings[0]
+    again, none = checked(graph)
+    assert none == []
+    np.testing.assert_allclose(again.information, graph.information)
+    assert np.isfinite(GncSettings()(graph).world_from_body).all()
+
+
+def test_a_graph_without_poses_is_refused() -> None:
+    with pytest.raises(GraphError, match="1 keyframes"):
+        build_graph(replace(DRIVE.keyframes, stamp_ns=DRIVE.keyframes.stamp_ns[:1]), np.zeros((0, 6, 6)), None)

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy import stats
+
+from vplog import geometry
+from vplog.data import EdgeKind
+from vplog.graph.consistency import chi2_quantile, keep_odometry_if_worse, residual_before, residual_sigma
+from vplog.graph.factors import edge_factors
+from vplog.graph.solve import GncSettings, LmSettings
+
+from .drive import ring, without_loops
+
+
+def test_chi2_agrees_with_gtsam() -> None:
+    drive = ring(40, 10)
+    random = np.random.default_rng(3)
+    root = random.normal(size=(len(drive.graph.a), 6, 6))
+    graph = replace(drive.graph, information=root @ np.swapaxes(root, 1, 2) + np.eye(6))
+    poses = drive.true @ geometry.exp(random.normal(size=(40, 6)) * 0.5)
+    values = gtsam.Values()
+    for node, pose in enumerate(poses):
+        values.insert(node, gtsam.Pose3(pose))
+    expected = [2.0 * factor.error(values) for factor in edge_factors(graph)]
+    np.testing.assert_allclose(residual_sigma(graph, poses) ** 2, expected, rtol=1e-8)
+
+
+def test_information_is_in_the_frame_of_b_rotation_first() -> None:
+    graph = ring(10, 1, noise=0.0).graph
+    information = np.array(graph.information)
+    information[-1] = np.diag([1.0, 4.0, 9.0, 16.0, 25.0, 36.0])
+    graph = replace(graph, information=information)
+    for axis in range(6):
+        poses = np.array(graph.world_from_body)
+        poses[graph.b[-1]] = poses[graph.b[-1]] @ geometry.exp(1e-3 * np.eye(6)[axis])
+        assert residual_sigma(graph, poses)[-1] == pytest.approx(1e-3 * (axis + 1), rel=1e-5)
+
+
+def test_distance_to_the_odometry_agrees_with_a_walk_along_the_chain() -> None:
+    graph = ring(50, 8, false=3).graph
+    result = residual_before(graph)
+    assert (result[:49] == 0).all()
+    for edge in range(49, len(graph.a)):
+        a, b = int(graph.a[edge]), int(graph.b[edge])
+        covariance = np.zeros((6, 6))
+        for k in range(a, b):
+            moved = geometry.adjoint(geometry.inverse(graph.a_from_b[k]))
+            covariance = moved @ covariance @ moved.T + np.linalg.inv(graph.information[k])
+        covariance += np.linalg.inv(graph.information[edge])
+        odometry = geometry.between(graph.world_from_body[a], graph.world_from_body[b])
+        error = geometry.log(geometry.between(graph.a_from_b[edge], odometry))
+        assert result[edge] == pytest.approx(np.sqrt(error @ np.linalg.solve(covariance, error)), rel=1e-6)
+
+
+def test_distance_to_the_odometry_is_chi_square() -> None:
+    chi2 = np.concatenate([residual_before(ring(60, 1, seed=seed).graph)[-1:] ** 2 for seed in range(150)])
+    assert stats.kstest(chi2, stats.chi2(6).cdf).pvalue > 1e-3
+
+
+def test_distance_does_not_depend_on_where_the_odometry_starts() -> None:
+    graph = ring(50, 8).graph
+    far = geometry.pose(geometry.so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5e5, 5e6, 0.0]))
+    moved = residual_before(replace(graph, world_from_body=far @ graph.world_from_body))
+    np.testing.assert_allclose(moved, residual_before(graph), rtol=1e-4)
+
+
+def test_distance_is_unknown_across_a_gap() -> None:
+    graph = ring(50, 8).graph
+    kind = list(graph.kind)
+    kind[20] = EdgeKind.LOOP
+    result = residual_before(replace(graph, kind=kind))
+    across = (graph.a <= 20) & (graph.b > 20)
+    np.testing.assert_array_equal(np.isnan(result), across)
+
+
+def test_odometry_is_kept_where_false_closures_bend_it() -> None:
+    drive = ring(loops=2, false=20)
+    solution = keep_odometry_if_worse(drive.graph, LmSettings()(drive.graph))
+    np.testing.assert_allclose(solution.world_from_body, drive.keyframes.odom_from_body, atol=1e-9)
+    assert solution.reason.startswith("Odometry was kept")
+    assert solution.weight.sum() == len(drive.true) - 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sound_solution_is_left_alone(seed: int) -> None:
+    for graph in (ring(seed=seed).graph, ring(false=10, seed=seed).graph, without_loops(ring(seed=seed).graph)):
+        solution = GncSettings()(graph)
+        assert keep_odometry_if_worse(graph, solution) is solution
+
+
+@pytest.mark.parametrize("dof", [6, 60, 6000])
+@pytest.mark.parametrize("probability", [0.9, 0.99, 0.9999, 0.999999])
+def test_quantiles_agree_with_scipy(dof: int, probability: float) -> None:
+    assert chi2_quantile(probability, dof) == pytest.approx(stats.chi2(dof).ppf(probability), rel=1e-8)

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+from vplog.data import EdgeKind, PoseGraph, Solution
+from vplog.graph.consistency import chi2_quantile
+from vplog.graph.factors import as_array, edge_factors, factor_graph
+from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings
+
+from .drive import position_error, ring, without_loops
+
+METHODS = [GncSettings(), LmSettings()]
+
+
+def loops(graph: PoseGraph) -> np.ndarray:
+    return np.array([kind == EdgeKind.LOOP for kind in graph.kind])
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.kind)
+def test_a_closed_loop_closes(method: GncSettings | LmSettings) -> None:
+    drive = ring()
+    solution = method(drive.graph)
+    before, after = (position_error(x, drive.true) for x in (drive.keyframes.odom_from_body, solution.world_from_body))
+    assert after < 0.4 * before
+    assert solution.converged
+    assert solution.error_after < 0.01 * solution.error_before
+    assert (solution.weight == 1).all()
+    np.testing.assert_array_equal(solution.world_from_body[0], drive.graph.world_from_body[0])
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.kind)
+def test_without_loops_odometry_comes_back(method: GncSettings | LmSettings) -> None:
+    drive = ring()
+    solution = method(without_loops(drive.graph))
+    np.testing.assert_allclose(solution.world_from_body, drive.keyframes.odom_from_body, atol=1e-9)
+    assert solution.converged
+
+
+@pytest.mark.parametrize("false", [2, 5, 9, 20])  # 9 to 50 % of the closures
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("gate", [0.999999, 1 - 1e-15], ids=["gate", "no gate"])
+def test_false_closures_lose_their_weight_and_true_ones_keep_it(false: int, seed: int, gate: float) -> None:
+    drive = ring(loops=20, false=false, seed=seed)
+    # beyond the 0.99 of the default, so that all true ones are to be kept
+    solution = GncSettings(inlier_probability=0.99999, gate_probability=gate)(drive.graph)
+    np.testing.assert_array_equal(solution.weight[loops(drive.graph)], ~drive.false[loops(drive.graph)])
+    assert position_error(solution.world_from_body, drive.true) < 0.5 * position_error(
+        drive.keyframes.odom_from_body, drive.true
+    )
+
+
+def test_gnc_agrees_with_gtsam() -> None:
+    """GTSAM's GncLMOptimizer, odometry and gauge known, keeps the same closures and ends at the same poses."""
+    drive = ring(80, loops=12, false=6, seed=5)
+    graph, n = drive.graph, 80
+    factors = factor_graph(graph, edge_factors(graph), np.ones(len(graph.a)), graph.world_from_body[0])
+    values = gtsam.Values()
+    for node, pose in enumerate(graph.world_from_body):
+        values.insert(node, gtsam.Pose3(pose))
+    settings = gtsam.GncLMParams()
+    settings.setKnownInliers(list(range(n)))  # the gauge comes first, then the odometry
+    settings.setLossType(gtsam.GncLossType.TLS)
+    optimiser = gtsam.GncLMOptimizer(factors, values, settings)
+    optimiser.setInlierCostThresholdsAtProbability(0.99)
+    expected = as_array(optimiser.optimize(), n)
+    solution = GncSettings()(graph)
+    np.testing.assert_array_equal(solution.weight, optimiser.getWeights()[1:] > 0.5)
+    np.testing.assert_allclose(solution.world_from_body, expected, atol=1e-3)
+    assert chi2_quantile(0.99, 6) == pytest.approx(2 * optimiser.getInlierCostThresholds()[-1])
+
+
+def test_the_same_graph_gives_the_same_bytes() -> None:
+    code = (
+        "import hashlib; from tests.graph.drive import ring; from vplog.graph.solve import GncSettings;"
+        "s = GncSettings()(ring(false=9).graph);"
+        "print(hashlib.sha256(s.world_from_body.tobytes() + s.weight.tobytes()).hexdigest())"
+    )
+    root = Path(__file__).parents[2]
+    outputs = {
+        subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    }
+    solution = GncSettings()(ring(false=9).graph)
+    again = GncSettings()(ring(false=9).graph)
+    assert solution.world_from_body.tobytes() == again.world_from_body.tobytes()
+    assert len(outputs) == 1
+
+
+def test_a_bad_start_is_repaired_by_the_chordal_solution() -> None:
+    drive = ring(noise=0.0)
+    random = np.random.default_rng(0)
+    lost = drive.graph.world_from_body.copy()
+    lost[1:] = lost[random.permutation(np.arange(1, len(lost)))]
+    solution = LmSettings()(replace(drive.graph, world_from_body=lost))
+    assert position_error(solution.world_from_body, drive.true) < 1e-6
+
+
+def test_a_loop_may_be_written_either_way_round() -> None:
+    drive = ring(false=5)
+    swapped = replace(
+        drive.graph,
+        a=drive.graph.b,
+        b=drive.graph.a,
+        a_from_b=np.linalg.inv(drive.graph.a_from_b),
+    )
+    # only the loops: odometry goes forward
+    keep = loops(drive.graph)
+    mixed = replace(
+        drive.graph,
+        a=np.where(keep, swapped.a, drive.graph.a),
+        b=np.where(keep, swapped.b, drive.graph.b),
+        a_from_b=np.where(keep[:, None, None], swapped.a_from_b, drive.graph.a_from_b),
+    )
+    solution = GncSettings()(mixed)
+    assert solution.weight[drive.false].sum() == 0
+    assert position_error(solution.world_from_body, drive.true) < 1.0
+
+
+def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+    for method in METHODS:
+        method(ring(60, 10, 5).graph)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_methods_are_chosen_by_their_kind() -> None:
+    adapter = TypeAdapter(OptimiserSettings)
+    for method in METHODS:
+        assert adapter.validate_python({"kind": method.kind}) == method
+        assert isinstance(method(ring(20, 2).graph), Solution)

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vplog.logs.images import depth_m, grey, image_size, is_depth
+from vplog.logs.messages import BadMessageError, ImageMessage
+
+RNG = np.random.default_rng(1)
+
+
+def raw(encoding: str, pixels: np.ndarray, padding: int = 0, big_endian: bool = False) -> ImageMessage:
+    """The message of native (H, W[, C]) pixels with `padding` bytes behind each row."""
+    height, width = pixels.shape[:2]
+    data = pixels.astype(pixels.dtype.newbyteorder(">" if big_endian else "<")).tobytes()
+    row = len(data) // height
+    rows = [data[i * row : (i + 1) * row] + b"\xee" * padding for i in range(height)]
+    return ImageMessage(0, "", encoding, b"".join(rows), False, width, height, row + padding, big_endian)
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize(
+    ("encoding", "order"), [("rgb8", "RGB"), ("bgr8", "BGR"), ("rgba8", "RGBA"), ("bgra8", "BGRA"), ("8UC3", "BGR")]
+)
+def test_colours_become_the_same_grey(encoding: str, order: str, padding: int) -> None:
+    colour = {c: RNG.integers(0, 256, (7, 9)).astype(np.uint8) for c in "RGBA"}
+    expected = 0.299 * colour["R"] + 0.587 * colour["G"] + 0.114 * colour["B"]  # ITU-R BT.601
+    image = grey(raw(encoding, np.stack([colour[c] for c in order], axis=-1), padding))
+    assert image.dtype == np.uint8
+    np.testing.assert_allclose(image, expected, atol=0.51)
+
+
+@pytest.mark.parametrize("padding", [0, 3])
+def test_mono_rows_with_padding(padding: int) -> None:
+    pixels = RNG.integers(0, 256, (6, 5)).astype(np.uint8)
+    np.testing.assert_array_equal(grey(raw("mono8", pixels, padding)), pixels)
+    last_row_bare = raw("mono8", pixels, padding)
+    bare = ImageMessage(
+        0, "", "mono8", last_row_bare.data[: len(last_row_bare.data) - padding], False, 5, 6, 5 + padding
+    )
+    np.testing.assert_array_equal(grey(bare), pixels)
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_sixteen_bits_in_both_byte_orders(big_endian: bool) -> None:
+    pixels = RNG.integers(1, 65535, (6, 5)).astype(np.uint16)
+    np.testing.assert_array_equal(grey(raw("mono16", pixels, 2, big_endian)), pixels // 256)
+    np.testing.assert_allclose(depth_m(raw("16UC1", pixels, 2, big_endian)), pixels / 1000.0, rtol=1e-6)
+    metres = RNG.uniform(0.1, 9, (6, 5)).astype(np.float32)
+    metres[0, :4] = np.nan, np.inf, 0.0, -1.0
+    depth = depth_m(raw("32FC1", metres, 4, big_endian))
+    assert np.isnan(depth[0, :4]).all()
+    np.testing.assert_array_equal(depth[1:], metres[1:])
+
+
+def test_depth_in_png() -> None:
+    pixels = RNG.integers(1, 65535, (6, 5)).astype(np.uint16)
+    pixels[0, 0], pixels[0, 1] = 0, 65535
+    file = cv2.imencode(".png", pixels)[1].tobytes()
+    for header, encoding in (
+        (bytes(12), "16UC1; compressedDepth png"),
+        (b"", "16UC1; png compressed"),
+        (bytes(12), "png"),
+    ):
+        depth = depth_m(ImageMessage(0, "", encoding, header + file, True))
+        assert np.isnan(depth[0, :2]).all()
+        np.testing.assert_allclose(depth[1:], pixels[1:] / 1000.0, rtol=1e-6)
+    assert is_depth(ImageMessage(0, "", "16UC1; compressedDepth png", file, True))
+    assert not is_depth(ImageMessage(0, "", "bgr8; jpeg compressed bgr8", file, True))
+
+
+def test_quantised_inverse_depth() -> None:
+    """As the transport's encoder: raw = a / depth + b with a = q (q + 1), b = 1 - a / max."""
+    metres = RNG.uniform(0.5, 9, (6, 5)).astype(np.float32)
+    q, farthest = 100.0, 10.0
+    a = q * (q + 1)
+    b = 1 - a / farthest
+    file = cv2.imencode(".png", np.round(a / metres + b).astype(np.uint16))[1].tobytes()
+    message = ImageMessage(0, "", "32FC1; compressedDepth png", struct.pack("<iff", 1, a, b) + file, True)
+    np.testing.assert_allclose(depth_m(message), metres, rtol=0.01)
+
+
+@pytest.mark.parametrize("kind", [".jpg", ".png", ".webp", ".bmp", ".pgm", ".ppm"])
+def test_files_decode_and_say_their_size(kind: str) -> None:
+    pixels = np.tile(np.arange(0, 250, 5, dtype=np.uint8), (30, 1))
+    colour = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if kind == ".ppm" else pixels
+    data = cv2.imencode(kind, colour)[1].tobytes()
+    assert image_size(data) == (50, 30)
+    assert np.abs(grey(ImageMessage(0, "", kind, data, True)).astype(int) - pixels).max() < 12
+
+
+def test_size_that_the_data_do_not_justify_is_refused_before_it_is_allocated() -> None:
+    with pytest.raises(BadMessageError, match="do not hold"):
+        grey(ImageMessage(0, "", "mono8", bytes(100), False, 2**31, 2**31, 2**31))
+    with pytest.raises(BadMessageError, match="do not hold"):
+        grey(ImageMessage(0, "", "rgb8", bytes(100), False, 10, 10, 10))
+    with pytest.raises(BadMessageError, match="do not hold"):
+        grey(ImageMessage(0, "", "mono8", b"", False, 0, 0, 0))
+    head = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+    with pytest.raises(BadMessageError, match="100000 x 100000"):
+        grey(ImageMessage(0, "", "png", bomb, True))
+
+
+@given(
+    st.binary(max_size=60),
+    st.sampled_from([b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"RIFF0000WEBPVP8 ", b"BM", b"P5 "]),
+)
+def test_damaged_bytes_are_a_known_error(data: bytes, head: bytes) -> None:
+    for read in (grey, depth_m):
+        with pytest.raises(BadMessageError):
+            read(ImageMessage(0, "", "16UC1; compressedDepth png", head + data, True))

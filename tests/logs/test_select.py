@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import pytest
+
+from vplog.errors import LogError
+from vplog.logs import TopicChoice
+from vplog.logs.containers import Channel
+from vplog.logs.select import Candidate, Selection, select
+
+INFO, IMAGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image"
+
+
+def topic(
+    name: str, role: str = "image", count: int = 10, kind: str = IMAGE, frame: str = "", set_: bool = False
+) -> Candidate:
+    return Candidate(Channel(name, kind, "cdr"), count, role, frame, set_)
+
+
+def info(name: str, frame: str = "", calibrated: bool = True) -> Candidate:
+    return topic(name, "camera_info", 10, INFO, frame, calibrated)
+
+
+def names(chosen: Selection) -> dict[str, str | None]:
+    parts = ("image", "depth", "camera_info", "odometry", "gps")
+    return {part: channel.topic if (channel := getattr(chosen, part)) else None for part in parts}
+
+
+def pick(*found: Candidate, **choice: str) -> dict[str, str | None]:
+    forward = select(list(found), TopicChoice(**choice), "run.mcap")
+    assert select(list(reversed(found)), TopicChoice(**choice), "run.mcap") == forward  # the order of a file has no say
+    return names(forward)
+
+
+def test_image_calibrated_first_then_most_messages_then_name() -> None:
+    a, b, c = topic("/a/image"), topic("/b/image", count=20), topic("/c/image", count=20)
+    assert pick(a, b, c)["image"] == "/b/image"
+    assert pick(a, b, c, info("/a/camera_info"))["image"] == "/a/image"
+    assert pick(a, b, c, info("/a/camera_info", calibrated=False))["image"] == "/b/image"
+    assert pick(a, b, topic("/d/image", count=0))["image"] == "/b/image"
+
+
+def test_calibration_of_the_same_namespace_then_of_the_same_frame() -> None:
+    left = topic("/stereo/left/image_raw/compressed", frame="left")
+    both = info("/stereo/left/camera_info", "left"), info("/stereo/right/camera_info", "left")
+    assert pick(left, *both)["camera_info"] == "/stereo/left/camera_info"
+    assert pick(left, info("/calibration", "left"), info("/other", "right"))["camera_info"] == "/calibration"
+    assert pick(left, info("/stereo/right/camera_info", "right"))["camera_info"] is None
+    realsense = topic("/device_0/Color_0/image/data"), info("/device_0/Color_0/info/camera_info", "c")
+    assert pick(*realsense)["camera_info"] == "/device_0/Color_0/info/camera_info"
+
+
+def test_depth_in_the_frame_of_the_image_first() -> None:
+    image = topic("/camera/color/image", frame="color")
+    aligned = topic("/camera/aligned_depth/image", "depth", 5, frame="color")
+    assert (
+        pick(image, aligned, topic("/camera/depth/image", "depth", 50, frame="depth"))["depth"] == aligned.channel.topic
+    )
+    assert pick(aligned)["depth"] is None  # depth alone is no camera
+
+
+def test_odometry_by_type_then_count_then_name() -> None:
+    pose = topic("/a", "odometry", 99, "geometry_msgs/msg/PoseStamped")
+    with_covariance = topic("/b", "odometry", 9, "geometry_msgs/msg/PoseWithCovarianceStamped")
+    odometry = [topic(name, "odometry", 5, "nav_msgs/msg/Odometry") for name in ("/z", "/y")]
+    assert pick(pose, with_covariance, *odometry)["odometry"] == "/y"
+    assert pick(pose, with_covariance)["odometry"] == "/b"
+
+
+def test_choice_overrides_and_empty_means_none() -> None:
+    found = (topic("/a", "odometry", 5), topic("/b", "odometry", 9), topic("/c"), topic("/d", "depth"))
+    assert pick(*found)["odometry"] == "/b"
+    assert pick(*found, odometry="/a")["odometry"] == "/a"
+    assert pick(*found, odometry="", depth="")["odometry"] is None
+    assert pick(*found, image="/d")["image"] == "/d"  # 16 bits of grey look like depth; who asks gets it
+
+
+def test_wrong_names_say_what_there_is() -> None:
+    found = [topic("/right"), topic("/left"), topic("/odom", "odometry", 5, "nav_msgs/msg/Odometry")]
+    with pytest.raises(LogError) as error:
+        select(found, TopicChoice(image="/cam0"), "run.mcap")
+    assert str(error.value) == (
+        "No topic '/cam0' in run.mcap. Image topics: /left, /right. Choose one with --image-topic."
+    )
+    with pytest.raises(LogError, match=r"'/odom' in run.mcap is nav_msgs/msg/Odometry\. Image topics: /left, /right"):
+        select(found, TopicChoice(image="/odom"), "run.mcap")
+    with pytest.raises(LogError, match=r"GPS topics: none"):
+        select(found, TopicChoice(gps="/fix"), "run.mcap")

@@ -1,0 +1,82 @@
+"""A small solved run to write and read back: a circle driven once, with closures of every fate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.data import Camera, Closures, EdgeKind, Keyframes, PoseGraph, Solution, Trajectory, Verdict
+from vplog.results.tables import TableMetadata
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+
+COUNT = 30
+METADATA = TableMetadata({"solver": {"method": "gnc", "iterations": 100}, "features": {"size": 1.5}}, "0123abcd")
+
+
+@dataclass(frozen=True)
+class Run:
+    keyframes: Keyframes
+    graph: PoseGraph
+    solution: Solution
+    closures: Closures
+    trajectory: Trajectory
+    camera: Camera
+
+
+def random_poses(rng: np.random.Generator, count: int) -> Floats:
+    return geometry.exp(rng.normal(size=(count, 6)) * [1, 1, 1, 20, 20, 20])
+
+
+def make_run(seed: int = 0) -> Run:
+    rng = np.random.default_rng(seed)
+    turn = np.linspace(0.0, 2.0 * np.pi, COUNT)
+    odom = geometry.pose(
+        geometry.so3_exp(turn[:, None] * [0.0, 0.0, 1.0]),
+        10.0 * np.stack([np.sin(turn), 1.0 - np.cos(turn), 0.0 * turn], axis=1),
+    )
+    world = odom @ geometry.exp(0.03 * rng.normal(size=(COUNT, 6)))
+    keyframes = Keyframes("a drive", 1_700_000_000_123_456_789 + 100_000_000 * np.arange(COUNT), odom)
+    verdict = list(Verdict)
+    count = len(verdict)
+    query = np.sort(rng.integers(COUNT // 2, COUNT, count)).astype(np.int32)
+    match = rng.integers(0, COUNT // 2, count).astype(np.int32)
+    solved = np.array([v in (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER) for v in verdict])
+    square = rng.normal(size=(count, 6, 6))
+    known = np.where(solved, 1.0, np.nan)
+    closures = Closures(
+        query=query,
+        match=match,
+        rank=np.arange(count, dtype=np.int32),
+        score=rng.random(count, dtype=np.float32),
+        support=rng.integers(0, 9, count).astype(np.int32),
+        matches=rng.integers(0, 900, count).astype(np.int32),
+        landmarks=rng.integers(0, 900, count).astype(np.int32),
+        inliers=rng.integers(0, 900, count).astype(np.int32),
+        spread=rng.random(count, dtype=np.float32),
+        match_from_query=random_poses(rng, count) * known[:, None, None],
+        information=(square @ square.transpose(0, 2, 1) + np.eye(6)) * known[:, None, None],
+        verdict=verdict,
+        residual_before=rng.random(count) * known,
+        residual_after=rng.random(count) * known,
+        weight=rng.random(count) * known,
+    )
+    a = np.arange(COUNT - 1, dtype=np.int32)
+    edges = COUNT - 1 + int(solved.sum())
+    square = rng.normal(size=(edges, 6, 6))
+    graph = PoseGraph(
+        world_from_body=odom,
+        a=np.concatenate([a, match[solved]]),
+        b=np.concatenate([a + 1, query[solved]]).astype(np.int32),
+        a_from_b=np.concatenate([geometry.between(odom[a], odom[a + 1]), closures.match_from_query[solved]]),
+        information=square @ square.transpose(0, 2, 1) + np.eye(6),
+        kind=[EdgeKind.ODOMETRY] * (COUNT - 1) + [EdgeKind.LOOP] * int(solved.sum()),
+    )
+    camera_axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    camera = Camera("front", None, "none", np.zeros(0), 640, 480, geometry.pose(camera_axes, np.array([1.0, 0.0, 0.5])))
+    solution = Solution(world, rng.random(edges), 9.0, 1.0, 5, True, "The steps became small.")
+    return Run(keyframes, graph, solution, closures, Trajectory(keyframes.stamp_ns, world), camera)

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from vplog.results import messages
+from vplog.results.contracts import table_schemas, write_schemas
+
+SCHEMAS = Path(__file__).parents[2] / "schemas"
+
+
+def test_contracts_in_the_repository_are_those_of_the_code(tmp_path: Path) -> None:
+    for path in write_schemas(tmp_path):
+        assert (SCHEMAS / path.name).read_text() == path.read_text(), f"run `vplog schemas`: {path.name} has changed"
+
+
+def test_every_column_has_a_description_and_every_number_a_unit(tmp_path: Path) -> None:
+    write_schemas(tmp_path)
+    for name, schema in table_schemas().items():
+        columns = json.loads((tmp_path / f"{name}.json").read_text())["columns"]
+        assert [column["name"] for column in columns] == schema.names
+        for column in columns:
+            assert column["description"]
+            assert column["unit"] or column["type"] in ("string", "any"), column["name"]
+
+
+def test_proto_text_and_message_class_agree() -> None:
+    """Each field of the class is one line of the text, under the same number and type."""
+    text = messages.loop_closure_proto()
+    fields = messages.loop_closure_class().DESCRIPTOR.fields
+    assert len(fields) == text.count(" = ") - 1  # `syntax = ` is the one that is no field
+    for field in fields:
+        kind = (
+            field.message_type.full_name
+            if field.message_type
+            else {1: "double", 2: "float", 5: "int32"}.get(field.type, "string")
+        )
+        repeated = "repeated " if field.is_repeated else ""
+        assert f"\n  {repeated}{kind} {field.name} = {field.number};\n" in text

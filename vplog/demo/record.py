@@ -1,0 +1,247 @@
+"""The drive as a robot would record it: a ROS 2 MCAP file, and beside it the truth as a TUM trajectory."""
+
+from __future__ import annotations
+
+import os
+import struct
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from vplog.demo import route
+from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
+from vplog.errors import ResultError
+from vplog.geometry import quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.data import Bytes, Camera, Float32s, Floats, Ints
+    from vplog.demo.settings import DemoSettings
+
+IMAGE = "/camera/image_raw/compressed"
+CAMERA_INFO = "/camera/camera_info"
+DEPTH = "/camera/depth/image_raw/compressedDepth"
+DEPTH_INFO = "/camera/depth/camera_info"
+ODOMETRY = "/odom"
+GPS = "/gps/fix"
+TF_STATIC = "/tf_static"
+TYPES = {
+    IMAGE: "sensor_msgs/msg/CompressedImage",
+    CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
+    DEPTH: "sensor_msgs/msg/CompressedImage",
+    DEPTH_INFO: "sensor_msgs/msg/CameraInfo",
+    ODOMETRY: "nav_msgs/msg/Odometry",
+    GPS: "sensor_msgs/msg/NavSatFix",
+    TF_STATIC: "tf2_msgs/msg/TFMessage",
+}
+_DELAY_NS = (2_000_000, 30_000_000)
+"""A message is logged this long after its stamp: drivers and transport take their time."""
+_CHUNK_BYTES = 1 << 20
+"""Uncompressed size of a chunk; about ten frames."""
+_TYPES = get_typestore(Stores.ROS2_HUMBLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A recorded demo drive."""
+
+    log: Path
+    truth: Path
+    """TUM trajectory, world_from_body at every odometry sample and every frame."""
+    camera: Camera
+    stamp_ns: Ints
+    """(F,) of the frames."""
+    world_from_body: Floats
+    """(F, 4, 4) truth at the frames."""
+
+
+def record_drive(folder: Path, settings: DemoSettings, threads: int | None = None) -> Drive:
+    """Render and write the whole drive; see `vplog.demo.make_drive`."""
+    scene = make_scene(settings)
+    log, truth = folder / "drive.mcap", folder / "truth.tum"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_truth(truth, settings, scene)
+        _write_log(log, settings, scene, threads or os.cpu_count() or 1)
+    except OSError as error:
+        raise ResultError(f"Cannot write the demo drive to {folder}: {error}. Choose another folder.") from None
+    return Drive(log, truth, scene.camera, scene.stamp_ns, scene.world_from_body)
+
+
+def _write_truth(path: Path, settings: DemoSettings, scene: Scene) -> None:
+    stamp_ns = np.union1d(route.odometry_stamps(settings), scene.stamp_ns)
+    poses = route.world_from_body(settings, stamp_ns)
+    lines = ["# timestamp tx ty tz qx qy qz qw (world_from_body)"]
+    for stamp, point, turn in zip(stamp_ns.tolist(), poses[:, :3, 3], quaternion(poses[:, :3, :3]), strict=True):
+        numbers = " ".join(f"{x:.9f}" for x in (*point, *turn))
+        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _write_log(path: Path, settings: DemoSettings, scene: Scene, threads: int) -> None:
+    """All messages in the order in which they reach the recorder."""
+    with ThreadPoolExecutor(threads) as pool:
+        messages = [
+            *_mounting(scene.camera),
+            *_odometry(settings),
+            *_fixes(settings),
+            *_frames(scene, pool),
+        ]
+    rng = np.random.default_rng([settings.seed, 5])
+    delays = rng.integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
+    logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
+
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="vplog demo")
+        channels: dict[str, int] = {}
+        schemas: dict[str, int] = {}
+        sequence: dict[str, int] = {}
+        for topic in dict.fromkeys(topic for topic, _, _ in messages):
+            name = TYPES[topic]
+            if name not in schemas:
+                text, _ = _TYPES.generate_msgdef(name, ros_version=2)
+                schemas[name] = writer.register_schema(name=name, encoding="ros2msg", data=text.encode())
+            channels[topic] = writer.register_channel(topic=topic, message_encoding="cdr", schema_id=schemas[name])
+        for log_time, i in logged:
+            topic, stamp, message = messages[i]
+            sequence[topic] = sequence.get(topic, 0) + 1
+            data = bytes(_TYPES.serialize_cdr(message, TYPES[topic]))
+            writer.add_message(channels[topic], log_time, data, stamp, sequence[topic])
+        writer.finish()
+
+
+def _message(name: str, **fields: Any) -> Any:
+    return _TYPES.types[name](**fields)
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    stamp = _message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return _message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def _vector(name: str, values: Floats) -> Any:
+    return _message(f"geometry_msgs/msg/{name}", **dict(zip("xyzw", values.tolist(), strict=False)))
+
+
+def _mounting(camera: Camera) -> Iterator[tuple[str, int, Any]]:
+    transform = _message(
+        "geometry_msgs/msg/Transform",
+        translation=_vector("Vector3", camera.body_from_camera[:3, 3]),
+        rotation=_vector("Quaternion", quaternion(camera.body_from_camera[:3, :3])),
+    )
+    stamped = _message(
+        "geometry_msgs/msg/TransformStamped",
+        header=_header(route.START_NS, BODY_FRAME),
+        child_frame_id=CAMERA_FRAME,
+        transform=transform,
+    )
+    yield TF_STATIC, route.START_NS, _message("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def _odometry(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
+    """Poses with a constant covariance: what one second of driving adds, biases included; translation first."""
+    poses = route.odometry(settings, np.random.default_rng([settings.seed, 6]))
+    rate = settings.odometry_rate_hz
+    turn2 = settings.odometry_turn_noise_rad**2 * rate
+    step2 = settings.odometry_step_noise_m**2 * rate
+    along2 = (settings.odometry_scale_error * settings.speed_m_s) ** 2
+    covariance = np.diag([
+        step2 + along2, step2, step2, turn2, turn2, turn2 + settings.odometry_yaw_bias_rad_s**2,
+    ]).ravel()  # fmt: skip
+    zero = _vector("Vector3", np.zeros(3))
+    twist = _message(
+        "geometry_msgs/msg/TwistWithCovariance",
+        twist=_message("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+        covariance=np.zeros(36),
+    )
+    turns = quaternion(poses[:, :3, :3])
+    for stamp, pose, turn in zip(route.odometry_stamps(settings).tolist(), poses, turns, strict=True):
+        at = _message(
+            "geometry_msgs/msg/Pose", position=_vector("Point", pose[:3, 3]), orientation=_vector("Quaternion", turn)
+        )
+        message = _message(
+            "nav_msgs/msg/Odometry",
+            header=_header(stamp, "odom"),
+            child_frame_id=BODY_FRAME,
+            pose=_message("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=covariance),
+            twist=twist,
+        )
+        yield ODOMETRY, stamp, message
+
+
+def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
+    stamp_ns = route.stamps(settings, settings.gps_rate_hz)
+    fixes = route.gps(settings, stamp_ns, np.random.default_rng([settings.seed, 7]))
+    variance = np.diag(np.array([1.0, 1.0, 4.0]) * settings.gps_sigma_m**2).ravel()
+    for stamp, (latitude, longitude, altitude) in zip(stamp_ns.tolist(), fixes.tolist(), strict=True):
+        message = _message(
+            "sensor_msgs/msg/NavSatFix",
+            header=_header(stamp, BODY_FRAME),
+            status=_message("sensor_msgs/msg/NavSatStatus", status=0, service=1),  # a fix, by GPS
+            latitude=latitude,
+            longitude=longitude,
+            altitude=altitude,
+            position_covariance=variance,
+            position_covariance_type=2,  # COVARIANCE_TYPE_DIAGONAL_KNOWN
+        )
+        yield GPS, stamp, message
+
+
+def _frames(scene: Scene, pool: ThreadPoolExecutor) -> Iterator[tuple[str, int, Any]]:
+    """Image, calibration and, if asked for, depth of every frame."""
+    settings = scene.settings
+
+    def encoded(frame: int) -> tuple[Bytes, Bytes | None]:
+        image, depth = take_picture(scene, frame)
+        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
+        return jpeg.ravel(), _compressed_depth(depth) if settings.depth else None
+
+    # One frame first: numba compiles in one thread while the others would only wait for it.
+    first = encoded(0)
+    rest = pool.map(encoded, range(1, len(scene.stamp_ns)))
+    for stamp, (jpeg, depth) in zip(scene.stamp_ns.tolist(), (first, *rest), strict=True):
+        header = _header(stamp, CAMERA_FRAME)
+        compressed = TYPES[IMAGE]
+        yield IMAGE, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=jpeg)
+        yield CAMERA_INFO, stamp, _calibration(header, scene.camera)
+        if depth is not None:
+            yield DEPTH, stamp, _message(compressed, header=header, format="16UC1; compressedDepth png", data=depth)
+            yield DEPTH_INFO, stamp, _calibration(header, scene.camera)
+
+
+def _compressed_depth(depth: Float32s) -> Bytes:
+    """The 12 bytes of ROS's compressed_depth_image_transport (int32 format, two float32, unused), then a 16-bit PNG.
+
+    Depth is in mm; 0 is unknown: sky, or beyond what 16 bits hold.
+    """
+    mm = np.nan_to_num(depth * 1000, nan=0.0)
+    mm = np.where(mm > 65534, 0, np.round(mm)).astype(np.uint16)  # 65535 means invalid to some readers
+    _, png = cv2.imencode(".png", mm)
+    header = np.frombuffer(struct.pack("<iff", 0, 0.0, 0.0), np.uint8)
+    return np.concatenate([header, png.ravel()])
+
+
+def _calibration(header: object, camera: Camera) -> Any:
+    assert camera.matrix is not None  # noqa: S101 - the demo's camera is calibrated
+    return _message(
+        TYPES[CAMERA_INFO],
+        header=header,
+        height=camera.height,
+        width=camera.width,
+        distortion_model=camera.distortion_model,
+        d=camera.distortion,
+        k=camera.matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([camera.matrix, np.zeros((3, 1))]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=_message("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+    )

@@ -1,0 +1,154 @@
+"""Where the car is at any time, and what its odometry and satellite receiver make of that.
+
+The world is flat, x east, y north, z up, its origin the centre of the block. Distance is metres along the axis of
+the street, counter-clockwise from the middle of the southern side; lateral is metres left of that axis.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.geometry import between, exp, log, pose, so3_exp
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Ints
+    from vplog.demo.settings import DemoSettings
+
+START_NS = 1_700_000_000_000_000_000
+"""Stamp of the first odometry sample; any date serves."""
+FIRST_FRAME_NS = 12_345_678
+"""The camera's own clock phase: frames fall between odometry samples, as in a real log."""
+ORIGIN_DEG = (48.137, 11.575)
+"""Latitude and longitude of the world's origin."""
+ORIGIN_ALTITUDE_M = 520.0
+SHIFT_LENGTH_M = 10.0
+"""Distance before the end of the first lap over which the car moves to its new track and the light changes."""
+
+# WGS84: semi-major axis in m and squared eccentricity (NIMA TR8350.2, table 3.1 and 3.3).
+_SEMI_MAJOR_M = 6_378_137.0
+_ECCENTRICITY2 = 6.694_379_990_14e-3
+
+
+def lap_length(settings: DemoSettings) -> float:
+    """Metres of one round along the axis: a rectangle with rounded corners."""
+    r = settings.corner_radius_m
+    return 2 * (settings.block_length_m + settings.block_width_m) - 8 * r + 2 * np.pi * r
+
+
+def axis_point(settings: DemoSettings, distance_m: Floats) -> tuple[Floats, Floats]:
+    """Point (T, 2) and heading (T,) in rad of the axis of the street at these distances."""
+    r = settings.corner_radius_m
+    half = np.array([settings.block_length_m, settings.block_width_m]) / 2
+    long, short = 2 * (half - r)
+    turn = np.pi / 2 * r
+    # start point, heading and length of the pieces: half a side, then a turn and a side in alternation
+    lengths = np.array([long / 2, turn, short, turn, long, turn, short, turn, long / 2])
+    starts = np.array([
+        [0, -half[1]], [half[0] - r, -half[1]], [half[0], r - half[1]], [half[0], half[1] - r], [half[0] - r, half[1]],
+        [r - half[0], half[1]], [-half[0], half[1] - r], [-half[0], r - half[1]], [r - half[0], -half[1]],
+    ])  # fmt: skip
+    headings = np.array([0, 0, 1, 1, 2, 2, 3, 3, 4]) * np.pi / 2
+    ends = np.cumsum(lengths)
+
+    lap = np.floor(distance_m / ends[-1])
+    rest = distance_m - lap * ends[-1]
+    piece = np.minimum(np.searchsorted(ends, rest, side="right"), len(ends) - 1)
+    rest = rest - (ends - lengths)[piece]
+    angle = np.where(piece % 2 == 1, rest / r, 0.0)
+    ahead = np.where(piece % 2 == 1, r * np.sin(angle), rest)
+    left = np.where(piece % 2 == 1, r * (1 - np.cos(angle)), 0.0)
+    c, s = np.cos(headings[piece]), np.sin(headings[piece])
+    point = starts[piece] + np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
+    return point, headings[piece] + angle + 2 * np.pi * lap
+
+
+def second_lap_share(settings: DemoSettings, distance_m: Floats) -> Floats:
+    """0 in the first lap, 1 after it, smooth over the SHIFT_LENGTH_M before its end."""
+    x = np.clip((distance_m - lap_length(settings)) / SHIFT_LENGTH_M + 1, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def lateral(settings: DemoSettings, distance_m: Floats) -> Floats:
+    """(T,) m left of the axis: none in the first lap, then 0.4 to 1 times the offset, meandering every 31 m."""
+    meander = 0.7 + 0.3 * np.sin(2 * np.pi * distance_m / 31.0)
+    return settings.lateral_offset_m * second_lap_share(settings, distance_m) * meander
+
+
+def track_point(settings: DemoSettings, distance_m: Floats) -> Floats:
+    """(T, 2) of the car."""
+    point, heading = axis_point(settings, distance_m)
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+    return point + left * lateral(settings, distance_m)[..., None]
+
+
+def duration_s(settings: DemoSettings) -> float:
+    return settings.laps * lap_length(settings) / settings.speed_m_s
+
+
+def world_from_body(settings: DemoSettings, stamp_ns: Ints) -> Floats:
+    """(T, 4, 4) truth: along the street at constant speed, with the small sway of a car on its springs."""
+    time_s: Floats = (stamp_ns - START_NS).astype(np.float64) * 1e-9
+    distance_m = settings.speed_m_s * time_s
+    step_m = 0.05  # short against every bend, long against rounding
+    forward = track_point(settings, distance_m + step_m) - track_point(settings, distance_m - step_m)
+    zero = np.zeros_like(time_s)
+    yaw = so3_exp(np.stack([zero, zero, np.arctan2(forward[:, 1], forward[:, 0])], axis=-1))
+    # Sway: 0.4 and 0.3 degrees, 1.5 cm, at periods of the order of a second that share no multiple.
+    roll, pitch = 0.007 * np.sin(time_s * 2.9), 0.005 * np.sin(time_s * 4.3 + 1.0)
+    rotation = yaw @ so3_exp(np.stack([roll, pitch, zero], axis=-1))
+    height = 0.015 * np.sin(time_s * 5.1 + 2.0)
+    return pose(rotation, np.concatenate([track_point(settings, distance_m), height[:, None]], axis=-1))
+
+
+def stamps(settings: DemoSettings, rate_hz: float, first_ns: int = 0) -> Ints:
+    """Stamps of a sensor in ns, from first_ns after the start to the end of the drive."""
+    count = int((duration_s(settings) - first_ns * 1e-9) * rate_hz) + 1 if rate_hz else 0
+    return START_NS + first_ns + np.round(np.arange(count) * (1e9 / rate_hz if rate_hz else 0)).astype(np.int64)
+
+
+def frame_stamps(settings: DemoSettings) -> Ints:
+    """(F,) ns, all between the first and the last odometry sample."""
+    frames = stamps(settings, settings.frame_rate_hz, FIRST_FRAME_NS)
+    return frames[frames <= odometry_stamps(settings)[-1]]
+
+
+def odometry_stamps(settings: DemoSettings) -> Ints:
+    """(T,) ns."""
+    return stamps(settings, settings.odometry_rate_hz)
+
+
+def odometry(settings: DemoSettings, rng: np.random.Generator) -> Floats:
+    """(T, 4, 4) odom_from_body that drifts: the true steps with a scale error, a yaw bias and white noise."""
+    truth = world_from_body(settings, odometry_stamps(settings))
+    step = log(between(truth[:-1], truth[1:]))
+    step[:, 3:] = step[:, 3:] * (1 + settings.odometry_scale_error)
+    step[:, 2] += settings.odometry_yaw_bias_rad_s / settings.odometry_rate_hz
+    step[:, :3] += rng.normal(size=(len(step), 3)) * settings.odometry_turn_noise_rad
+    step[:, 3:] += rng.normal(size=(len(step), 3)) * settings.odometry_step_noise_m
+    result = [np.eye(4)]
+    for motion in exp(step):
+        result.append(result[-1] @ motion)
+    return np.stack(result)
+
+
+def gps(settings: DemoSettings, stamp_ns: Ints, rng: np.random.Generator) -> Floats:
+    """(G, 3) latitude and longitude in degrees, altitude in m, of the noisy position at these stamps.
+
+    East and north become degrees by the radii of curvature at the origin, which is exact to a millimetre over a block.
+    """
+    sigma = np.array([1.0, 1.0, 2.0]) * settings.gps_sigma_m
+    east, north, up = (world_from_body(settings, stamp_ns)[:, :3, 3] + rng.normal(size=(len(stamp_ns), 3)) * sigma).T
+    latitude = np.radians(ORIGIN_DEG[0])
+    w2 = 1 - _ECCENTRICITY2 * np.sin(latitude) ** 2
+    meridian_m = _SEMI_MAJOR_M * (1 - _ECCENTRICITY2) / w2**1.5 + ORIGIN_ALTITUDE_M
+    parallel_m = (_SEMI_MAJOR_M / np.sqrt(w2) + ORIGIN_ALTITUDE_M) * np.cos(latitude)
+    return np.stack(
+        [
+            ORIGIN_DEG[0] + np.degrees(north / meridian_m),
+            ORIGIN_DEG[1] + np.degrees(east / parallel_m),
+            ORIGIN_ALTITUDE_M + up,
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,162 @@
+"""Keyframes, odometry noise and verified closures become a pose graph."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.data import EdgeKind, PoseGraph, Verdict
+from vplog.errors import GraphError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes
+
+    Bools = NDArray[np.bool_]
+
+_LEAST_SHARE = 1e-10
+"""Least eigenvalue of an information matrix as a share of its largest: GTSAM factorises them, so none may be zero."""
+_NOISE = 1e-9
+"""Negative eigenvalues up to this share of the largest are rounding of whoever wrote the matrix."""
+
+
+def build_graph(
+    keyframes: Keyframes, edge_covariances: Floats, closures: Closures | None
+) -> tuple[PoseGraph, Ints, list[str]]:
+    """The graph, the ledger row (L,) of each of its loop edges in order, and warnings.
+
+    Odometry edges join consecutive keyframes, with the inverses of `edge_covariances` (N-1, 6, 6, in the later
+    body's frame). They are followed by one loop edge per ledger row whose verdict is `accepted`: a the match, b the
+    query. Raises GraphError where a pose or a matrix is not one.
+    """
+    poses, n = keyframes.odom_from_body, len(keyframes.stamp_ns)
+    if n < 2:
+        raise GraphError(
+            f"{keyframes.drive or 'The drive'} has {n} keyframes; a graph needs 2. Lower the keyframe spacing."
+        )
+    if edge_covariances.shape != (n - 1, 6, 6):
+        raise GraphError(f"{n} keyframes need ({n - 1}, 6, 6) edge covariances, not {edge_covariances.shape}.")
+    _check_matrices(edge_covariances, "covariance", np.arange(n - 1), np.arange(1, n))
+
+    verdicts = closures.verdict if closures is not None else []
+    rows = np.flatnonzero([verdict == Verdict.ACCEPTED for verdict in verdicts])
+    a, b = np.arange(n - 1), np.arange(1, n)
+    a_from_b = geometry.between(poses[:-1], poses[1:])
+    information = np.linalg.inv(edge_covariances)
+    if closures is not None and len(rows):
+        match, query = closures.match[rows], closures.query[rows]
+        wrong = np.flatnonzero((match < 0) | (match >= query) | (query >= n))
+        if len(wrong):
+            row = wrong[0]
+            raise GraphError(
+                f"Closure {rows[row]} joins keyframes {match[row]} and {query[row]}; "
+                f"the match must come before the query, both within 0..{n - 1}."
+            )
+        a, b = np.concatenate([a, match]), np.concatenate([b, query])
+        a_from_b = np.concatenate([a_from_b, closures.match_from_query[rows]])
+        information = np.concatenate([information, closures.information[rows]])
+    graph = PoseGraph(
+        world_from_body=np.array(poses, np.float64),
+        a=a.astype(np.int32),
+        b=b.astype(np.int32),
+        a_from_b=a_from_b,
+        information=(information + np.swapaxes(information, 1, 2)) / 2,
+        kind=[EdgeKind.ODOMETRY] * (n - 1) + [EdgeKind.LOOP] * len(rows),
+    )
+    graph, warnings = checked(graph)
+    return graph, rows.astype(np.int64), warnings
+
+
+def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
+    """The graph with positive definite information, and warnings of what was repaired.
+
+    For graphs from anywhere, files included. Raises GraphError with the edge and the value where indices are out of
+    range, a number is not finite, a rotation is none, an information matrix is negative, or parts are not connected.
+    """
+    n, edges = len(graph.world_from_body), len(graph.a)
+    shapes = (len(graph.b), len(graph.kind), *graph.a_from_b.shape, *graph.information.shape)
+    if shapes != (edges, edges, edges, 4, 4, edges, 6, 6) or graph.world_from_body.shape != (n, 4, 4) or n == 0:
+        raise GraphError(f"The graph's arrays do not fit each other: {n} poses, {edges} edges, shapes {shapes}.")
+    wrong = np.flatnonzero((graph.a < 0) | (graph.b < 0) | (graph.a >= n) | (graph.b >= n) | (graph.a == graph.b))
+    if len(wrong):
+        edge = wrong[0]
+        raise GraphError(f"Edge {edge} joins {graph.a[edge]} and {graph.b[edge]}; there are poses 0..{n - 1}.")
+    _check_poses(graph.world_from_body, "Pose {row}")
+    _check_poses(graph.a_from_b, "Edge {row}")
+    _check_matrices(graph.information, "information", graph.a, graph.b)
+    lost = _unconnected(n, graph.a, graph.b)
+    if len(lost):
+        raise GraphError(f"No edge leads from pose 0 to pose {lost[0]} ({len(lost)} of {n} poses are cut off).")
+
+    # scaled to a unit diagonal first, so that radians and metres are compared as likes
+    diagonal = np.diagonal(graph.information, axis1=1, axis2=2)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, diagonal.max(1, keepdims=True)))
+    scale = scale[:, :, None] * scale[:, None, :]
+    values, vectors = np.linalg.eigh((graph.information + np.swapaxes(graph.information, 1, 2)) / 2 / scale)
+    least = _LEAST_SHARE * values[:, -1]
+    poor = values[:, 0] < least
+    if not poor.any():
+        return graph, []
+    negative = np.flatnonzero(values[:, 0] < -_NOISE * values[:, -1])
+    information = graph.information.copy()
+    fixed = (vectors * np.maximum(values, least[:, None])[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale
+    information[poor] = fixed[poor]
+    warnings = []
+    if len(negative):
+        edge = negative[0]
+        warnings.append(
+            f"The information of {len(negative)} edges is not positive (first: edge {edge}, {graph.a[edge]} to "
+            f"{graph.b[edge]}, eigenvalue {values[edge, 0]:.3g} of a unit diagonal); the negative part was cut off."
+        )
+    return (
+        PoseGraph(graph.world_from_body, graph.a, graph.b, graph.a_from_b, information, graph.kind),
+        warnings,
+    )
+
+
+def _check_poses(poses: Floats, name: str) -> None:
+    bad = np.flatnonzero(~np.isfinite(poses).all((1, 2)))
+    if len(bad):
+        where = name.format(row=bad[0])
+        value = poses[bad[0]][~np.isfinite(poses[bad[0]])][0]
+        raise GraphError(f"{where} holds {value}, so it is no pose ({len(bad)} of {len(poses)} are not).")
+    rotation = poses[:, :3, :3]
+    # 1e-5: single precision passes, a scaled, sheared or mirrored matrix does not
+    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
+    bad = np.flatnonzero((off > 1e-5) | (np.linalg.det(rotation) < 0) | (poses[:, 3] != [0, 0, 0, 1]).any(1))
+    if len(bad):
+        where = name.format(row=bad[0])
+        raise GraphError(f"{where} is no rigid pose: R R^T is off the identity by {off[bad[0]]:.3g}.")
+
+
+def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | Ints) -> None:
+    finite: Bools = np.asarray(np.isfinite(matrices).all((1, 2)))
+    diagonal = np.diagonal(np.where(finite[:, None, None], matrices, 0.0), axis1=1, axis2=2)
+    bad = np.flatnonzero(~finite | (diagonal < 0).any(1) | (diagonal <= 0).all(1))
+    if len(bad):
+        edge = bad[0]
+        entries = np.diagonal(matrices[edge])
+        value = matrices[edge][~np.isfinite(matrices[edge])][0] if not finite[edge] else entries.min()
+        raise GraphError(
+            f"The {name} of edge {edge} ({a[edge]} to {b[edge]}) holds {value:.6g}; "
+            "it must be finite with a positive diagonal."
+        )
+
+
+def _unconnected(n: int, a: Int32s, b: Int32s) -> Ints:
+    """Poses that no path of edges joins to pose 0."""
+    root = list(range(n))
+
+    def find(node: int) -> int:
+        while root[node] != node:
+            root[node] = root[root[node]]  # path halving
+            node = root[node]
+        return node
+
+    for left, right in zip(a.tolist(), b.tolist(), strict=True):
+        root[find(left)] = find(right)
+    start = find(0)
+    return np.array([node for node in range(n) if find(node) != start], np.int64)

@@ -1,0 +1,67 @@
+"""Plain least squares: every edge is believed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vplog.data import Solution
+from vplog.graph.build import checked
+from vplog.graph.consistency import residual_sigma
+from vplog.graph.factors import edge_factors, least_squares
+from vplog.graph.initialise import initial_poses
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    import gtsam
+
+    from vplog.data import Floats, PoseGraph
+
+
+class LmSettings(Settings):
+    """Levenberg-Marquardt on all edges."""
+
+    kind: Literal["lm"] = "lm"
+    """Name of the method."""
+    max_iterations: int = Field(default=100, ge=1)
+    """Steps after which it gives up; graphs of drives take 5-20."""
+    tolerance: float = Field(default=1e-9, gt=0)
+    """It has converged when a step gains less than this share of the error."""
+
+    def __call__(self, graph: PoseGraph) -> Solution:
+        """Solve. Raises GraphError where the graph is none or its poses are not determined."""
+        graph, _ = checked(graph)
+        factors = edge_factors(graph)
+        weight = np.ones(len(graph.a))
+        return solve_kept(
+            graph, factors, weight, initial_poses(graph, factors, weight), self.max_iterations, self.tolerance, ""
+        )
+
+
+def solve_kept(
+    graph: PoseGraph,
+    factors: list[gtsam.BetweenFactorPose3],
+    weight: Floats,
+    start: Floats,
+    max_iterations: int,
+    tolerance: float,
+    found: str,
+) -> Solution:
+    """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
+    fit = least_squares(graph, factors, weight, start, max_iterations, tolerance)
+    end = "converged" if fit.converged else "stopped at the limit"
+    return Solution(
+        world_from_body=fit.world_from_body,
+        weight=weight,
+        error_before=half_chi2(graph, weight, graph.world_from_body),
+        error_after=half_chi2(graph, weight, fit.world_from_body),
+        iterations=fit.iterations,
+        converged=fit.converged,
+        reason=f"{found}Least squares {end} after {fit.iterations} iterations.",
+    )
+
+
+def half_chi2(graph: PoseGraph, weight: Floats, poses: Floats) -> float:
+    return float(0.5 * (weight * residual_sigma(graph, poses) ** 2).sum())

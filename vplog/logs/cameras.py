@@ -1,0 +1,110 @@
+"""The camera of a drive: its matrix from a calibration, its place on the body from static transforms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Camera
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+    from vplog.logs.containers import Notes
+    from vplog.logs.messages import CalibrationMessage
+    from vplog.logs.transforms import FrameTree
+
+_MODELS = {
+    "plumb_bob": "plumb_bob",
+    "brown_conrady": "plumb_bob",  # RealSense's name of the same polynomial
+    "radtan": "plumb_bob",  # Kalibr's
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "kannala_brandt": "equidistant",  # Foxglove's
+    "fisheye": "equidistant",
+}
+"""Names that drivers write, and vplog's."""
+_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+"""Coefficients that OpenCV takes for each model."""
+_BODY = "base_link"
+"""The body's frame where the odometry names none: ROS REP 105."""
+_SAME_SHAPE = 0.01
+"""Relative difference of the scales in x and y below which a resized image still fits its calibration: rounding."""
+
+
+def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int, int], notes: Notes) -> Camera:
+    """The camera of images of `size` (width, height; 0 unknown), body_from_camera still the identity.
+
+    Images of a topic named image_rect... are rectified already: their matrix is that of P, without distortion
+    (sensor_msgs/CameraInfo).
+    """
+    width, height = size
+    unknown = Camera(name, None, "none", np.zeros(0), width, height, np.eye(4))
+    if calibration is None:
+        return unknown
+    matrix, model, distortion = calibration.matrix, calibration.model, calibration.distortion
+    if "image_rect" in name and calibration.projection[0, 0] > 0:
+        matrix, model, distortion = calibration.projection[:, :3], "", np.zeros(0)
+    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        notes.add(f"The calibration of {name} is not set (K[0] = {matrix[0, 0]:g}); the camera counts as uncalibrated.")
+        return unknown
+    known = _model(model, distortion)
+    if known is None:
+        notes.add(
+            f"The calibration of {name} has {len(distortion)} coefficients of the distortion model {model[:40]!r}, "
+            f"which is none of {', '.join(_COUNTS)}; the camera counts as uncalibrated."
+        )
+        return unknown
+    camera = replace(unknown, matrix=matrix, distortion_model=known[0], distortion=known[1])
+    return _fit(camera, calibration, notes)
+
+
+def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:
+    """Model and coefficients in vplog's names; None where the model is not known."""
+    if not np.isfinite(coefficients).all():
+        return None
+    if not coefficients.any():
+        return "none", np.zeros(0)
+    model = _MODELS.get(name.lower())
+    if model is None and not name:  # drivers that leave the name out mean OpenCV's polynomial
+        model = "plumb_bob" if len(coefficients) < 8 else "rational_polynomial"
+    if model is None or len(coefficients) not in _COUNTS[model]:
+        return None
+    return model, coefficients
+
+
+def _fit(camera: Camera, calibration: CalibrationMessage, notes: Notes) -> Camera:
+    """The camera for the size its images really have."""
+    width, height = calibration.width, calibration.height
+    if not (width and height) or (camera.width, camera.height) in ((width, height), (0, 0)):
+        size = (camera.width or width, camera.height or height)
+        return replace(camera, width=size[0], height=size[1])
+    x, y = camera.width / width, camera.height / height
+    seen = f"{camera.width} x {camera.height} px, its calibration {width} x {height}"
+    if abs(x - y) > _SAME_SHAPE * max(x, y):
+        notes.add(f"The images of {camera.name} have {seen}; the camera counts as uncalibrated.")
+        return replace(camera, matrix=None, distortion_model="none", distortion=np.zeros(0))
+    notes.add(f"The images of {camera.name} have {seen}; the matrix is scaled to the images.")
+    # Pixel centres are whole numbers, so the image starts at -0.5: scaling is about that corner.
+    scale = np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2], [0.0, 0.0, 1.0]])
+    return replace(camera, matrix=scale @ (camera.matrix if camera.matrix is not None else np.eye(3)))
+
+
+def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes) -> Floats:
+    """(4, 4) through the static transforms; the identity, with a note where that is a guess, where there is no chain.
+
+    `body` is the odometry's child frame, empty where its type has none; `frame` is the image's frame_id.
+    """
+    if not body and _BODY in tree:
+        body = _BODY
+        notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
+    found = tree.between(body, frame) if body and frame else None
+    if found is not None:
+        return found
+    if len(tree) or (body and frame):
+        notes.add(
+            f"No static transforms lead from the body {body or '(not named)'} to the camera's frame "
+            f"{frame or '(not named)'}; the camera is taken to sit at the body and look along its z."
+        )
+    return np.eye(4)

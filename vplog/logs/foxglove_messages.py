@@ -1,0 +1,149 @@
+"""Foxglove messages, protobuf and JSON (docs.foxglove.dev/docs/sdk/schemas), through Foxglove's own classes.
+
+The file's descriptors are not built: these types are fixed by their names, and a stranger's schema runs nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from vplog.logs.messages import (
+    BadMessageError,
+    CalibrationMessage,
+    FixMessage,
+    ImageMessage,
+    PoseMessage,
+    TransformMessage,
+    nanoseconds,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from google.protobuf.message import Message as Proto
+
+    from vplog.data import Floats
+    from vplog.logs.messages import Record
+
+
+def decode_foxglove(kind: str, encoding: str, data: bytes) -> Record:
+    """A record of type `foxglove.RawImage` and so on. Raises BadMessageError or what the parsers raise."""
+    make, read = _READERS[kind]
+    message = make()
+    if encoding == "json":
+        _fill(message, json.loads(data))
+    else:
+        message.ParseFromString(data)
+    return read(message)
+
+
+def _fill(message: Proto, tree: Any) -> None:
+    """Set a message from Foxglove's JSON: times as {sec, nsec}, bytes as base64, enums as numbers."""
+    if not isinstance(tree, dict):
+        raise BadMessageError(f"{message.DESCRIPTOR.name} is not a JSON object")
+    if message.DESCRIPTOR.full_name == "google.protobuf.Timestamp":
+        tree = {"seconds": tree.get("sec", 0), "nanos": tree.get("nsec", tree.get("nanosec", 0))}
+    for descriptor in message.DESCRIPTOR.fields:
+        value = tree.get(descriptor.name)
+        if value is None:
+            continue
+        if descriptor.is_repeated:
+            if not isinstance(value, list):
+                raise BadMessageError(f"{descriptor.name} is not a JSON array")
+            field = getattr(message, descriptor.name)
+            if descriptor.message_type:
+                for item in value:
+                    _fill(field.add(), item)
+            else:
+                field.extend(value)
+        elif descriptor.message_type:
+            _fill(getattr(message, descriptor.name), value)
+        elif descriptor.type == descriptor.TYPE_BYTES:
+            setattr(message, descriptor.name, _bytes(value))
+        else:
+            setattr(message, descriptor.name, value)
+
+
+def _bytes(value: Any) -> bytes:
+    try:
+        return base64.b64decode(value, validate=True)
+    except (binascii.Error, TypeError, ValueError):
+        raise BadMessageError("its data are not base64") from None
+
+
+def _stamp(message: Any) -> int:
+    return nanoseconds(message.timestamp.seconds, message.timestamp.nanos)
+
+
+def _raw(m: Any) -> Record:
+    return ImageMessage(_stamp(m), m.frame_id, m.encoding, m.data, False, m.width, m.height, m.step)
+
+
+def _compressed(m: Any) -> Record:
+    return ImageMessage(_stamp(m), m.frame_id, m.format, m.data, True)
+
+
+def _calibration(m: Any) -> Record:
+    matrix, projection = _matrix(m.K, (3, 3)), _matrix(m.P, (3, 4))
+    distortion = np.array(m.D, np.float64)
+    return CalibrationMessage(
+        _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, distortion, matrix, projection
+    )
+
+
+def _pose(m: Any) -> Record:
+    return PoseMessage(_stamp(m), m.frame_id, "", _xyz(m.pose.position), _xyzw(m.pose.orientation), None)
+
+
+def _fix(m: Any) -> Record:
+    known = m.position_covariance_type != LocationFix.PositionCovarianceType.UNKNOWN
+    covariance = _matrix(m.position_covariance, (3, 3)) if known else np.full((3, 3), np.nan)
+    return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance)
+
+
+def _transform(m: Any) -> TransformMessage:
+    return TransformMessage(m.parent_frame_id, m.child_frame_id, _xyz(m.translation), _xyzw(m.rotation))
+
+
+def _one_transform(m: Any) -> Record:
+    return [_transform(m)]
+
+
+def _transforms(m: Any) -> Record:
+    return [_transform(t) for t in m.transforms]
+
+
+def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
+    """Zeros where the field was left out."""
+    return np.array(values, np.float64).reshape(shape) if len(values) else np.zeros(shape)
+
+
+def _xyz(v: Any) -> Floats:
+    return np.array([v.x, v.y, v.z])
+
+
+def _xyzw(q: Any) -> Floats:
+    return np.array([q.x, q.y, q.z, q.w])
+
+
+_READERS: dict[str, tuple[type[Proto], Callable[[Any], Record]]] = {
+    "foxglove.RawImage": (RawImage, _raw),
+    "foxglove.CompressedImage": (CompressedImage, _compressed),
+    "foxglove.CameraCalibration": (CameraCalibration, _calibration),
+    "foxglove.PoseInFrame": (PoseInFrame, _pose),
+    "foxglove.LocationFix": (LocationFix, _fix),
+    "foxglove.FrameTransform": (FrameTransform, _one_transform),
+    "foxglove.FrameTransforms": (FrameTransforms, _transforms),
+}

@@ -1,0 +1,125 @@
+"""A folder of images as a Log: no odometry, no calibration."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Camera, Frame, LogInfo, Topic
+from vplog.errors import LogError
+from vplog.logs.images import grey
+from vplog.logs.messages import BadMessageError, ImageMessage
+from vplog.logs.stamps import increasing, rows_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.data import Bytes, Gps, Ints, Odometry
+    from vplog.logs.containers import Notes
+
+PERIOD_NS = 100_000_000
+"""Time between images whose names hold no time: 10 Hz, KITTI's rate."""
+_SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM", b"P5", b"P6", b"P2", b"P3")
+_UNITS = ((11, 10**9), (14, 10**6), (17, 10**3), (20, 1))
+"""Digits below which a whole number is in s, ms, us, ns, and the ns of that unit; today's have 10, 13, 16, 19."""
+
+
+def is_image(path: Path) -> bool:
+    """By the file's first bytes: JPEG, PNG, WebP, BMP, PNM."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    return head.startswith(_SIGNATURES) or (head[:4] == b"RIFF" and head[8:] == b"WEBP")
+
+
+def natural_order(path: Path) -> tuple:
+    """Sorts `2.png` before `10.png`."""
+    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", path.name))
+
+
+def stamps_of(names: list[str]) -> list[int] | None:
+    """ns from file stems that are all decimal seconds or all whole s, ms, us or ns since 1970; else None.
+
+    Whole numbers of fewer than 10 digits count the frames instead: seconds since 1970 have had 10 since 2001.
+    """
+    if all(re.fullmatch(r"\d{1,10}\.\d{1,9}", name) for name in names):
+        parts = [name.split(".") for name in names]
+        return [int(whole) * 10**9 + int(fraction.ljust(9, "0")) for whole, fraction in parts]
+    if not all(re.fullmatch(r"\d{10,19}", name) for name in names) or len({len(name) for name in names}) != 1:
+        return None
+    unit = next(ns for digits, ns in _UNITS if len(names[0]) < digits)
+    stamps = [int(name) * unit for name in names]
+    return stamps if max(stamps) < 2**63 else None
+
+
+@dataclass(eq=False)
+class FileFrame:
+    """One image file, read when decoded."""
+
+    stamp_ns: int
+    camera: Camera
+    path: Path
+
+    def decode(self) -> Frame:
+        """Raises LogError where the file is not an image."""
+        return Frame(self.stamp_ns, self.camera, _read(self.path))
+
+
+class ImageFolder:
+    """The images of one folder, in natural order of their names or in order of the times in them."""
+
+    def __init__(self, path: Path, files: list[Path], notes: Notes) -> None:
+        files = sorted(files, key=natural_order)
+        times = stamps_of([file.stem for file in files])
+        if times is None:
+            notes.add(f"The names in {path.name} are not times; its images are taken to be 0.1 s apart.")
+            times = [i * PERIOD_NS for i in range(len(files))]
+        stamp_ns, rows = increasing(np.array(times, np.int64), path.name, notes)
+        self._path, self._notes = path, notes
+        self._stamp_ns, self._files = stamp_ns, [files[row] for row in rows.tolist()]
+
+    @property
+    def name(self) -> str:
+        return self._path.name
+
+    @property
+    def warnings(self) -> list[str]:
+        return list(self._notes.lines)
+
+    def info(self) -> LogInfo:
+        count = len(self._files)
+        topic = Topic(self.name, "image", self._files[0].suffix.lstrip(".").lower(), count, "image", True)
+        start_ns, end_ns = int(self._stamp_ns[0]), int(self._stamp_ns[-1])
+        return LogInfo(str(self._path), "images", start_ns, end_ns, count, [topic], self.warnings)
+
+    def camera(self) -> Camera:
+        return self._camera
+
+    def stamps(self) -> Ints:
+        return self._stamp_ns
+
+    def frames(self, stamp_ns: Ints) -> Iterator[FileFrame]:
+        for row in rows_of(self._stamp_ns, stamp_ns, self.name):
+            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row])
+
+    def odometry(self) -> Odometry | None:
+        return None
+
+    def gps(self) -> Gps | None:
+        return None
+
+    @cached_property
+    def _camera(self) -> Camera:
+        height, width = _read(self._files[0]).shape
+        return Camera(self.name, None, "none", np.zeros(0), width, height, np.eye(4))
+
+
+def _read(path: Path) -> Bytes:
+    try:
+        return grey(ImageMessage(0, "", path.suffix, path.read_bytes(), True))
+    except (OSError, BadMessageError) as error:
+        raise LogError(f"{path} cannot be decoded: {error}.") from None

@@ -1,0 +1,170 @@
+"""Pixels: an ImageMessage becomes a grey uint8 image or a depth image in metres."""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from vplog.logs.messages import BadMessageError
+
+if TYPE_CHECKING:
+    from vplog.data import Bytes, Float32s
+    from vplog.logs.messages import ImageMessage
+
+MAX_PIXELS = 2**27
+"""px of a compressed image that are decoded (134 million: above any camera, below what a PNG bomb claims)."""
+_DEPTH_HEADER = 12
+"""Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_INVALID_MM = (0, 65535)
+"""Depth values in mm that mean no measurement: 0 in ROS REP 118 and cameras' firmware, 65535 in 7-Scenes."""
+
+_PNM_HEAD = 4096
+"""Bytes in which a PNM file must have named its size; comments may stand before it."""
+
+_LAYOUTS: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8UC1": ("u1", 1, None),
+    "rgb8": ("u1", 3, cv2.COLOR_RGB2GRAY),
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2GRAY),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2GRAY),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2GRAY),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2GRAY),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2GRAY),
+    "mono16": ("u2", 1, None),
+    "16UC1": ("u2", 1, None),
+    "32FC1": ("f4", 1, None),
+}
+"""ROS encoding: type of a channel, channels, OpenCV's conversion to grey (8UC3 is BGR, as cv_bridge has it)."""
+_DEPTH_ENCODINGS = ("16UC1", "32FC1")
+
+
+def is_depth(message: ImageMessage) -> bool:
+    """By encoding: 16UC1 or 32FC1, raw or in the format of compressedDepth (`16UC1; compressedDepth png`)."""
+    if message.compressed:
+        return "compresseddepth" in message.encoding.lower() or message.encoding.startswith(_DEPTH_ENCODINGS)
+    return message.encoding in _DEPTH_ENCODINGS
+
+
+def grey(message: ImageMessage) -> Bytes:
+    """(H, W) uint8. 16-bit images lose their low byte. Raises BadMessageError."""
+    if message.compressed:
+        image = _imdecode(message.data, cv2.IMREAD_GRAYSCALE)
+        return np.asarray(image, np.uint8)
+    pixels, conversion = _raw(message)
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise BadMessageError(f"encoding {message.encoding} is depth, not an image")
+    return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion))
+
+
+def depth_m(message: ImageMessage) -> Float32s:
+    """(H, W) float32 m, NaN where unknown: 16UC1 holds mm, 32FC1 m (ROS REP 118). Raises BadMessageError."""
+    if not message.compressed:
+        pixels, _ = _raw(message)
+        return _metres(pixels, message.encoding)
+    if message.data.startswith(_PNG):
+        return _metres(_imdecode(message.data, cv2.IMREAD_UNCHANGED), message.encoding)
+    if "rvl" in message.encoding.lower():
+        raise BadMessageError("compressedDepth with RVL is not supported; record it with PNG")
+    pixels = _imdecode(message.data[_DEPTH_HEADER:], cv2.IMREAD_UNCHANGED)
+    if not message.encoding.startswith("32FC1"):
+        return _metres(pixels, message.encoding)
+    # 32FC1 is stored as quantised inverse depth: raw = a / depth + b (compressed_depth_image_transport, codec.cpp).
+    _, a, b = struct.unpack_from("<iff", message.data)
+    if pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise BadMessageError("its PNG is not a 16-bit image")
+    raw = pixels.astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth = np.float32(a) / (raw - np.float32(b))
+    return np.where((pixels != 0) & np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan)).astype(np.float32)
+
+
+def _metres(pixels: Any, encoding: str) -> Float32s:
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
+        raise BadMessageError(f"{encoding[:40]!r} with {pixels.ndim} dimensions of {pixels.dtype} is not a depth image")
+    if pixels.dtype == np.uint16:
+        return np.where(np.isin(pixels, _INVALID_MM), np.float32(np.nan), pixels * np.float32(0.001)).astype(np.float32)
+    return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.float32(np.nan)).astype(np.float32)
+
+
+def _raw(message: ImageMessage) -> tuple[Any, int | None]:
+    """(H, W) or (H, W, C) pixels in native byte order without row padding, and the conversion to grey."""
+    if message.encoding not in _LAYOUTS:
+        raise BadMessageError(f"encoding {message.encoding[:40]!r} is not supported; these are: {', '.join(_LAYOUTS)}")
+    kind, channels, conversion = _LAYOUTS[message.encoding]
+    width, height = message.width, message.height
+    row = width * channels * int(kind[1])
+    step = message.step or row
+    # The last row may come without its padding.
+    if not (width and height) or step < row or step * (height - 1) + row > len(message.data):
+        raise BadMessageError(f"{len(message.data)} bytes do not hold {width} x {height} px of {message.encoding}")
+    dtype = np.dtype(kind).newbyteorder(">" if message.big_endian else "<")
+    data = np.frombuffer(message.data, np.uint8)
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
+    return (pixels if channels == 1 else pixels.reshape(height, width, channels)), conversion
+
+
+def _imdecode(data: bytes, flags: int) -> Any:
+    """OpenCV's decoder, after the size in the file's own header was found believable."""
+    size = image_size(data)
+    if size is None:
+        raise BadMessageError(f"its {len(data)} bytes are not a JPEG, PNG, WebP, BMP or PNM image")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise BadMessageError(f"{size[0]} x {size[1]} px are more than any camera gives")
+    try:
+        # IGNORE_ORIENTATION: calibration and odometry belong to the sensor's own rows.
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise BadMessageError(f"its {len(data)} bytes are not an image that OpenCV decodes")
+    return image
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that an image file claims in its header; None where it is of another kind or damaged."""
+    size = None
+    if data.startswith(_PNG) and len(data) >= 24:
+        size = struct.unpack_from(">II", data, 16)
+    elif data[:2] == b"\xff\xd8":
+        size = _jpeg_size(data)
+    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
+        size = _webp_size(data)
+    elif data[:2] == b"BM" and len(data) >= 26:
+        size = tuple(abs(side) for side in struct.unpack_from("<ii", data, 18))  # rows from the top count negative
+    elif match := re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD]):
+        size = int(match[1]), int(match[2])
+    return None if size is None else (size[0], size[1])
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """developers.google.com/speed/webp/docs/riff_container; the sides of VP8 and VP8L have 14 bits."""
+    if data[12:16] == b"VP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if data[12:16] == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if data[12:16] == b"VP8 ":
+        return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xFF:  # fill byte: ITU T.81, B.1.1.2
+            position += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame: ITU T.81, table B.1
+            height, width = struct.unpack_from(">HH", data, position + 5)
+            return width, height
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return None

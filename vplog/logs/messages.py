@@ -1,0 +1,154 @@
+"""Messages as vplog sees them: raw bytes of a known type, in whatever encoding, become one of five records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+    from vplog.logs.containers import Channel
+
+
+class BadMessageError(Exception):
+    """A message's bytes are not what its type says."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMessage:
+    stamp_ns: int
+    frame: str
+    encoding: str
+    """ROS name of the pixel layout (`mono8`, `16UC1`, ...); the format string where compressed."""
+    data: bytes
+    compressed: bool
+    width: int = 0
+    height: int = 0
+    step: int = 0
+    """Bytes per row, padding included; 0 where compressed."""
+    big_endian: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationMessage:
+    stamp_ns: int
+    frame: str
+    width: int
+    height: int
+    model: str
+    distortion: Floats
+    matrix: Floats
+    """(3, 3) of the image as the sensor gives it; all zero where uncalibrated."""
+    projection: Floats
+    """(3, 4) of the rectified image; all zero where unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMessage:
+    stamp_ns: int
+    frame: str
+    child: str
+    """The frame that moves; empty where the type has none."""
+    position: Floats
+    """(3,) m."""
+    quaternion: Floats
+    """(4,) x y z w, as logged."""
+    covariance: Floats | None
+    """(6, 6) as logged: translation first, axes of `frame`; None where the type has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class FixMessage:
+    stamp_ns: int
+    valid: bool
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    covariance: Floats
+    """(3, 3) m^2 east-north-up; NaN where its type says unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransformMessage:
+    """One edge of the frame tree."""
+
+    parent: str
+    child: str
+    position: Floats
+    quaternion: Floats
+
+
+Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[TransformMessage]
+
+_KINDS = {
+    "sensor_msgs/Image": "image",
+    "sensor_msgs/CompressedImage": "image",
+    "foxglove.CompressedImage": "image",
+    "foxglove.RawImage": "image",
+    "sensor_msgs/CameraInfo": "camera_info",
+    "foxglove.CameraCalibration": "camera_info",
+    "nav_msgs/Odometry": "odometry",
+    "geometry_msgs/PoseStamped": "odometry",
+    "geometry_msgs/PoseWithCovarianceStamped": "odometry",
+    "foxglove.PoseInFrame": "odometry",
+    "sensor_msgs/NavSatFix": "gps",
+    "foxglove.LocationFix": "gps",
+    "tf2_msgs/TFMessage": "tf",
+    "tf/tfMessage": "tf",
+    "foxglove.FrameTransform": "tf",
+    "foxglove.FrameTransforms": "tf",
+}
+_ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxglove"}
+
+
+def kind_of(channel: Channel) -> str:
+    """`image`, `camera_info`, `odometry`, `gps`, `tf`, or `` for what vplog has no use for or cannot decode."""
+    family = _ENCODINGS.get(channel.encoding)
+    name = short_type(channel.type)
+    if family is None or name.startswith("foxglove.") != (family == "foxglove"):
+        return ""
+    return _KINDS.get(name, "")
+
+
+def short_type(name: str) -> str:
+    """`sensor_msgs/msg/Image` as ROS 1 wrote it: `sensor_msgs/Image`."""
+    return name.replace("/msg/", "/")
+
+
+def decode(channel: Channel, data: bytes) -> Record:
+    """The record that a message holds. Raises BadMessageError."""
+    try:
+        if _ENCODINGS[channel.encoding] == "ros":
+            from vplog.logs.ros_messages import decode_ros
+
+            return decode_ros(short_type(channel.type), channel.encoding, data)
+        from vplog.logs.foxglove_messages import decode_foxglove
+
+        return decode_foxglove(channel.type, channel.encoding, data)
+    except BadMessageError:
+        raise
+    except Exception as error:  # generated decoders raise anything on a stranger's bytes
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadMessageError(reason[:200]) from None
+
+
+def stamp_of(channel: Channel, data: bytes) -> int:
+    """The header stamp in ns without decoding the rest where the encoding allows. Raises BadMessageError."""
+    if channel.encoding in ("cdr", "ros1"):
+        # CDR: 4 bytes of encapsulation, then the stamp; ROS 1: a sequence number of 4 bytes, then the stamp.
+        little = channel.encoding == "ros1" or data[1:2] == b"\x01"
+        order = "little" if little else "big"
+        if len(data) < 12:
+            raise BadMessageError(f"{len(data)} bytes are too few for a header")
+        seconds = int.from_bytes(data[4:8], order, signed=channel.encoding == "cdr")
+        return nanoseconds(seconds, int.from_bytes(data[8:12], order))
+    record = decode(channel, data)
+    return 0 if isinstance(record, list) else record.stamp_ns
+
+
+def nanoseconds(seconds: int, nanos: int) -> int:
+    """One stamp. Raises BadMessageError where it is negative or does not fit 64 bits."""
+    stamp_ns = seconds * 1_000_000_000 + nanos
+    if not 0 <= stamp_ns < 2**63:
+        raise BadMessageError(f"stamp {seconds}.{nanos:09d} s is out of range")
+    return stamp_ns

@@ -1,0 +1,130 @@
+"""ROS messages, CDR (ROS 2) and ROS 1, through rosbags' decoders of the standard types."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from vplog.logs.messages import (
+    CalibrationMessage,
+    FixMessage,
+    ImageMessage,
+    PoseMessage,
+    TransformMessage,
+    nanoseconds,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rosbags.typesys.store import Typestore
+
+    from vplog.data import Floats
+    from vplog.logs.messages import Record
+
+_UNKNOWN_COVARIANCE = 0
+"""NavSatFix.COVARIANCE_TYPE_UNKNOWN."""
+
+
+@cache
+def _store(encoding: str) -> Typestore:
+    if encoding == "cdr":
+        return get_typestore(Stores.ROS2_HUMBLE)  # these types have one layout in every ROS 2 release
+    store = get_typestore(Stores.ROS1_NOETIC)
+    transforms = "geometry_msgs/TransformStamped[] transforms"
+    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(transforms, name))
+    return store
+
+
+def decode_ros(kind: str, encoding: str, data: bytes) -> Record:
+    """A record of type `sensor_msgs/Image` and so on. Raises whatever the decoder does on damaged bytes."""
+    store = _store(encoding)
+    name = kind.replace("/", "/msg/")
+    message: Any = store.deserialize_cdr(data, name) if encoding == "cdr" else store.deserialize_ros1(data, name)
+    return _READERS[kind](message)
+
+
+def _stamp(message: Any) -> int:
+    return nanoseconds(message.header.stamp.sec, message.header.stamp.nanosec)
+
+
+def _image(message: Any) -> Record:
+    return ImageMessage(
+        _stamp(message), message.header.frame_id, message.encoding, message.data.tobytes(), False,
+        message.width, message.height, message.step, bool(message.is_bigendian),
+    )  # fmt: skip
+
+
+def _compressed(message: Any) -> Record:
+    return ImageMessage(_stamp(message), message.header.frame_id, message.format, message.data.tobytes(), True)
+
+
+def _calibration(message: Any) -> Record:
+    # ROS 2 made the fields of ROS 1 lower case.
+    d, k, p = (np.array(getattr(message, n if hasattr(message, n) else n.upper()), np.float64) for n in "dkp")
+    return CalibrationMessage(
+        _stamp(message), message.header.frame_id, message.width, message.height, message.distortion_model,
+        d, k.reshape(3, 3), p.reshape(3, 4),
+    )  # fmt: skip
+
+
+def _odometry(message: Any) -> Record:
+    return _pose(message, message.pose.pose, message.child_frame_id, message.pose.covariance)
+
+
+def _pose_stamped(message: Any) -> Record:
+    return _pose(message, message.pose, "", None)
+
+
+def _pose_with_covariance(message: Any) -> Record:
+    return _pose(message, message.pose.pose, "", message.pose.covariance)
+
+
+def _pose(message: Any, pose: Any, child: str, covariance: Any) -> PoseMessage:
+    sigma = None if covariance is None else np.reshape(covariance, (6, 6)).astype(np.float64)
+    position, quaternion = _xyz(pose.position), _xyzw(pose.orientation)
+    return PoseMessage(_stamp(message), message.header.frame_id, child, position, quaternion, sigma)
+
+
+def _fix(message: Any) -> Record:
+    covariance = np.reshape(message.position_covariance, (3, 3)).astype(np.float64)
+    if message.position_covariance_type == _UNKNOWN_COVARIANCE:
+        covariance = np.full((3, 3), np.nan)
+    return FixMessage(
+        _stamp(message), message.status.status >= 0, message.latitude, message.longitude, message.altitude, covariance
+    )
+
+
+def _transforms(message: Any) -> Record:
+    return [
+        TransformMessage(
+            t.header.frame_id, t.child_frame_id, _xyz(t.transform.translation), _xyzw(t.transform.rotation)
+        )
+        for t in message.transforms
+    ]
+
+
+def _xyz(v: Any) -> Floats:
+    return np.array([v.x, v.y, v.z])
+
+
+def _xyzw(q: Any) -> Floats:
+    return np.array([q.x, q.y, q.z, q.w])
+
+
+_READERS: dict[str, Callable[[Any], Record]] = {
+    "sensor_msgs/Image": _image,
+    "sensor_msgs/CompressedImage": _compressed,
+    "sensor_msgs/CameraInfo": _calibration,
+    "nav_msgs/Odometry": _odometry,
+    "geometry_msgs/PoseStamped": _pose_stamped,
+    "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
+    "sensor_msgs/NavSatFix": _fix,
+    "tf2_msgs/TFMessage": _transforms,
+    "tf/tfMessage": _transforms,
+}

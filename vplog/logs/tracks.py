@@ -1,0 +1,121 @@
+"""Motion and fixes: the messages of one topic become arrays over time, cleaned, sorted and in vplog's conventions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Gps, Odometry
+from vplog.logs.containers import plural
+from vplog.logs.stamps import Stamps
+from vplog.logs.transforms import usable_pose
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+    from vplog.logs.containers import Notes
+    from vplog.logs.messages import FixMessage, PoseMessage
+
+_ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
+"""ROS orders x y z, then rotations about X Y Z; vplog the other way."""
+
+
+class PoseTrack:
+    """Collects the poses of one odometry topic."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._stamps = Stamps()
+        self._poses: list[Floats] = []
+        self._covariance: list[Floats | None] = []
+        self._dropped = 0
+        self.child = ""
+        """The frame that moves, as the first message names it."""
+
+    def add(self, message: PoseMessage, log_ns: int) -> None:
+        self.child = self.child or message.child
+        pose = usable_pose(message.position, message.quaternion)
+        if pose is None:
+            self._dropped += 1
+            return
+        self._stamps.add(message.stamp_ns, log_ns)
+        self._poses.append(pose)
+        self._covariance.append(message.covariance)
+
+    def finish(self, notes: Notes) -> Odometry | None:
+        """The odometry, or None where no pose is usable."""
+        if self._dropped:
+            notes.add(f"{self._topic}: {plural(self._dropped, 'pose')} with NaN or without a rotation dropped.")
+        stamp_ns, rows = self._stamps.order(self._topic, notes)
+        if not len(rows):
+            return None
+        poses = np.array(self._poses)[rows]
+        unknown = np.full((6, 6), np.nan)
+        logged = [self._covariance[row] for row in rows]
+        covariance = body_covariance(poses, np.array([unknown if c is None else c for c in logged]))
+        usable = np.isfinite(covariance).all((1, 2))
+        if usable.all():
+            return Odometry(stamp_ns, poses, covariance)
+        if usable.any():
+            bad = plural(int((~usable).sum()), "covariance")
+            notes.add(f"{self._topic}: {bad} that no noise can have (zero, negative or not finite) taken as unknown.")
+            return Odometry(stamp_ns, poses, covariance)
+        why = (
+            "carries no covariance" if all(c is None for c in logged) else "has no usable covariance (zero or invalid)"
+        )
+        notes.add(f"{self._topic} {why}; the noise of its motion is a guess.")
+        return Odometry(stamp_ns, poses, None)
+
+
+def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
+    """ROS covariances (T, 6, 6), translation first in the fixed axes of odom, in vplog's order and the body's axes.
+
+    A right perturbation of the pose, R exp(phi) and t + R v, has phi = R^T w and v = R^T dt for a turn w and a shift
+    dt in the fixed axes; so each 3x3 block S becomes R^T S R. Rows that no noise can have (all zero, NaN, a negative
+    variance: -1 first is ROS's mark for unknown) are NaN.
+    """
+    variances = np.diagonal(logged, axis1=1, axis2=2)
+    usable = np.asarray(np.isfinite(logged).all((1, 2)) & (variances >= 0).all(1) & logged.any((1, 2)))
+    result = logged[:, _ROTATION_FIRST][:, :, _ROTATION_FIRST]
+    turn = np.zeros_like(result)
+    turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(odom_from_body[:, :3, :3], 1, 2)
+    result = turn @ np.where(usable[:, None, None], result, 0.0) @ np.swapaxes(turn, 1, 2)
+    result = (result + np.swapaxes(result, 1, 2)) / 2  # symmetric to the last bit
+    result[~usable] = np.nan
+    return result
+
+
+class FixTrack:
+    """Collects the fixes of one GPS topic."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._stamps = Stamps()
+        self._fixes: list[FixMessage] = []
+        self._dropped = 0
+
+    def add(self, message: FixMessage, log_ns: int) -> None:
+        here = (message.latitude_deg, message.longitude_deg)
+        if not (message.valid and np.isfinite(here).all() and abs(here[0]) <= 90 and abs(here[1]) <= 360):
+            self._dropped += 1
+            return
+        self._stamps.add(message.stamp_ns, log_ns)
+        self._fixes.append(message)
+
+    def finish(self, notes: Notes) -> Gps | None:
+        """The fixes, or None where none is usable. Altitudes may be NaN."""
+        if self._dropped:
+            notes.add(f"{self._topic}: {plural(self._dropped, 'message')} without a fix dropped.")
+        stamp_ns, rows = self._stamps.order(self._topic, notes)
+        if not len(rows):
+            return None
+        fixes = [self._fixes[row] for row in rows]
+        covariance = np.array([fix.covariance for fix in fixes])
+        covariance[~covariance.any((1, 2))] = np.nan
+        return Gps(
+            stamp_ns,
+            np.array([fix.latitude_deg for fix in fixes], np.float64),
+            np.array([fix.longitude_deg for fix in fixes], np.float64),
+            np.array([fix.altitude_m for fix in fixes], np.float64),
+            covariance,
+        )

@@ -1,0 +1,72 @@
+"""How far the camera's calibration can be trusted: its rotations against the odometry's."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Ints, Keyframes
+
+
+class CalibrationSettings(Settings):
+    """How the camera's rotations are held against the odometry's.
+
+    A focal length that is wrong by a share makes every rotation between two views wrong by the same share, and leaves
+    small residuals: only another sensor can tell. A wrong one is not corrected, but closures then claim less.
+    """
+
+    pairs: int = 32
+    """Pairs of keyframes that are compared; their mean is six times surer than one."""
+    angle: float = 0.15
+    """Rotation of a pair in rad, by odometry: enough to stand out of its noise, little enough to share a view."""
+    reach: int = 8
+    """Keyframes that a pair may be apart."""
+    least_share: float = 0.01
+    """Share of the rotation that is never claimed to be known better: a careful calibration's focal length."""
+    most_share: float = 0.2
+    """A larger disagreement is the odometry's, not a lens's: it is taken as this much."""
+
+
+def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
+    """(P, 2) int64 rows (earlier, later) of keyframes that turn by about `angle` within `reach`, spread evenly."""
+    count = len(keyframes.stamp_ns)
+    later = np.full(count, -1)
+    for apart in range(settings.reach, 0, -1):  # from far to near, so that the nearest is kept
+        if apart < count:
+            turn = geometry.angle(geometry.between(keyframes.odom_from_body[:-apart], keyframes.odom_from_body[apart:]))
+            fits = np.flatnonzero((turn > settings.angle) & (turn < 2.0 * settings.angle))
+            later[fits] = fits + apart
+    earlier = np.flatnonzero(later >= 0)
+    if len(earlier) > settings.pairs:
+        earlier = earlier[np.linspace(0, len(earlier) - 1, settings.pairs).astype(np.int64)]
+    return np.column_stack([earlier, later[earlier]]).astype(np.int64)
+
+
+def rotation_share(driven: Floats, seen: Floats, settings: CalibrationSettings) -> float:
+    """By what share the camera's rotations disagree with the odometry's, at least `least_share`.
+
+    `driven` and `seen` are (P, 4, 4) motions of the body over turning pairs, by odometry and by the images alone.
+    """
+    if len(driven) < 8:  # the median of fewer says little
+        return settings.least_share
+    expected, found = geometry.so3_log(driven[:, :3, :3]), geometry.so3_log(seen[:, :3, :3])
+    ratio = (found * expected).sum(axis=1) / (expected**2).sum(axis=1)
+    return float(np.clip(abs(np.median(ratio) - 1.0), settings.least_share, settings.most_share))
+
+
+def motion_covariance(match_from_query: Floats, share: float) -> Floats:
+    """(6, 6) what a calibration that is wrong by `share` adds to a closure, in the query's frame.
+
+    It stretches rotation and translation, and what it does across them hangs on the scene: all directions get the share
+    of their length.
+    """
+    turned, moved = geometry.so3_log(match_from_query[:3, :3]), match_from_query[:3, 3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = (turned @ turned) * np.eye(3)
+    result[3:, 3:] = (moved @ moved) * np.eye(3)
+    return share**2 * result

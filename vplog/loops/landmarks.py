@@ -1,0 +1,258 @@
+"""3D landmarks behind the features of one keyframe, with what is known of each: from depth, or from motion.
+
+A landmark is (x, y, rho): its normalised image coordinates in the keyframe's camera and its inverse depth in 1/m
+(Civera, Davison & Montiel 2008). Inverse depth is close to Gaussian for near and far points alike, and depth sensors
+that measure disparity have one constant error in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.loops import matching, undistort
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.data import Camera, Features, Floats, Keyframes
+
+    FeaturesOf = Callable[[int], Features]
+
+
+class LandmarkSettings(Settings):
+    """How the features of a map frame get their 3D position."""
+
+    neighbours: int = 2
+    """Keyframes before and after the map frame that its features are triangulated with."""
+    pixel_sigma: float = 0.7
+    """Standard deviation in px of a feature's position along each axis; a SIFT point repeats to about a pixel."""
+    depth_sigma: float = 1.425e-3
+    """Standard deviation in 1/m of measured inverse depth, so that sigma_z = depth_sigma z^2: Khoshelham & Elberink
+    2012, section 3.2, for the Kinect (1.425e-3 m^-1)."""
+    depth_share: float = 0.01
+    """Further error of measured depth as a share of it: registration to the colour image and its calibration."""
+    depth_range_m: float = 20.0
+    """Measured depths beyond this are taken as unknown: twice the longest range of common depth cameras."""
+    odometry_rotation: float = 0.005
+    """Standard deviation in rad of the odometry's rotation between neighbouring keyframes, before images refine it."""
+    odometry_share: float = 0.02
+    """Standard deviation of the odometry's translation between neighbouring keyframes, as a share of its length."""
+    certainty: float = 3.0
+    """A landmark is known where its inverse depth is this many sigmas above zero: its depth is then sure to a third,
+    and a point at infinity passes once in a thousand."""
+    gate_px: float = 4.0
+    """Reprojection error in px beyond which an observation leaves its track: four sigmas of the default noise."""
+    iterations: int = 5
+    """Gauss-Newton steps of the window's bundle adjustment; odometry starts it within its linear range."""
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """What is known of the points behind M features of one keyframe."""
+
+    rho: Floats
+    """(M,) inverse depth in 1/m along the camera's z, NaN where the feature was never seen twice."""
+    rays: Floats
+    """(M, 2) normalised image coordinates, refined by the other views where there are any."""
+    covariance: Floats
+    """(M, 3, 3) of (x, y, rho)."""
+    known: np.ndarray
+    """(M,) bool: the depth is good enough to fix a translation."""
+    tracked: int
+    """Features that were found in another view or have a depth, known or not."""
+    from_depth: bool
+    """Whether the scale is the depth sensor's; otherwise it is the odometry's."""
+
+
+def landmarks_of(
+    row: int,
+    keyframes: Keyframes,
+    camera: Camera,
+    features: FeaturesOf,
+    match: matching.MatchSettings,
+    settings: LandmarkSettings,
+) -> Landmarks:
+    """The landmarks of keyframe `row`: from depth where its features have any, else from motion."""
+    own = _strongest(features(row), match.features)
+    rays = undistort.rays(camera, own.points)
+    if np.isfinite(own.depth_m).any():
+        return from_depth(rays, own.depth_m.astype(np.float64), undistort.focal_px(camera), settings)
+    rows = [
+        other
+        for other in range(row - settings.neighbours, row + settings.neighbours + 1)
+        if other != row and 0 <= other < len(keyframes.stamp_ns)
+    ]
+    observed = np.full((len(rows), len(rays), 2), np.nan)
+    for view, other in enumerate(rows):
+        theirs = features(other)
+        mine, found = matching.match_features(own, theirs, match)
+        observed[view, mine] = undistort.rays(camera, theirs.points[found])
+    camera_from_body = geometry.inverse(camera.body_from_camera)
+    views = (
+        camera_from_body
+        @ geometry.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
+        @ camera.body_from_camera
+    )
+    return from_motion(rays, observed, views, undistort.focal_px(camera), settings)
+
+
+def from_depth(rays: Floats, depth_m: Floats, focal_px: float, settings: LandmarkSettings) -> Landmarks:
+    """Landmarks of rays (M, 2) with measured depths (M,) in m, NaN unknown."""
+    rho, variance = inverse_depth(depth_m, settings)
+    rho = np.where(np.isfinite(rays).all(axis=1), rho, np.nan)
+    covariance = np.zeros((len(rays), 3, 3))
+    covariance[:, 0, 0] = covariance[:, 1, 1] = (settings.pixel_sigma / focal_px) ** 2
+    covariance[:, 2, 2] = variance
+    known = rho > settings.certainty * np.sqrt(variance)
+    return Landmarks(rho, rays, covariance, known, int(np.isfinite(rho).sum()), from_depth=True)
+
+
+def inverse_depth(depth_m: Floats, settings: LandmarkSettings) -> tuple[Floats, Floats]:
+    """Inverse depth (M,) in 1/m and its variance (M,) of measured depths (M,) in m; NaN where not to be used."""
+    usable = (depth_m > 0) & (depth_m < settings.depth_range_m)
+    rho = np.where(usable, 1.0 / np.where(usable, depth_m, 1.0), np.nan)
+    return rho, settings.depth_sigma**2 + (settings.depth_share * rho) ** 2
+
+
+def from_motion(
+    rays: Floats, observed: Floats, views: Floats, focal_px: float, settings: LandmarkSettings
+) -> Landmarks:
+    """Landmarks of rays (M, 2), seen again at `observed` (V, M, 2), NaN where not, by cameras `views` (V, 4, 4).
+
+    `views` are view_from_camera by odometry, which fixes the scale; images refine them, together with the landmarks,
+    by a bundle adjustment of the window with the odometry as prior (Triggs et al. 2000, section 6.1: the landmarks are
+    eliminated). A landmark's covariance holds the uncertainty of the views.
+    """
+    sigma = settings.pixel_sigma / focal_px
+    gate = settings.gate_px / focal_px
+    moved = np.linalg.norm(views[:, :3, 3], axis=1)
+    prior = np.zeros((len(views), 6, 6))
+    turn, shift = settings.odometry_rotation, settings.odometry_share * moved
+    prior[:, [0, 1, 2], [0, 1, 2]] = turn**-2
+    prior[:, [3, 4, 5], [3, 4, 5]] = (np.maximum(shift, 1e-6) ** -2)[:, None]  # 1 um: a camera that stood still
+    # what odometry may be wrong by moves points by this much more
+    loose = gate + settings.certainty * turn
+    seen = np.isfinite(observed).all(axis=2) & np.isfinite(rays).all(axis=1).reshape(1, -1)
+    rho, refined, covariance = np.full(len(rays), np.nan), rays.copy(), np.zeros((len(rays), 3, 3))
+    tracked = np.flatnonzero(seen.any(axis=0))
+    if len(tracked):
+        held, observed, seen = rays[tracked], observed[:, tracked], seen[:, tracked]
+        points = np.column_stack([held, _linear_inverse_depth(held, observed, views, seen)])
+        seen &= _errors(points, observed, views) < loose
+        start = views
+        spread = np.zeros((len(held), 3, 3))
+        for step in range(settings.iterations):
+            if step == settings.iterations - 1:  # the views are refined: now the pixels' own gate
+                seen &= _errors(points, observed, views) < gate
+            points, views, spread = _adjust(points, views, held, observed, seen, sigma, start, prior)
+        seen &= _errors(points, observed, views) < gate
+        found = seen.any(axis=0)
+        rho[tracked[found]] = points[found, 2]
+        refined[tracked[found]] = points[found, :2]
+        covariance[tracked[found]] = spread[found]
+    known = rho > settings.certainty * np.sqrt(covariance[:, 2, 2])
+    return Landmarks(rho, refined, covariance, known, len(tracked), from_depth=False)
+
+
+def _adjust(
+    points: Floats,
+    views: Floats,
+    rays: Floats,
+    observed: Floats,
+    seen: np.ndarray,
+    sigma: float,
+    start: Floats,
+    prior: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """One Gauss-Newton step over landmarks and views: both, moved, and the landmarks' covariance (M, 3, 3)."""
+    seen = seen & np.isfinite(_errors(points, observed, views))
+    residual, by_point, by_view = _linearise(points, observed, views)
+    # whitened, and Huber at one sigma: beyond it an error counts linearly
+    error = np.where(seen[..., None], residual, 0.0) / sigma
+    root = np.where(seen, 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0)), 0.0)
+    error, by_point, by_view = (
+        error * root[..., None],
+        by_point * (root / sigma)[..., None, None],
+        by_view * (root / sigma)[..., None, None],
+    )
+    by_view_t, by_point_t = np.swapaxes(by_view, 2, 3), np.swapaxes(by_point, 2, 3)
+    # the keyframe's own observation holds x and y; a whisper on rho keeps what no view sees invertible
+    point_hessian = (by_point_t @ by_point).sum(axis=0)
+    point_hessian[:, [0, 1], [0, 1]] += sigma**-2
+    point_hessian[:, 2, 2] += 1e-6  # m^2, a sigma of 1000 /m: a millimetre of depth
+    point_gradient = (by_point_t @ error[..., None])[..., 0].sum(axis=0)
+    point_gradient[:, :2] += (points[:, :2] - rays) / sigma**2
+    # to first order the prior's error moves with the view: log(start^-1 view exp(d)) = log(start^-1 view) + d
+    size = 6 * len(views)
+    view_hessian = np.zeros((size, size))
+    view_gradient = np.zeros(size)
+    for v in range(len(views)):
+        block, rows = slice(6 * v, 6 * v + 6), by_view[v].reshape(-1, 6)
+        view_hessian[block, block] = rows.T @ rows + prior[v]
+        drift = geometry.log(geometry.between(start[v], views[v]))
+        view_gradient[block] = rows.T @ error[v].ravel() + prior[v] @ drift
+    # the landmarks are eliminated: Schur complement
+    cross = np.moveaxis(by_view_t @ by_point, 0, 1).reshape(len(points), size, 3)
+    point_covariance = np.linalg.inv(point_hessian)
+    gain = cross @ point_covariance
+    gains, crosses = (np.moveaxis(m, 1, 0).reshape(size, -1) for m in (gain, cross))
+    view_covariance = np.linalg.inv(view_hessian - gains @ crosses.T)
+    view_step = -view_covariance @ (view_gradient - gains @ point_gradient.ravel())
+    gain_t = np.swapaxes(gain, 1, 2)
+    point_step = -(point_covariance @ point_gradient[..., None])[..., 0] - gain_t @ view_step
+    covariance = point_covariance + (gain_t.reshape(-1, size) @ view_covariance).reshape(gain_t.shape) @ gain
+    return points + point_step, views @ geometry.exp(view_step.reshape(-1, 6)), covariance
+
+
+def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
+    """Residuals (V, M, 2) and their derivatives by landmark (V, M, 2, 3) and by view (V, M, 2, 6).
+
+    A view moves as view exp(d), d in the keyframe's camera.
+    """
+    rotation, translation = views[:, None, :3, :3], views[:, None, :3, 3]
+    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
+    seen = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * translation
+    depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.inf)  # behind a view: its error is infinite, its weight 0
+    image = seen[..., :2] / depth
+    by_seen = np.zeros((*seen.shape[:2], 2, 3))
+    by_seen[..., 0, 0] = by_seen[..., 1, 1] = 1.0 / depth[..., 0]
+    by_seen[..., :, 2] = -image / depth
+    moved = by_seen @ rotation
+    by_point = np.concatenate([moved[..., :2], by_seen @ translation[..., None]], axis=-1)
+    by_view = np.concatenate([-moved @ geometry.skew(bearing), moved * points[:, 2, None, None]], axis=-1)
+    return image - observed, by_point, by_view
+
+
+def _errors(points: Floats, observed: Floats, views: Floats) -> Floats:
+    """(V, M) reprojection errors in normalised coordinates; infinite behind a view, NaN where not observed."""
+    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
+    seen = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * views[:, None, :3, 3]
+    front = seen[..., 2] > 0
+    image = seen[..., :2] / np.where(front, seen[..., 2], 1.0)[..., None]
+    return np.where(front, np.linalg.norm(image - observed, axis=2), np.inf)
+
+
+def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, seen: np.ndarray) -> Floats:
+    """(M,) inverse depth by least squares over all views: u (a_z + rho t_z) = a_xy + rho t_xy is linear in rho."""
+    bearing = np.column_stack([rays, np.ones(len(rays))])
+    turned = bearing @ np.swapaxes(views[:, :3, :3], 1, 2)
+    translation = views[:, None, :3, 3]
+    slope = np.where(seen[..., None], translation[..., :2] - observed * translation[..., 2:], 0.0)
+    offset = np.where(seen[..., None], observed * turned[..., 2:] - turned[..., :2], 0.0)
+    return (slope * offset).sum(axis=(0, 2)) / np.maximum((slope**2).sum(axis=(0, 2)), 1e-12)
+
+
+def _strongest(features: Features, count: int) -> Features:
+    """The first `count` features: those that matching looks at."""
+    return replace(
+        features,
+        points=features.points[:count],
+        sizes=features.sizes[:count],
+        descriptors=features.descriptors[:count],
+        depth_m=features.depth_m[:count],
+    )

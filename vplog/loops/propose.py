@@ -1,0 +1,112 @@
+"""Which earlier keyframes each keyframe may be a return to, by place recognition."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vplog.data import Float32s, Int32s, Ints, Keyframes
+    from vplog.stages import PlaceIndex
+
+
+class ProposeSettings(Settings):
+    """Which earlier keyframes are worth a look. The gaps count keyframes, whose spacing follows the drive's own scale:
+    a car's is metres, a hand-held camera's centimetres."""
+
+    per_query: int = 10
+    """Candidates kept for each keyframe."""
+    gap_keyframes: int = 30
+    """A match is at least this many keyframes earlier, but never more than a quarter of the drive: until then much of
+    the view is still the same, and a closure tells odometry nothing new."""
+    gap_steps: float = 30.0
+    """And at least this many times the drive's median keyframe spacing earlier along the path, so that standing still
+    makes no closures, however long it takes."""
+    gap_s: float = 0.0
+    """And at least this many seconds earlier; 0 leaves it to the other gaps."""
+    gap_m: float = 0.0
+    """And at least this many metres of path earlier; 0 leaves it to the other gaps."""
+    suppress: int = 1
+    """Candidates within this many keyframes of a better one of the same query are left out: they show what it shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """C candidate closures, ordered by query, then rank."""
+
+    query: Int32s
+    """(C,) keyframe row, the later one."""
+    match: Int32s
+    """(C,) keyframe row, the earlier one."""
+    rank: Int32s
+    """(C,) 0 is the query's best."""
+    score: Float32s
+    """(C,) the recogniser's similarity."""
+    support: Int32s
+    """(C,) neighbours of the pair that agree by sequence; 0 where no sequence was used."""
+
+
+def candidate_stops(keyframes: Keyframes, settings: ProposeSettings) -> Ints:
+    """(N,) int64: keyframe i may match rows below stops[i] only. They never decrease."""
+    count = len(keyframes.stamp_ns)
+    if count == 0:
+        return np.empty(0, np.int64)
+    step_m = np.linalg.norm(np.diff(keyframes.odom_from_body[:, :3, 3], axis=0), axis=1)
+    path_m = np.concatenate([[0.0], np.cumsum(step_m)])
+    moving = step_m[step_m > 0]
+    gap_m = max(settings.gap_m, settings.gap_steps * float(np.median(moving)) if len(moving) else 0.0)
+    # of a short drive too, the last quarter can return to the first
+    gap_rows = min(settings.gap_keyframes, count // 4)
+    gap_ns = int(settings.gap_s * 1e9)
+    by_rows = np.arange(count) - max(gap_rows, 1) + 1
+    by_time = np.searchsorted(keyframes.stamp_ns, keyframes.stamp_ns - gap_ns, side="right")
+    by_path = np.searchsorted(path_m, path_m - gap_m, side="right")
+    return np.maximum(np.minimum(np.minimum(by_rows, by_time), by_path), 0).astype(np.int64)
+
+
+def propose(
+    keyframes: Keyframes,
+    descriptors: Sequence[object],
+    index: PlaceIndex,
+    settings: ProposeSettings,
+    threads: int = 1,
+) -> Proposals:
+    """The best earlier places of every keyframe, by `index` over the same keyframes' `descriptors`."""
+    stops = candidate_stops(keyframes, settings)
+    # each one kept may suppress 2 x suppress others
+    asked = settings.per_query * (2 * settings.suppress + 1)
+
+    def rank(row: int) -> tuple[Int32s, Float32s]:
+        ranking = index.query(descriptors[row], asked, int(stops[row]))
+        kept = _suppress(ranking.rows, settings.suppress, settings.per_query)
+        return ranking.rows[kept], ranking.score[kept]
+
+    queries = np.flatnonzero(stops > 0)
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        found = list(pool.map(rank, queries.tolist()))
+    counts = np.array([len(rows) for rows, _ in found], np.int64)
+    return Proposals(
+        query=np.repeat(queries, counts).astype(np.int32),
+        match=np.concatenate([rows for rows, _ in found] or [[]]).astype(np.int32),
+        rank=np.concatenate([np.arange(n) for n in counts] or [[]]).astype(np.int32),
+        score=np.concatenate([score for _, score in found] or [[]]).astype(np.float32),
+        support=np.zeros(int(counts.sum()), np.int32),
+    )
+
+
+def _suppress(rows: Int32s, within: int, keep: int) -> list[int]:
+    """Positions of the first `keep` rows, best first, that are not within `within` rows of a better one."""
+    kept: list[int] = []
+    for at, row in enumerate(rows.tolist()):
+        if all(abs(row - int(rows[other])) > within for other in kept):
+            kept.append(at)
+            if len(kept) == keep:
+                break
+    return kept

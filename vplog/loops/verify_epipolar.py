@@ -1,0 +1,57 @@
+"""Whether two images of an uncalibrated camera agree by epipolar geometry. No pose comes of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from vplog.data import Verdict
+from vplog.loops import chance
+from vplog.loops.verify_metric import Pose
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from vplog.data import Float32s
+
+_SAMPLE = 7
+"""Matches that fix a fundamental matrix."""
+_MODELS = 3
+"""Fundamental matrices that seven matches allow: Hartley & Zisserman 2004, section 11.1.2."""
+
+
+class EpipolarSettings(Settings):
+    """When two uncalibrated images are said to show one place."""
+
+    min_inliers: int = 20
+    """Matches that must agree; a line is a weak test, so no fewer than for a pose."""
+    log10_false_alarms: float = -6.0
+    """Most wrong geometries expected by chance, as log10 (Moisan & Stival 2004)."""
+    max_error_px: float = 2.0
+    """Distance in px to the epipolar line that is an agreement: two sigmas of a SIFT point."""
+    rounds: int = 2000
+    """Most samples of RANSAC: a geometry is found with 99 % where 42 % of the matches are right."""
+    min_spread: float = 0.1
+    """Share of the image that the inliers' bounding box must cover; less is one object, not a place."""
+
+
+def solve(query: Float32s, match: Float32s, width: int, height: int, settings: EpipolarSettings) -> Pose:
+    """The verdict on matched pixels (K, 2) of two images of `width` x `height` px: at best `no_calibration`."""
+    if len(query) <= _SAMPLE:
+        return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
+    fundamental, mask = cv2.findFundamentalMat(
+        match, query, cv2.USAC_MAGSAC, settings.max_error_px, 0.99, settings.rounds
+    )
+    if fundamental is None or mask is None or fundamental.shape != (3, 3):
+        return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
+    inlier = mask.ravel().astype(bool)
+    count = int(inlier.sum())
+    # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
+    share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)
+    alarms = chance.log10_false_alarms(len(query), count, _SAMPLE, _MODELS, share)
+    if count < settings.min_inliers or alarms > settings.log10_false_alarms:
+        return Pose(Verdict.TOO_FEW_INLIERS, count, 0.0)
+    spread = float(np.prod(np.ptp(query[inlier] / [width, height], axis=0)))
+    verdict = Verdict.NO_CALIBRATION if spread >= settings.min_spread else Verdict.POOR_SPREAD
+    return Pose(verdict, count, spread)

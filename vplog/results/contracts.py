@@ -1,0 +1,64 @@
+"""The contracts for outsiders: one .proto per own message, one JSON per Parquet table."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+
+from vplog.results import messages, tables
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_HEADER = {
+    "vplog.table": "Name of the table.",
+    "vplog.settings": "The full tree of settings as JSON with sorted keys.",
+    "vplog.library": "Hash of the place library, empty where none was used.",
+    "vplog.version": "Version of vplog that wrote the file.",
+}
+
+
+def write_schemas(folder: Path) -> list[Path]:
+    """Write the contracts into a folder; the files written, in order."""
+    texts = {"vplog.LoopClosure.proto": messages.loop_closure_proto()}
+    for name, schema in table_schemas().items():
+        texts[f"{name}.json"] = json.dumps(_contract(name, schema), indent=2, ensure_ascii=False) + "\n"
+    written = []
+    for name, text in texts.items():
+        with replacing(folder / name) as stream:
+            stream.write(text.encode())
+        written.append(folder / name)
+    return written
+
+
+def table_schemas() -> dict[str, pa.Schema]:
+    """The schema of every table, by name. A descriptor is shown as bytes: its type is the recogniser's choice."""
+    return {
+        "keyframes": tables.KEYFRAMES,
+        "descriptors": tables.descriptors_schema(pa.binary()),
+        "closures": tables.CLOSURES,
+        "edges": tables.EDGES,
+        "trajectory": tables.TRAJECTORY,
+    }
+
+
+def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
+    columns = []
+    for column in schema:
+        metadata = {key.decode(): value.decode() for key, value in column.metadata.items()}
+        kind = "float64[36]" if pa.types.is_fixed_size_list(column.type) else str(column.type)
+        if (name, column.name) == ("descriptors", "descriptor"):
+            kind = "any"
+        columns.append(
+            {
+                "name": column.name,
+                "type": {"float": "float32", "double": "float64"}.get(kind, kind),
+                "nullable": column.nullable,
+                "unit": metadata["unit"],
+                "description": metadata["description"],
+            }
+        )
+    return {"table": name, "file": f"{name}.parquet", "metadata": _HEADER, "columns": columns}

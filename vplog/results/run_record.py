@@ -1,0 +1,56 @@
+"""run.json: what was run, on what, and how it went."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import ResultError
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def write_run_json(path: Path, record: dict[str, Any]) -> None:
+    """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
+    text = json.dumps(_plain(record), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with replacing(path) as stream:
+        stream.write(text.encode())
+
+
+def read_run_json(path: Path) -> dict[str, Any]:
+    """The record of a run folder. Raises ResultError where the file is missing or is no JSON object."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ResultError(
+            f"Cannot read {path}: {error.strerror}. Is {path.parent} the output of `vplog run`?"
+        ) from None
+    except (ValueError, RecursionError):
+        raise ResultError(f"{path} is not JSON. Run `vplog run` again to write it anew.") from None
+    if not isinstance(record, dict):
+        raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again to write it anew.")
+    return record
+
+
+def canonical_json(tree: Any) -> str:
+    """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
+    return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """The value with numpy scalars, arrays and paths as JSON has them."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return _plain(value.tolist())
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # JSON has no NaN
+    return value

@@ -1,0 +1,370 @@
+"""The Parquet tables of a run folder: literal schemas, and a writer and a reader for each.
+
+Poses are scalar columns `tx ty tz` (m) and `qx qy qz qw` (unit, w >= 0), which DuckDB and Polars query directly;
+6x6 matrices are lists of 36, row by row, rotation first. What is NaN in our arrays because it is not known is null in
+a table, as queries expect. Same input, same bytes: no clock, path or thread count
+enters a file, and row groups have a fixed size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import vplog
+from vplog import geometry
+from vplog.data import Closures, EdgeKind, Keyframes, PoseGraph, Trajectory, Verdict
+from vplog.errors import ResultError
+from vplog.results.atomic import replacing
+from vplog.results.run_record import canonical_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+    from vplog.data import Floats, Solution
+
+ROWS_PER_GROUP = 65_536
+"""Rows of a row group; 64 Ki rows of the widest table here are about 40 MB in memory."""
+DESCRIPTORS_PER_GROUP = 1_024
+"""The same for descriptors, which may take tens of kB each."""
+
+
+@dataclass(frozen=True)
+class TableMetadata:
+    """What every table says of the run that made it; equal for equal runs."""
+
+    settings: dict[str, Any]
+    """The full tree of settings."""
+    library: str
+    """Hash of the place library, empty where none was used."""
+
+    def record(self) -> dict[str, str]:
+        """As key and text, for the header of a file."""
+        return {
+            "vplog.settings": canonical_json(self.settings),
+            "vplog.library": self.library,
+            "vplog.version": vplog.__version__,
+        }
+
+
+def _column(name: str, kind: pa.DataType, unit: str, description: str, nullable: bool = False) -> pa.Field:
+    return pa.field(name, kind, nullable, metadata={"unit": unit, "description": description})
+
+
+def _pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Field]:
+    return [
+        *(_column(f"{prefix}t{axis}", pa.float64(), "m", f"{text}: position, {axis}.", nullable) for axis in "xyz"),
+        *(_column(f"{prefix}q{axis}", pa.float64(), "1", f"{text}: quaternion, {axis}.", nullable) for axis in "xyzw"),
+    ]
+
+
+_MATRIX = pa.list_(pa.field("element", pa.float64(), nullable=False), 36)
+_INFORMATION_UNIT = "rad^-2, rad^-1 m^-1, m^-2"
+
+KEYFRAMES = pa.schema(
+    [
+        _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
+        _column("drive", pa.string(), "", "Name of the drive."),
+        _column("stamp_ns", pa.int64(), "ns", "Stamp of the frame, in the log's clock."),
+        *_pose_columns("odom_", "odom_from_body, as the odometry has it"),
+        *_pose_columns("world_", "world_from_body, optimised"),
+    ]
+)
+CLOSURES = pa.schema(
+    [
+        _column("query", pa.int32(), "row", "Keyframe, the later one."),
+        _column("match", pa.int32(), "row", "Keyframe, the earlier one."),
+        _column("query_stamp_ns", pa.int64(), "ns", "Stamp of the query keyframe."),
+        _column("match_stamp_ns", pa.int64(), "ns", "Stamp of the match keyframe."),
+        _column("rank", pa.int32(), "1", "Place among the query's candidates, 0 is the best."),
+        _column("score", pa.float32(), "1", "The recogniser's similarity, on its own scale."),
+        _column("support", pa.int32(), "pairs", "Neighbours of the pair that agree by sequence; 0 without a sequence."),
+        _column("matches", pa.int32(), "features", "Feature matches that passed the ratio and mutual tests."),
+        _column("landmarks", pa.int32(), "features", "Matches with a known 3D position in the map frame."),
+        _column("inliers", pa.int32(), "features", "Matches that agree with the pose, or with the epipolar geometry."),
+        _column("spread", pa.float32(), "1", "Share of the query image that the inliers' bounding box covers."),
+        *_pose_columns("", "match_from_query between body frames, null where no pose was found", nullable=True),
+        _column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of match_from_query, in the query's body frame.", True),
+        _column("verdict", pa.string(), "", "What became of the candidate."),
+        _column("reason", pa.string(), "", "The verdict in one sentence."),
+        _column(
+            "residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True
+        ),
+        _column("residual_after", pa.float64(), "sigma", "The same after the solve.", True),
+        _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
+    ]
+)
+EDGES = pa.schema(
+    [
+        _column("a", pa.int32(), "row", "Keyframe."),
+        _column("b", pa.int32(), "row", "Keyframe."),
+        _column("kind", pa.string(), "", "`odometry`, `loop` or `gps`."),
+        *_pose_columns("", "a_from_b, as measured"),
+        _column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
+        _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1."),
+        _column("residual", pa.float64(), "sigma", "Mahalanobis distance of the measurement to the solution."),
+    ]
+)
+TRAJECTORY = pa.schema(
+    [
+        _column("stamp_ns", pa.int64(), "ns", "Stamp of the odometry sample, in the log's clock."),
+        *_pose_columns("", "world_from_body, optimised"),
+    ]
+)
+
+
+def descriptors_schema(descriptor: pa.DataType) -> pa.Schema:
+    """Schema of the descriptors of a recogniser that stores one place as `descriptor`."""
+    return pa.schema(
+        [
+            _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
+            _column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe."),
+            _column("descriptor", descriptor, "", "The place, in the recogniser's own Arrow type."),
+        ]
+    )
+
+
+def write_keyframes(path: Path, keyframes: Keyframes, world_from_body: Floats, metadata: TableMetadata) -> None:
+    """keyframes.parquet, with the optimised poses (N, 4, 4)."""
+    count = len(keyframes.stamp_ns)
+    columns = {
+        "keyframe": np.arange(count, dtype=np.int32),
+        "drive": [keyframes.drive] * count,
+        "stamp_ns": keyframes.stamp_ns,
+        **_pose_values("odom_", keyframes.odom_from_body),
+        **_pose_values("world_", world_from_body),
+    }
+    _write(path, "keyframes", KEYFRAMES, columns, metadata)
+
+
+def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:
+    """The keyframes and their optimised poses (N, 4, 4). The drive of an empty table is ``."""
+    table = _read(path, "keyframes", KEYFRAMES)
+    drive = table["drive"][0].as_py() if len(table) else ""
+    keyframes = Keyframes(drive, _values(table, "stamp_ns"), _poses(table, "odom_"))
+    return keyframes, _poses(table, "world_")
+
+
+def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadata: TableMetadata) -> None:
+    """closures.parquet, the ledger with the stamps of both keyframes and each verdict's sentence."""
+    columns = {
+        **{name: getattr(closures, name) for name in _PLAIN_LEDGER},
+        "query_stamp_ns": keyframes.stamp_ns[closures.query],
+        "match_stamp_ns": keyframes.stamp_ns[closures.match],
+        **_pose_values("", closures.match_from_query),
+        "information": closures.information,
+        "verdict": [verdict.value for verdict in closures.verdict],
+        "reason": [verdict.sentence for verdict in closures.verdict],
+    }
+    _write(path, "closures", CLOSURES, columns, metadata)
+
+
+_PLAIN_LEDGER = (
+    *("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread"),
+    *("residual_before", "residual_after", "weight"),
+)
+"""Fields of the ledger that are one column as they are."""
+
+
+def read_closures(path: Path) -> Closures:
+    """The ledger."""
+    table = _read(path, "closures", CLOSURES)
+    try:
+        verdict = [Verdict(text) for text in table["verdict"].to_pylist()]
+    except ValueError as error:
+        raise ResultError(f"{path}: {error}. Verdicts: {', '.join(Verdict)}.") from None
+    return Closures(
+        match_from_query=_poses(table, ""),
+        information=_matrices(table, "information"),
+        verdict=verdict,
+        **{name: _values(table, name) for name in _PLAIN_LEDGER},
+    )
+
+
+def write_edges(path: Path, graph: PoseGraph, solution: Solution, metadata: TableMetadata) -> None:
+    """edges.parquet: the graph, the weights and the residuals of its solution."""
+    columns = {
+        "a": graph.a,
+        "b": graph.b,
+        "kind": [kind.value for kind in graph.kind],
+        **_pose_values("", graph.a_from_b),
+        "information": graph.information,
+        "weight": solution.weight,
+        "residual": edge_residuals(graph, solution.world_from_body),
+    }
+    _write(path, "edges", EDGES, columns, metadata)
+
+
+def edge_residuals(graph: PoseGraph, world_from_body: Floats) -> Floats:
+    """(E,) sigma: Mahalanobis distance of each measured a_from_b to that of the poses (N, 4, 4)."""
+    solved = geometry.between(world_from_body[graph.a], world_from_body[graph.b])
+    xi = geometry.log(geometry.between(graph.a_from_b, solved))
+    return np.sqrt(np.maximum(np.einsum("ei,eij,ej->e", xi, graph.information, xi), 0.0))
+
+
+def read_edges(path: Path, world_from_body: Floats) -> tuple[PoseGraph, Floats, Floats]:
+    """The graph over the nodes given (N, 4, 4), and the weight and residual (E,) of its edges."""
+    table = _read(path, "edges", EDGES)
+    a, b = _values(table, "a"), _values(table, "b")
+    if len(table) and not 0 <= min(a.min(), b.min()) <= max(a.max(), b.max()) < len(world_from_body):
+        raise ResultError(f"{path} names a node outside 0..{len(world_from_body) - 1}. Is it of another run?")
+    try:
+        kind = [EdgeKind(text) for text in table["kind"].to_pylist()]
+    except ValueError as error:
+        raise ResultError(f"{path}: {error}. Kinds: {', '.join(EdgeKind)}.") from None
+    graph = PoseGraph(world_from_body, a, b, _poses(table, ""), _matrices(table, "information"), kind)
+    return graph, _values(table, "weight"), _values(table, "residual")
+
+
+def write_trajectory(path: Path, trajectory: Trajectory, metadata: TableMetadata) -> None:
+    """trajectory.parquet."""
+    columns = {"stamp_ns": trajectory.stamp_ns, **_pose_values("", trajectory.world_from_body)}
+    _write(path, "trajectory", TRAJECTORY, columns, metadata)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """The trajectory."""
+    table = _read(path, "trajectory", TRAJECTORY)
+    return Trajectory(_values(table, "stamp_ns"), _poses(table, ""))
+
+
+def write_descriptors(
+    path: Path, keyframes: Keyframes, batches: Iterable[pa.Array], descriptor: pa.DataType, metadata: TableMetadata
+) -> None:
+    """descriptors.parquet from batches of any length, in the order of the keyframes, one group in memory at a time.
+
+    The bytes do not depend on how the descriptors were batched. Raises ResultError where their number differs from
+    that of the keyframes.
+    """
+    schema = _with_metadata(descriptors_schema(descriptor), "descriptors", metadata)
+    written = 0
+    with replacing(path) as stream, pq.ParquetWriter(stream, schema, compression="zstd") as writer:
+        for group in _regrouped(batches, DESCRIPTORS_PER_GROUP):
+            rows = np.arange(written, written + len(group), dtype=np.int32)
+            written += len(group)
+            if written > len(keyframes.stamp_ns):
+                break
+            arrays = [pa.array(rows), pa.array(keyframes.stamp_ns[rows], pa.int64()), group]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=DESCRIPTORS_PER_GROUP)
+        if written != len(keyframes.stamp_ns):
+            raise ResultError(
+                f"{path}: {written} descriptors came for {len(keyframes.stamp_ns)} keyframes; each keyframe has one."
+            )
+
+
+def _regrouped(batches: Iterable[pa.Array], size: int) -> Iterator[pa.Array]:
+    """The same values in arrays of `size`, the last one shorter."""
+    waiting: list[pa.Array] = []
+    count = 0
+    for batch in batches:
+        waiting.append(batch)
+        count += len(batch)
+        if count < size:
+            continue
+        joined = pa.concat_arrays(waiting)
+        whole = count - count % size
+        for start in range(0, whole, size):
+            yield _own(joined.slice(start, size))
+        waiting = [joined.slice(whole)]
+        count -= whole
+    if count:
+        yield _own(pa.concat_arrays(waiting))
+
+
+def _own(array: pa.Array) -> pa.Array:
+    """A copy that starts at offset 0, so that what is written does not depend on what it was a slice of."""
+    return pa.concat_arrays([array, array.slice(0, 0)])
+
+
+def read_descriptors(path: Path) -> tuple[pa.Array, str]:
+    """The descriptors in the order of the keyframes, and the hash of the library they belong to."""
+    table = _read(path, "descriptors", None)
+    column = table["descriptor"].combine_chunks()
+    return column, (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
+    try:
+        header = pq.read_schema(path).metadata or {}
+    except (OSError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
+    return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
+
+
+def _write(path: Path, name: str, schema: pa.Schema, columns: dict[str, Any], metadata: TableMetadata) -> None:
+    arrays = [_array(columns[column.name], column) for column in schema]
+    table = pa.Table.from_arrays(arrays, schema=_with_metadata(schema, name, metadata))
+    with replacing(path) as stream:
+        pq.write_table(table, stream, compression="zstd", row_group_size=ROWS_PER_GROUP)
+
+
+def _array(values: Any, column: pa.Field) -> pa.Array:
+    """The values of a column; NaN is null where the column may be null."""
+    if column.type != _MATRIX:
+        return pa.array(values, column.type, mask=np.isnan(values) if column.nullable else None)
+    rows = np.ascontiguousarray(values, np.float64).reshape(-1, _MATRIX.list_size)
+    unknown = pa.array(np.isnan(rows).all(1)) if column.nullable else None
+    return pa.FixedSizeListArray.from_arrays(pa.array(rows.reshape(-1)), type=_MATRIX, mask=unknown)
+
+
+def _with_metadata(schema: pa.Schema, name: str, metadata: TableMetadata) -> pa.Schema:
+    return schema.with_metadata({**metadata.record(), "vplog.table": name})
+
+
+def _read(path: Path, name: str, schema: pa.Schema | None) -> pa.Table:
+    """The table with the columns of the schema (any where None), checked. Raises ResultError."""
+    try:
+        with pq.ParquetFile(path) as file:
+            table = file.read()
+    except (OSError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
+    found = (table.schema.metadata or {}).get(b"vplog.table", b"").decode()
+    if found != name:
+        raise ResultError(f"{path} is not a {name} table of vplog (it says {found!r}). Give the folder of a run.")
+    if schema is None:
+        return table
+    for column in schema:
+        if column.name not in table.schema.names or table.schema.field(column.name).type != column.type:
+            raise ResultError(f"{path} has no column {column.name} of type {column.type}. Run `vplog run` again.")
+        if not column.nullable and table[column.name].null_count:
+            raise ResultError(f"{path} holds nulls in column {column.name}. Run `vplog run` again.")
+    return table
+
+
+def _unreadable(path: Path, error: Exception) -> ResultError:
+    if isinstance(error, FileNotFoundError):
+        return ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.")
+    return ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Run `vplog run` again to write it anew.")
+
+
+def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
+    names = [f"{prefix}{name}" for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
+    values = np.concatenate([poses[:, :3, 3], geometry.quaternion(poses[:, :3, :3])], axis=1)
+    return dict(zip(names, np.ascontiguousarray(values.T), strict=True))
+
+
+def _poses(table: pa.Table, prefix: str) -> Floats:
+    """(R, 4, 4), all NaN where the row holds none."""
+    values = np.stack([_values(table, f"{prefix}{name}") for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")], 1)
+    poses = geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
+    poses[~np.isfinite(poses).all((1, 2))] = np.nan
+    return poses
+
+
+def _values(table: pa.Table, name: str) -> np.ndarray:
+    """A column as an array of its own, which may be written to."""
+    return np.array(table[name].to_numpy())
+
+
+def _matrices(table: pa.Table, name: str) -> Floats:
+    """(R, 6, 6), NaN where the row holds none."""
+    column = table[name].combine_chunks()
+    matrices = np.full((len(column), 6, 6), np.nan)
+    matrices[column.is_valid().to_numpy(zero_copy_only=False)] = column.flatten().to_numpy().reshape(-1, 6, 6)
+    return matrices
