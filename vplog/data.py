@@ -109,6 +109,17 @@ class Features:
 
 
 @dataclass(frozen=True, eq=False)
+class Reference:
+    """One image of a raw-image library, with where it came from."""
+
+    image: Bytes
+    """(H, W) uint8 grey."""
+    features: Features
+    drive: str
+    stamp_ns: int
+
+
+@dataclass(frozen=True, eq=False)
 class Ranking:
     """The places of a map that are most like a query, best first."""
 

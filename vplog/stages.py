@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
-    from vplog.data import Bytes, Camera, Features, Frame, Gps, Ints, LogInfo, Odometry, PoseGraph, Ranking, Solution
+    from vplog.data import Bytes, Camera, Features, Frame, Gps, Ints, LogInfo, Odometry, PoseGraph, Ranking, Reference, Solution
 
 
 class EncodedFrame(Protocol):
@@ -94,7 +94,7 @@ class PlaceState(Protocol):
 
 
 class Recogniser(Protocol):
-    def learn(self, references: Iterable[tuple[Bytes, Features]], threads: int) -> PlaceState: ...
+    def learn(self, references: Iterable[Reference], threads: int) -> PlaceState: ...
 
     def load(self, folder: Path, threads: int) -> PlaceState: ...
 

@@ -21,6 +21,7 @@ blocks = st.builds(
 )
 
 
+@limit(max_examples=100, deadline=None)
 @given(blocks, st.floats(0, 1))
 def test_a_lap_later_the_axis_is_at_the_same_point(block: DemoSettings, share: float) -> None:
     lap = route.lap_length(block)
@@ -29,7 +30,7 @@ def test_a_lap_later_the_axis_is_at_the_same_point(block: DemoSettings, share: f
     assert headings[1] - headings[0] == pytest.approx(2 * np.pi, abs=1e-6)
 
 
-@limit(max_examples=30)
+@limit(max_examples=30, deadline=None)
 @given(blocks)
 def test_the_axis_is_run_at_unit_speed_without_a_kink(block: DemoSettings) -> None:
     distance = np.linspace(0, 2 * route.lap_length(block), 4001)

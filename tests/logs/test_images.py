@@ -103,9 +103,28 @@ def test_size_that_the_data_do_not_justify_is_refused_before_it_is_allocated() -
     with pytest.raises(BadMessageError, match="do not hold"):
         grey(ImageMessage(0, "", "mono8", b"", False, 0, 0, 0))
     head = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
-    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+    end = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head)) + end
     with pytest.raises(BadMessageError, match="100000 x 100000"):
         grey(ImageMessage(0, "", "png", bomb, True))
+
+
+def test_cut_files_are_no_half_images() -> None:
+    data = cv2.imencode(".jpg", RNG.integers(0, 256, (40, 50)).astype(np.uint8))[1].tobytes()
+    assert image_size(data + bytes(100)) == (50, 40)  # cameras pad their buffers
+    with pytest.raises(BadMessageError, match="are not a whole JPEG, PNG"):
+        grey(ImageMessage(0, "", "jpeg", data[:-50], True))
+    data = cv2.imencode(".png", RNG.integers(0, 256, (40, 50)).astype(np.uint8))[1].tobytes()
+    claim = data[:33] + b"\xff" + data[34:]  # the length of the first chunk behind the header
+    for bad in (data[:-20], data[: len(data) // 2], claim):
+        with pytest.raises(BadMessageError, match="are not a whole JPEG, PNG"):
+            grey(ImageMessage(0, "", "png", bad, True))
+
+
+@pytest.mark.parametrize("kind", [".jpg", ".png", ".webp"])
+def test_images_of_one_grey_are_not_refused(kind: str) -> None:
+    data = cv2.imencode(kind, np.zeros((2000, 3000), np.uint8))[1].tobytes()
+    assert grey(ImageMessage(0, "", kind, data, True)).shape == (2000, 3000)
 
 
 @given(

@@ -85,12 +85,14 @@ def test_unusable_poses_are_dropped() -> None:
         pose(2, position=np.array([np.nan, 0, 0])),
         pose(3, quaternion=np.zeros(4)),
         pose(4, position=np.full(3, np.inf)),
+        pose(4, position=np.full(3, 1e300)),
+        pose(4, quaternion=np.full(4, 1e300)),
     )
     odometry, notes = track(pose(1), *bad, pose(5, quaternion=2 * QUARTER))
     assert odometry is not None
     assert odometry.stamp_ns.tolist() == [1, 5]
     np.testing.assert_allclose(odometry.odom_from_body[0], odometry.odom_from_body[1])
-    assert "3 poses" in notes
+    assert "5 poses" in notes
     assert track(*bad)[0] is None
 
 

@@ -1,0 +1,1 @@
+"""Local features of images: how they are found, and where they wait for verification."""

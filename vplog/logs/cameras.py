@@ -29,6 +29,8 @@ _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant
 """Coefficients that OpenCV takes for each model."""
 _BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
+_LARGEST_PX = 1e7
+"""px; a longer focal length is damage: telescopes have 1e6."""
 _SAME_SHAPE = 0.01
 """Relative difference of the scales in x and y below which a resized image still fits its calibration: rounding."""
 
@@ -46,7 +48,7 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
     matrix, model, distortion = calibration.matrix, calibration.model, calibration.distortion
     if "image_rect" in name and calibration.projection[0, 0] > 0:
         matrix, model, distortion = calibration.projection[:, :3], "", np.zeros(0)
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+    if not ((np.abs(matrix) < _LARGEST_PX).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         notes.add(f"The calibration of {name} is not set (K[0] = {matrix[0, 0]:g}); the camera counts as uncalibrated.")
         return unknown
     known = _model(model, distortion)

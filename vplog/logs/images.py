@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Float32s
     from vplog.logs.messages import ImageMessage
 
-MAX_PIXELS = 2**27
-"""px of a compressed image that are decoded (134 million: above any camera, below what a PNG bomb claims)."""
+MAX_PIXELS = 2**26
+"""px of a compressed image that are decoded (67 million: above the cameras of vehicles and robots)."""
+MAX_PIXELS_PER_BYTE = 1100
+"""px that a byte of a compressed image may claim: deflate, the tightest of PNG, reaches 1032 bytes per byte, baseline
+and progressive JPEG stay below 512 px. WebP has no such limit; MAX_PIXELS alone bounds it."""
 _DEPTH_HEADER = 12
 """Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -115,9 +118,10 @@ def _imdecode(data: bytes, flags: int) -> Any:
     """OpenCV's decoder, after the size in the file's own header was found believable."""
     size = image_size(data)
     if size is None:
-        raise BadMessageError(f"its {len(data)} bytes are not a JPEG, PNG, WebP, BMP or PNM image")
-    if size[0] * size[1] > MAX_PIXELS:
-        raise BadMessageError(f"{size[0]} x {size[1]} px are more than any camera gives")
+        raise BadMessageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP or PNM image")
+    limit = MAX_PIXELS if data.startswith(b"RIFF") else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
+    if size[0] * size[1] > limit:
+        raise BadMessageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
     try:
         # IGNORE_ORIENTATION: calibration and odometry belong to the sensor's own rows.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -131,8 +135,8 @@ def _imdecode(data: bytes, flags: int) -> Any:
 def image_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that an image file claims in its header; None where it is of another kind or damaged."""
     size = None
-    if data.startswith(_PNG) and len(data) >= 24:
-        size = struct.unpack_from(">II", data, 16)
+    if data.startswith(_PNG):
+        size = _png_size(data)
     elif data[:2] == b"\xff\xd8":
         size = _jpeg_size(data)
     elif data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
@@ -142,6 +146,19 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     elif match := re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD]):
         size = int(match[1]), int(match[2])
     return None if size is None else (size[0], size[1])
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    """None too where a chunk is longer than the file: OpenCV 5.0 allocates what it claims, up to 4 GB."""
+    if data[12:16] != b"IHDR" or len(data) < 33:
+        return None
+    position = len(_PNG)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        if kind == b"IEND":
+            return struct.unpack_from(">II", data, 16)
+        position += 12 + length  # length, type, data, CRC
+    return None
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
@@ -165,6 +182,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
             continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame: ITU T.81, table B.1
             height, width = struct.unpack_from(">HH", data, position + 5)
-            return width, height
+            # Without an end marker behind this (thumbnails lie before it) the file is cut; OpenCV would grey the rest.
+            return (width, height) if data.rfind(b"\xff\xd9") > position else None
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
     return None

@@ -101,7 +101,7 @@ class McapFile:
             raise LogError(f"{self._path} does not start as an MCAP file does.")
         position, ended = len(MAGIC), False
         while not ended:
-            head = self._at(position, _RECORD.size)
+            head = self._at(position, _RECORD.size) if position < self._length else b""
             if len(head) < _RECORD.size:
                 break
             opcode, length = _RECORD.unpack(head)

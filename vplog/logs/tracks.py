@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
 
+_LARGEST = 1e15
+"""m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
+
 
 class PoseTrack:
     """Collects the poses of one odometry topic."""
@@ -45,7 +48,7 @@ class PoseTrack:
     def finish(self, notes: Notes) -> Odometry | None:
         """The odometry, or None where no pose is usable."""
         if self._dropped:
-            notes.add(f"{self._topic}: {plural(self._dropped, 'pose')} with NaN or without a rotation dropped.")
+            notes.add(f"{self._topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
         stamp_ns, rows = self._stamps.order(self._topic, notes)
         if not len(rows):
             return None
@@ -75,7 +78,7 @@ def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
     variance: -1 first is ROS's mark for unknown) are NaN.
     """
     variances = np.diagonal(logged, axis1=1, axis2=2)
-    usable = np.asarray(np.isfinite(logged).all((1, 2)) & (variances >= 0).all(1) & logged.any((1, 2)))
+    usable = np.asarray((np.abs(logged) < _LARGEST).all((1, 2)) & (variances >= 0).all(1) & logged.any((1, 2)))
     result = logged[:, _ROTATION_FIRST][:, :, _ROTATION_FIRST]
     turn = np.zeros_like(result)
     turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(odom_from_body[:, :3, :3], 1, 2)
@@ -111,7 +114,7 @@ class FixTrack:
             return None
         fixes = [self._fixes[row] for row in rows]
         covariance = np.array([fix.covariance for fix in fixes])
-        covariance[~covariance.any((1, 2))] = np.nan
+        covariance[~(covariance.any((1, 2)) & (np.abs(covariance) < _LARGEST).all((1, 2)))] = np.nan
         return Gps(
             stamp_ns,
             np.array([fix.latitude_deg for fix in fixes], np.float64),

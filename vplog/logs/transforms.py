@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from vplog.data import Floats
     from vplog.logs.messages import TransformMessage
 
+FARTHEST_M = 1e9
+"""m; positions in map coordinates reach 1e7, so a coordinate beyond this is damage."""
+SMALLEST = 1e-6
+"""Largest component of a quaternion below which none was set; real ones have length 1, to a few digits."""
+
 
 class FrameTree:
     """Static transforms between named frames; a later transform of the same pair replaces an earlier one."""
@@ -58,8 +63,9 @@ def clean(frame: str) -> str:
 
 
 def usable_pose(position: Floats, quaternion: Floats) -> Floats | None:
-    """(4, 4), or None where it is NaN, infinite or its quaternion is zero (norm below 1e-6: nothing was set)."""
-    finite = bool(np.isfinite(position).all() and np.isfinite(quaternion).all())
-    if not finite or float(np.linalg.norm(quaternion)) < 1e-6:
+    """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond FARTHEST_M) or no rotation is set."""
+    placed = bool((np.abs(position) < FARTHEST_M).all())  # False for NaN
+    length = float(np.abs(quaternion).max())
+    if not placed or not np.isfinite(quaternion).all() or not SMALLEST < length < 1 / SMALLEST:
         return None
     return geometry.pose(geometry.rotation(quaternion), position)

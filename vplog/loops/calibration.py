@@ -62,11 +62,11 @@ def rotation_share(driven: Floats, seen: Floats, settings: CalibrationSettings) 
 def motion_covariance(match_from_query: Floats, share: float) -> Floats:
     """(6, 6) what a calibration that is wrong by `share` adds to a closure, in the query's frame.
 
-    It stretches rotation and translation, and what it does across them hangs on the scene: all directions get the share
-    of their length.
+    It stretches rotation and translation, and what it does across them hangs on the scene: an error as long as the
+    share of their length, in any direction.
     """
     turned, moved = geometry.so3_log(match_from_query[:3, :3]), match_from_query[:3, 3]
     result = np.zeros((6, 6))
     result[:3, :3] = (turned @ turned) * np.eye(3)
     result[3:, 3:] = (moved @ moved) * np.eye(3)
-    return share**2 * result
+    return share**2 / 3.0 * result  # three axes share the length

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
 from vplog import geometry
 from vplog.loops import matching, undistort
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 class LandmarkSettings(Settings):
     """How the features of a map frame get their 3D position."""
 
-    neighbours: int = 2
+    neighbours: int = Field(default=2, ge=1, le=20)
     """Keyframes before and after the map frame that its features are triangulated with."""
-    pixel_sigma: float = 0.7
-    """Standard deviation in px of a feature's position along each axis; a SIFT point repeats to about a pixel."""
+    pixel_sigma: float = Field(default=0.7, gt=0.0)
+    """Standard deviation in px of a feature's position along each axis; a SIFT point repeats to 0.5 to 1 px."""
     depth_sigma: float = 1.425e-3
     """Standard deviation in 1/m of measured inverse depth, so that sigma_z = depth_sigma z^2: Khoshelham & Elberink
     2012, section 3.2, for the Kinect (1.425e-3 m^-1)."""
@@ -38,7 +39,7 @@ class LandmarkSettings(Settings):
     """Further error of measured depth as a share of it: registration to the colour image and its calibration."""
     depth_range_m: float = 20.0
     """Measured depths beyond this are taken as unknown: twice the longest range of common depth cameras."""
-    odometry_rotation: float = 0.005
+    odometry_rotation: float = Field(default=0.005, gt=0.0)
     """Standard deviation in rad of the odometry's rotation between neighbouring keyframes, before images refine it."""
     odometry_share: float = 0.02
     """Standard deviation of the odometry's translation between neighbouring keyframes, as a share of its length."""
@@ -46,8 +47,8 @@ class LandmarkSettings(Settings):
     """A landmark is known where its inverse depth is this many sigmas above zero: its depth is then sure to a third,
     and a point at infinity passes once in a thousand."""
     gate_px: float = 4.0
-    """Reprojection error in px beyond which an observation leaves its track: four sigmas of the default noise."""
-    iterations: int = 5
+    """Reprojection error in px beyond which an observation leaves its track: four to six sigmas."""
+    iterations: int = Field(default=5, ge=1)
     """Gauss-Newton steps of the window's bundle adjustment; odometry starts it within its linear range."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
 from vplog.settings import Settings
 
@@ -18,10 +19,10 @@ _EXACT = 1 << 24
 class MatchSettings(Settings):
     """Which features of two images are taken for the same point."""
 
-    features: int = 1000
+    features: int = Field(default=1000, ge=1)
     """How many features of each image are matched, the strongest ones; time grows with its square, and 1000 SIFT
     already give hundreds of matches for a revisit."""
-    ratio: float = 0.75
+    ratio: float = Field(default=0.75, gt=0.0, le=1.0)
     """A match is kept when its distance is below this share of the second best's: Lowe 2004, section 7.1, fig. 11,
     where 0.8 drops 90 % of the wrong matches; 0.75 halves the rest, so that most wrong candidates end here."""
 
@@ -41,11 +42,13 @@ def match(a: Bytes, b: Bytes, ratio: float) -> tuple[Ints, Ints]:
     mutual = best == distances.min(axis=0)[best_b]
     distances[rows, best_b] = np.inf
     second = distances.min(axis=1)
+    distances[rows, best_b] = best
     # in double, where both sides are exact up to one rounding of ratio^2
     distinct = best.astype(np.float64) < ratio**2 * second.astype(np.float64)
     chosen = np.flatnonzero(mutual & distinct)
-    _, first = np.unique(best_b[chosen], return_index=True)  # two rows of a at the same distance: the lower one
-    chosen = chosen[np.sort(first)]
+    chosen = chosen[
+        distances[:, best_b[chosen]].argmin(axis=0) == chosen
+    ]  # of rows of a at the same distance: the first
     return chosen, best_b[chosen]
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
 from vplog.settings import Settings
 
@@ -21,9 +22,9 @@ class ProposeSettings(Settings):
     """Which earlier keyframes are worth a look. The gaps count keyframes, whose spacing follows the drive's own scale:
     a car's is metres, a hand-held camera's centimetres."""
 
-    per_query: int = 10
+    per_query: int = Field(default=10, ge=1)
     """Candidates kept for each keyframe."""
-    gap_keyframes: int = 30
+    gap_keyframes: int = Field(default=30, ge=0)
     """A match is at least this many keyframes earlier, but never more than a quarter of the drive: until then much of
     the view is still the same, and a closure tells odometry nothing new."""
     gap_steps: float = 30.0
@@ -33,7 +34,7 @@ class ProposeSettings(Settings):
     """And at least this many seconds earlier; 0 leaves it to the other gaps."""
     gap_m: float = 0.0
     """And at least this many metres of path earlier; 0 leaves it to the other gaps."""
-    suppress: int = 1
+    suppress: int = Field(default=1, ge=0)
     """Candidates within this many keyframes of a better one of the same query are left out: they show what it shows."""
 
 
@@ -67,7 +68,8 @@ def candidate_stops(keyframes: Keyframes, settings: ProposeSettings) -> Ints:
     gap_ns = int(settings.gap_s * 1e9)
     by_rows = np.arange(count) - max(gap_rows, 1) + 1
     by_time = np.searchsorted(keyframes.stamp_ns, keyframes.stamp_ns - gap_ns, side="right")
-    by_path = np.searchsorted(path_m, path_m - gap_m, side="right")
+    # even spacing puts a keyframe right on the gap, where the rounding of the sum must not decide
+    by_path = np.searchsorted(path_m, path_m - gap_m * (1.0 - 1e-6), side="right")
     return np.maximum(np.minimum(np.minimum(by_rows, by_time), by_path), 0).astype(np.int64)
 
 

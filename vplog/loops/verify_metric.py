@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from vplog import geometry
 from vplog.data import Verdict
@@ -27,12 +28,14 @@ _HUBER = 1.5
 """Sigmas beyond which an error counts linearly: 96 % as efficient as least squares on Gaussian errors (Huber 1981)."""
 _STEPS = 5
 """Gauss-Newton steps each time; RANSAC starts within the linear range and two or three converge."""
+_SINGULAR = 1e12
+"""Condition of the Hessian beyond which its inverse has no digit left that a sensor could have measured."""
 
 
 class MetricSettings(Settings):
     """When a pose between two keyframes is believed, and how much."""
 
-    min_inliers: int = 20
+    min_inliers: int = Field(default=20, ge=6)
     """Matches that must agree with the pose; RTAB-Map's and ORB-SLAM's usual bound, well above chance."""
     min_share: float = 0.25
     """Share of the matches with landmarks that must agree: repeated structure lets a wrong pose gather some."""
@@ -133,6 +136,8 @@ def solve(
     moved = match_from_query[:3, 3]
     if np.linalg.norm(moved) > settings.max_depths * depth_m:
         return Pose(Verdict.IMPLAUSIBLE_POSE, count, spread)
+    if np.linalg.cond(hessian) > _SINGULAR:  # such as landmarks on one line through the camera
+        return Pose(Verdict.DEGENERATE_MOTION, count, spread)
     pose_covariance = np.asarray(np.linalg.inv(hessian), np.float64) * max(1.0, excess)
     pose_covariance[:3, :3] += settings.rotation_floor**2 * np.eye(3)
     pose_covariance[3:, 3:] += (settings.translation_floor * depth_m) ** 2 * np.eye(3)
@@ -164,6 +169,8 @@ def _refine(
         total = noise + by_point @ covariance @ np.swapaxes(by_point, 1, 2)
         total[~deep, 2, :] = total[~deep, :, 2] = 0.0  # no depth was measured: only the two image errors speak
         total[~deep, 2, 2] = 1.0
+        lost = ~np.isfinite(predicted).all(axis=1)  # a step took them behind the query: they say nothing
+        by_pose[lost], predicted[lost], total[lost] = 0.0, measured[lost], np.eye(3)
         residual = predicted - measured
         residual[~deep, 2] = 0.0
         by_pose[~deep, 2] = 0.0

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vplog.errors import LogError
+from vplog.loops import undistort
+
+from .scene import camera
+
+LENSES = [
+    ("none", []),
+    ("plumb_bob", [0.0] * 5),
+    ("plumb_bob", [-0.28, 0.09, 1e-3, -5e-4]),
+    ("plumb_bob", [-0.37, 0.2, 2e-4, 3e-4, -0.05]),
+    ("rational_polynomial", [0.9, 0.3, 1e-4, -2e-4, 0.02, 1.25, 0.5, 0.08]),
+    ("equidistant", [-0.013, 0.02, -0.012, 0.0026]),
+    ("equidistant", []),
+]
+
+
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_pixels_to_rays_and_back(model: str, distortion: list[float]) -> None:
+    lens = camera(model, distortion)
+    grid = np.stack(np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 479, 13)), axis=-1).reshape(-1, 2)
+    rays = undistort.rays(lens, grid)
+    good = np.isfinite(rays).all(axis=1)
+    assert good.mean() > 0.9
+    depth = np.random.default_rng(0).uniform(0.5, 50, (len(grid), 1))
+    back = undistort.project(lens, np.column_stack([rays, np.ones(len(rays))])[good] * depth[good])
+    np.testing.assert_allclose(back, grid[good], atol=1e-5)
+
+
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_points_to_pixels_and_back(model: str, distortion: list[float]) -> None:
+    lens = camera(model, distortion)
+    rays = np.random.default_rng(1).uniform(-0.45, 0.45, (200, 2))
+    pixels = undistort.project(lens, np.column_stack([rays, np.ones(len(rays))]))
+    np.testing.assert_allclose(undistort.rays(lens, pixels), rays, atol=1e-8)
+
+
+def test_a_fisheye_without_coefficients_is_not_a_pinhole() -> None:
+    point = np.array([[1.0, 0.0, 1.0]])
+    assert undistort.project(camera("equidistant"), point)[0, 0] == pytest.approx(320 + 500 * np.pi / 4)
+
+
+def test_where_the_lens_has_no_inverse_there_is_no_ray() -> None:
+    lens = camera("plumb_bob", [-0.6, 0.0, 0.0, 0.0])  # r (1 - 0.6 r^2) never exceeds 0.497
+    found = undistort.rays(lens, np.array([[320.0, 240.0], [320.0 + 500 * 0.6, 240.0]]))
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1]).all()
+
+
+def test_nothing_in_nothing_out() -> None:
+    assert undistort.rays(camera("equidistant"), np.empty((0, 2))).shape == (0, 2)
+    assert undistort.project(camera(), np.empty((0, 3))).shape == (0, 2)
+
+
+def test_points_behind_have_no_pixel() -> None:
+    assert np.isnan(undistort.project(camera(), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]))).all()
+
+
+def test_unknown_lenses_are_named() -> None:
+    with pytest.raises(LogError, match=r"'fov'.*plumb_bob"):
+        undistort.rays(replace(camera(), distortion_model="fov"), np.zeros((1, 2)))
+    with pytest.raises(LogError, match="no matrix"):
+        undistort.focal_px(camera(calibrated=False))

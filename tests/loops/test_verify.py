@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from vplog import geometry
+from vplog.data import Camera, Closures, Features, Keyframes, Verdict
+from vplog.errors import LogError
+from vplog.loops import verify_metric
+from vplog.loops.landmarks import LandmarkSettings
+from vplog.loops.verify import VerifySettings, verify
+from vplog.loops.verify_metric import MetricSettings
+
+from .scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, view
+
+EXACT = VerifySettings(landmarks=LandmarkSettings(pixel_sigma=NOISE_PX, depth_share=0.0))
+COLUMNS = ("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread")
+LAP = 16
+"""Keyframes of the first pass; the second comes back over the same road, off to the side."""
+
+
+@lru_cache(maxsize=8)
+def drive(depth: bool, model: str = "none") -> tuple[Camera, Keyframes, np.ndarray, list[Features]]:
+    rng = np.random.default_rng(11)
+    lens = camera(model, {"none": (), "equidistant": (0.01,) * 4, "plumb_bob": (-0.2, 0.05, 1e-3, 0.0)}[model])
+    place = scene(rng)
+    there = [pose(1.2 * i, 0.2 * np.sin(i), yaw=0.05 * np.sin(i / 3)) for i in range(LAP)]
+    back = [
+        pose(1.2 * i + rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), 0.03)
+        for i in range(LAP)
+    ]
+    poses = np.array(there + back)
+    return lens, keyframes(list(poses)), poses, [view(place, p, lens, rng, depth) for p in poses]
+
+
+def lap_pairs() -> list[tuple[int, int]]:
+    return [(LAP + i, i) for i in range(LAP)]
+
+
+def sigmas(ledger: Closures, poses: np.ndarray) -> np.ndarray:
+    """(C,) Mahalanobis distance to the truth over sqrt(6)."""
+    error = geometry.log(
+        geometry.between(geometry.between(poses[ledger.match], poses[ledger.query]), ledger.match_from_query)
+    )
+    return np.sqrt(np.einsum("ni,nij,nj->n", error, ledger.information, error) / 6)
+
+
+@pytest.mark.parametrize(
+    ("depth", "model"), [(False, "none"), (False, "plumb_bob"), (True, "none"), (True, "equidistant")]
+)
+def test_revisits_are_found_with_the_pose_and_the_certainty_they_have(depth: bool, model: str) -> None:
+    lens, frames, poses, seen = drive(depth, model)
+    ledger = verify(proposals(lap_pairs()), frames, lens, seen.__getitem__, EXACT)
+    accepted = [v is Verdict.ACCEPTED for v in ledger.verdict]
+    assert sum(accepted) >= LAP - 3
+    rows = np.flatnonzero(accepted)
+    part = replace(
+        ledger,
+        query=ledger.query[rows],
+        match=ledger.match[rows],
+        match_from_query=ledger.match_from_query[rows],
+        information=ledger.information[rows],
+    )
+    moved = geometry.between(geometry.between(poses[part.match], poses[part.query]), part.match_from_query)
+    assert np.median(np.linalg.norm(moved[:, :3, 3], axis=1)) < 0.05
+    assert np.median(geometry.angle(moved)) < 0.003
+    assert np.isfinite(part.information).all()
+    np.testing.assert_allclose(part.information, np.swapaxes(part.information, 1, 2))
+    assert (np.linalg.eigvalsh(part.information) > 0).all()
+    # floors and the odometry's scale make it careful; never sure of what is wrong
+    assert np.median(sigmas(part, poses)) < 1.2
+    assert sigmas(part, poses).max() < 3.0
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_without_floors_the_covariance_is_the_errors_own(depth: bool) -> None:
+    lens, frames, poses, seen = drive(depth)
+    bare = EXACT.model_copy(
+        update={
+            "metric": MetricSettings(rotation_floor=0.0, translation_floor=0.0, scale_share=0.0),
+            "calibration": EXACT.calibration.model_copy(update={"least_share": 0.0}),
+        }
+    )
+    pairs = [(LAP + i, i + k) for i in range(LAP) for k in (-1, 0) if i + k >= 0]
+    ledger = verify(proposals(pairs), frames, lens, seen.__getitem__, bare)
+    ratio = sigmas(ledger, poses)[[v is Verdict.ACCEPTED for v in ledger.verdict]]
+    assert len(ratio) > 24
+    assert 0.6 < np.sqrt(np.mean(ratio**2)) < 2.0
+
+
+def test_other_places_are_rejected_and_carry_no_pose() -> None:
+    lens, frames, _, seen = drive(False)
+    rng = np.random.default_rng(1)
+    elsewhere = [view(scene(rng), pose(0), lens, rng) for _ in range(LAP)]
+    for other in elsewhere:  # half of each image's descriptors are the road's: matches without geometry
+        count = len(other) // 2
+        source = seen[int(rng.integers(LAP))].descriptors
+        other.descriptors[:count] = source[rng.choice(len(source), count, replace=False)]
+    both = seen[:LAP] + elsewhere
+    ledger = verify(proposals(lap_pairs()), frames, lens, both.__getitem__, EXACT)
+    assert not any(v is Verdict.ACCEPTED for v in ledger.verdict)
+    assert (ledger.matches >= 25).any()  # some did reach the geometry
+    assert np.isnan(ledger.match_from_query).all()
+    assert np.isnan(ledger.information).all()
+    assert np.isnan(ledger.weight).all()
+    for name in COLUMNS:
+        assert np.isfinite(getattr(ledger, name)).all()
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_threads_and_order_change_no_byte(calibrated: bool) -> None:
+    lens, frames, _, seen = drive(False)
+    lens = lens if calibrated else replace(lens, matrix=None)
+    pairs = [(LAP + i, j) for i in range(0, LAP, 4) for j in (i, (i + 7) % LAP)]
+    one, four = (verify(proposals(pairs), frames, lens, seen.__getitem__, EXACT, threads=n) for n in (1, 4))
+    for name in (*COLUMNS, "match_from_query", "information"):
+        assert getattr(one, name).tobytes() == getattr(four, name).tobytes(), name
+    assert one.verdict == four.verdict
+    alone = verify(proposals(pairs[4:5]), frames, lens, seen.__getitem__, EXACT)
+    assert alone.match_from_query.tobytes() == one.match_from_query[4:5].tobytes()
+
+
+def test_uncalibrated_images_agree_or_not_but_have_no_pose() -> None:
+    lens, frames, _, seen = drive(False)
+    lens = replace(lens, matrix=None)
+    near, far = [(LAP + i, i) for i in range(8)], [(LAP + i, i + 8) for i in range(8)]
+    rng = np.random.default_rng(2)
+    shuffled = [replace(f, points=rng.permutation(f.points)) for f in seen]  # the same features, no geometry
+    same = verify(proposals(near), frames, lens, seen.__getitem__, EXACT)
+    none = verify(proposals(near), frames, lens, (seen[:LAP] + shuffled[LAP:]).__getitem__, EXACT)
+    assert set(same.verdict) == {Verdict.NO_CALIBRATION}
+    assert (same.inliers > 100).all()
+    assert set(none.verdict) == {Verdict.TOO_FEW_INLIERS}
+    for ledger in (same, none, verify(proposals(far), frames, lens, seen.__getitem__, EXACT)):
+        assert np.isnan(ledger.match_from_query).all()
+        assert (ledger.landmarks == 0).all()
+
+
+def test_images_without_features_are_too_few_matches() -> None:
+    lens, frames, _, seen = drive(False)
+    blank = [empty(lens) if i % 2 else f for i, f in enumerate(seen)]
+    for given in (blank, [empty(lens)] * len(seen)):
+        ledger = verify(proposals([(LAP, 1), (LAP + 1, 2)]), frames, lens, given.__getitem__, EXACT)
+        assert ledger.verdict == [Verdict.TOO_FEW_MATCHES] * 2
+        assert ledger.matches.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("still", ["standing", "turning"])
+def test_a_map_camera_that_did_not_move_has_no_scale(still: str) -> None:
+    rng = np.random.default_rng(12)
+    lens, place = camera(), scene(rng)
+    swing = 0.04 if still == "turning" else 0.0
+    about = geometry.inverse(lens.body_from_camera)
+    poses = [lens.body_from_camera @ geometry.exp(np.array([0.0, swing * i, 0, 0, 0, 0])) @ about for i in range(5)] + [
+        pose(0.3, 0.4)
+    ]
+    seen = [view(place, p, lens, rng) for p in poses]
+    ledger = verify(proposals([(5, 2)]), keyframes(poses), lens, seen.__getitem__, EXACT)
+    assert ledger.verdict == [Verdict.DEGENERATE_MOTION]
+    assert ledger.matches[0] > 100
+
+
+def test_matches_without_landmarks_and_in_one_corner() -> None:
+    lens, frames, _, seen = drive(True)
+    holes = [replace(f, depth_m=np.where(np.arange(len(f)) < 5, f.depth_m, np.float32(np.nan))) for f in seen]
+    ledger = verify(proposals([(LAP + 3, 3)]), frames, lens, holes.__getitem__, EXACT)
+    assert ledger.verdict == [Verdict.TOO_FEW_LANDMARKS]
+    assert ledger.landmarks[0] <= 5
+
+    rng = np.random.default_rng(9)
+    place = scene(rng, 9000)
+    poses = [pose(0.0), pose(0.3, 0.2)]
+    seen = [view(place, p, lens, rng, depth=True, most=9000) for p in poses]
+    kept = [(np.abs(f.points - [320, 240]) < 75).all(axis=1) for f in seen]  # 150 px square: 7 % of the image
+    small = [
+        replace(f, points=f.points[k], sizes=f.sizes[k], descriptors=f.descriptors[k], depth_m=f.depth_m[k])
+        for f, k in zip(seen, kept, strict=True)
+    ]
+    ledger = verify(proposals([(1, 0)]), keyframes(poses), lens, small.__getitem__, EXACT)
+    assert ledger.verdict == [Verdict.POOR_SPREAD]
+
+
+def test_a_pose_too_far_to_share_the_view_is_implausible() -> None:
+    rng = np.random.default_rng(13)
+    lens = camera()
+    place = replace(scene(rng), points=rng.uniform([9, -3, -2], [11, 3, 3], (3000, 3)))  # a wall 10 m ahead
+    poses = [pose(0.0), pose(6.5)]
+    seen = [view(place, p, lens, rng, depth=True) for p in poses]
+    settings = EXACT.model_copy(update={"metric": MetricSettings(min_spread=0.0)})
+    ledger = verify(proposals([(1, 0)]), keyframes(poses), lens, seen.__getitem__, settings)
+    assert ledger.verdict == [Verdict.IMPLAUSIBLE_POSE]
+    assert np.isnan(ledger.match_from_query).all()
+
+
+def test_a_wall_is_no_obstacle_where_depth_is_measured() -> None:
+    rng = np.random.default_rng(14)
+    lens = camera()
+    flat = rng.uniform([10, -9, -7], [10.001, 9, 7], (3000, 3))
+    place = replace(scene(rng), points=flat)
+    poses = np.array([pose(0.0), pose(0.5, 0.4, yaw=0.1)])
+    seen = [view(place, p, lens, rng, depth=True) for p in poses]
+    ledger = verify(proposals([(1, 0)]), keyframes(list(poses)), lens, seen.__getitem__, EXACT)
+    assert ledger.verdict == [Verdict.ACCEPTED]
+    assert sigmas(ledger, poses)[0] < 2.5
+
+
+def test_a_wrong_focal_length_is_noticed_and_claims_less(caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(15)
+    lens, place = camera(), scene(rng, 6000)
+    assert lens.matrix is not None
+    poses = np.array([pose(0.1 * i, yaw=0.35 * np.sin(i / 3)) for i in range(40)])
+    seen = [view(place, p, lens, rng, depth=True) for p in poses]
+    wrong = replace(lens, matrix=lens.matrix * [[1.12, 1, 1], [1, 1.12, 1], [1, 1, 1]])
+    pairs = proposals([(34, 0), (33, 1)])  # 20 degrees apart
+    good = verify(pairs, keyframes(list(poses)), lens, seen.__getitem__, EXACT)
+    assert not caplog.records
+    bad = verify(pairs, keyframes(list(poses)), wrong, seen.__getitem__, EXACT)
+    assert "focal length" in caplog.text
+    assert good.verdict == bad.verdict == [Verdict.ACCEPTED] * 2
+    trace = [np.trace(np.linalg.inv(ledger.information[0])[:3, :3]) for ledger in (good, bad)]
+    assert trace[1] > 2.0 * trace[0]
+    assert (sigmas(bad, poses) < 2.0).all()
+
+
+def test_no_candidates_and_progress() -> None:
+    lens, frames, _, seen = drive(False)
+    assert len(verify(proposals([]), frames, lens, seen.__getitem__, EXACT)) == 0
+    calls: list[tuple[int, int]] = []
+    verify(proposals(lap_pairs()[:5]), frames, lens, seen.__getitem__, EXACT, 2, lambda d, t: calls.append((d, t)))
+    assert calls == [(i + 1, 5) for i in range(5)]
+
+
+def test_an_unknown_lens_stops_before_the_work() -> None:
+    lens, frames, _, _ = drive(False)
+    with pytest.raises(LogError, match="distortion model"):
+        verify(proposals([(LAP, 0)]), frames, replace(lens, distortion_model="fov"), lambda _: 1 / 0, EXACT)  # type: ignore[arg-type]
+
+
+def test_derivatives_of_the_pose_agree_with_differences() -> None:
+    rng = np.random.default_rng(8)
+    at = geometry.exp(rng.normal(0, 0.1, 6))
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (4, 2)), rng.uniform(0.05, 0.5, 4)])
+    here, by_pose, by_point = verify_metric._predict(at, points)
+    step = 1e-6
+    for axis in range(6):
+        moved, _, _ = verify_metric._predict(at @ geometry.exp(step * np.eye(6)[axis]), points)
+        np.testing.assert_allclose(by_pose[..., axis], (moved - here) / step, atol=1e-5)
+    for axis in range(3):
+        moved, _, _ = verify_metric._predict(at, points + step * np.eye(3)[axis])
+        np.testing.assert_allclose(by_point[..., axis], (moved - here) / step, atol=1e-5)

@@ -1,0 +1,64 @@
+"""SIFT (Lowe 2004) through OpenCV, as rows of bytes: 128 integers of 0..255 a feature."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+
+from vplog.data import Bytes, Features, Float32s
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class SiftSettings(Settings):
+    """SIFT of one image, strongest features first."""
+
+    kind: Literal["sift"] = "sift"
+    """Which extractor."""
+    max_features: int = 1200
+    """Features kept of an image, by response; 800 describe a place, verification takes them all."""
+    contrast_threshold: float = 0.04
+    """Weakest extremum kept, OpenCV's and Lowe's default."""
+    max_megapixels: float = 0.5
+    """Larger images are halved in both directions until they are below; points stay in px of the full image."""
+
+    def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
+        """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points."""
+        height, width = image.shape
+        small, halvings = image, 0
+        while small.size > self.max_megapixels * 1e6:
+            small, halvings = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), halvings + 1
+        detector = cv2.SIFT.create(nfeatures=self.max_features, contrastThreshold=self.contrast_threshold)
+        keypoints, found = detector.detectAndCompute(small, None)
+        if not keypoints:
+            nothing = np.zeros(0, np.float32)
+            return Features(np.zeros((0, 2), np.float32), nothing, np.zeros((0, 128), np.uint8), nothing, width, height)
+        points = np.array([keypoint.pt for keypoint in keypoints], np.float32)
+        response = np.array([keypoint.response for keypoint in keypoints], np.float32)
+        sizes = np.array([keypoint.size for keypoint in keypoints], np.float32)
+        angles = np.array([keypoint.angle for keypoint in keypoints], np.float32)
+        # OpenCV keeps every feature that ties with the last; a full order makes the cut the same everywhere
+        order = np.lexsort((angles, sizes, points[:, 0], points[:, 1], -response))[: self.max_features]
+        scale = 2.0**halvings
+        points = (points[order] + 0.5) * np.float32(scale) - 0.5  # pixel centres, not corners, are the origin
+        return Features(
+            points=points.astype(np.float32),
+            sizes=sizes[order] * np.float32(scale),
+            descriptors=found[order].astype(np.uint8),  # OpenCV's values are whole numbers already
+            depth_m=_depth_at(points, depth_m),
+            width=width,
+            height=height,
+        )
+
+
+def _depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:
+    """(M,) depth of the pixel each point falls in, NaN where there is none."""
+    if depth_m is None:
+        return np.full(len(points), np.nan, np.float32)
+    column = np.clip(np.rint(points[:, 0]).astype(np.int64), 0, depth_m.shape[1] - 1)
+    row = np.clip(np.rint(points[:, 1]).astype(np.int64), 0, depth_m.shape[0] - 1)
+    return depth_m[row, column]

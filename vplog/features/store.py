@@ -1,0 +1,72 @@
+"""Features of every keyframe on disk, so that memory does not grow with the drive."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from vplog.data import Features
+from vplog.errors import ResultError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_ROW_BYTES = 4 * 4 + 128
+"""x, y, size, depth as float32, then the descriptor."""
+
+
+class FeatureStore:
+    """A scratch file of features, one keyframe after the other. Removed on exit; reads are safe from any thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._entries: list[tuple[int, int, int, int]] = []
+        self._lock = threading.Lock()
+        try:
+            self._file = path.open("w+b")
+        except OSError as error:
+            raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._path.unlink(missing_ok=True)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def append(self, features: Features) -> None:
+        """Store the next keyframe's features. Raises ResultError where the disk is full."""
+        floats = np.column_stack([features.points, features.sizes, features.depth_m]).astype("<f4")
+        try:
+            with self._lock:
+                offset = self._file.seek(0, 2)
+                self._file.write(floats.tobytes())
+                self._file.write(features.descriptors.tobytes())
+                self._file.flush()
+        except OSError as error:
+            raise ResultError(
+                f"Cannot store features in {self._path}: {error.strerror}. "
+                f"They need about {_ROW_BYTES * 1200 // 1000} kB per keyframe while the run lasts."
+            ) from None
+        self._entries.append((offset, len(features), features.width, features.height))
+
+    def __getitem__(self, row: int) -> Features:
+        """The features of keyframe `row`."""
+        offset, count, width, height = self._entries[row]
+        with self._lock:
+            self._file.seek(offset)
+            data = self._file.read(count * _ROW_BYTES)
+        floats = np.frombuffer(data, "<f4", count * 4).reshape(count, 4)
+        return Features(
+            points=np.ascontiguousarray(floats[:, :2]),
+            sizes=floats[:, 2],
+            descriptors=np.frombuffer(data, np.uint8, count * 128, count * 16).reshape(count, 128),
+            depth_m=floats[:, 3],
+            width=width,
+            height=height,
+        )
