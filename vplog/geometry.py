@@ -64,7 +64,7 @@ def so3_log(rotation: Floats) -> Floats:
     norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(norm, q[..., 3:])
     scale = np.where(norm < _SMALL_ANGLE, 2.0, angle / np.where(norm < _SMALL_ANGLE, 1.0, norm))
-    return q[..., :3] * scale
+    return np.asarray(q[..., :3] * scale, np.float64)
 
 
 def exp(xi: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -10,13 +10,28 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
-    from vplog.data import Bytes, Camera, Features, Frame, Gps, Ints, LogInfo, Odometry, PoseGraph, Ranking, Reference, Solution
+    from vplog.data import (
+        Bytes,
+        Camera,
+        Features,
+        Float32s,
+        Frame,
+        Gps,
+        Ints,
+        LogInfo,
+        Odometry,
+        PoseGraph,
+        Ranking,
+        Reference,
+        Solution,
+    )
 
 
 class EncodedFrame(Protocol):
     """An image as the log holds it. Reading is sequential; decoding is the workers' job, and only for keyframes."""
 
-    stamp_ns: int
+    @property
+    def stamp_ns(self) -> int: ...
 
     def decode(self) -> Frame:
         """The grey image with its depth. Raises LogError where the bytes are not an image."""
@@ -53,13 +68,13 @@ class Log(Protocol):
 
 
 class Extractor(Protocol):
-    def __call__(self, image: Bytes, depth_m: object | None = None) -> Features: ...
+    def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features: ...
 
 
 class PlaceIndex(Protocol):
     """A map of places, rebuilt from descriptors alone."""
 
-    def query(self, descriptor: object, k: int, stop: int | None = None) -> Ranking:
+    def query(self, descriptor: Any, k: int, stop: int | None = None) -> Ranking:
         """The k best rows below `stop` (all rows where None). Rows that share nothing are left out."""
         ...
 
@@ -82,13 +97,13 @@ class PlaceState(Protocol):
         """Size of one place descriptor, in bits."""
         ...
 
-    def describe(self, features: Features) -> object: ...
+    def describe(self, features: Features) -> Any: ...
 
-    def to_arrow(self, descriptors: Sequence[object]) -> pa.Array: ...
+    def to_arrow(self, descriptors: Sequence[Any]) -> pa.Array: ...
 
-    def from_arrow(self, column: pa.Array) -> Sequence[object]: ...
+    def from_arrow(self, column: pa.Array) -> Sequence[Any]: ...
 
-    def index(self, descriptors: Sequence[object]) -> PlaceIndex: ...
+    def index(self, descriptors: Sequence[Any]) -> PlaceIndex: ...
 
     def save(self, folder: Path) -> None: ...
 

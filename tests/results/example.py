@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog import geometry
-from vplog.data import Camera, Closures, EdgeKind, Keyframes, PoseGraph, Solution, Trajectory, Verdict
+from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.results.tables import TableMetadata
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ class Run:
     solution: Solution
     closures: Closures
     trajectory: Trajectory
+    odometry: Odometry
     camera: Camera
 
 
@@ -79,4 +80,5 @@ def make_run(seed: int = 0) -> Run:
     camera_axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     camera = Camera("front", None, "none", np.zeros(0), 640, 480, geometry.pose(camera_axes, np.array([1.0, 0.0, 0.5])))
     solution = Solution(world, rng.random(edges), 9.0, 1.0, 5, True, "The steps became small.")
-    return Run(keyframes, graph, solution, closures, Trajectory(keyframes.stamp_ns, world), camera)
+    odometry = Odometry(keyframes.stamp_ns, odom, None)
+    return Run(keyframes, graph, solution, closures, Trajectory(keyframes.stamp_ns, world), odometry, camera)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from vplog.pipeline import pipeline_schema
 from vplog.results import messages
 from vplog.results.contracts import table_schemas, write_schemas
 
@@ -10,12 +11,12 @@ SCHEMAS = Path(__file__).parents[2] / "schemas"
 
 
 def test_contracts_in_the_repository_are_those_of_the_code(tmp_path: Path) -> None:
-    for path in write_schemas(tmp_path):
+    for path in write_schemas(tmp_path, pipeline_schema()):
         assert (SCHEMAS / path.name).read_text() == path.read_text(), f"run `vplog schemas`: {path.name} has changed"
 
 
 def test_every_column_has_a_description_and_every_number_a_unit(tmp_path: Path) -> None:
-    write_schemas(tmp_path)
+    write_schemas(tmp_path, pipeline_schema())
     for name, schema in table_schemas().items():
         columns = json.loads((tmp_path / f"{name}.json").read_text())["columns"]
         assert [column["name"] for column in columns] == schema.names

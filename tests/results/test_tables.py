@@ -29,7 +29,7 @@ def write_all(folder: Path) -> list[Path]:
     tables.write_keyframes(paths[0], RUN.keyframes, RUN.solution.world_from_body, METADATA)
     tables.write_closures(paths[1], RUN.closures, RUN.keyframes, METADATA)
     tables.write_edges(paths[2], RUN.graph, RUN.solution, METADATA)
-    tables.write_trajectory(paths[3], RUN.trajectory, METADATA)
+    tables.write_trajectory(paths[3], RUN.trajectory, RUN.odometry, METADATA)
     column = pa.array([bytes([row]) for row in range(COUNT)], pa.binary())
     tables.write_descriptors(paths[4], RUN.keyframes, [column], pa.binary(), METADATA)
     return paths
@@ -88,8 +88,10 @@ def test_edge_residual_is_the_distance_gtsam_computes() -> None:
 
 
 def test_trajectory_comes_back(tmp_path: Path) -> None:
-    tables.write_trajectory(tmp_path / "t", RUN.trajectory, METADATA)
-    assert_same(tables.read_trajectory(tmp_path / "t"), RUN.trajectory, ("world_from_body",))
+    tables.write_trajectory(tmp_path / "t", RUN.trajectory, RUN.odometry, METADATA)
+    trajectory, odometry = tables.read_trajectory(tmp_path / "t")
+    assert_same(trajectory, RUN.trajectory, ("world_from_body",))
+    np.testing.assert_allclose(odometry.odom_from_body, RUN.odometry.odom_from_body, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [pa.binary(), pa.list_(pa.int32()), pa.list_(pa.float32(), 4)], ids=str)
@@ -152,7 +154,7 @@ def test_duckdb_reads_every_table(tmp_path: Path) -> None:
 
 
 def test_quaternions_are_unit_with_w_not_negative(tmp_path: Path) -> None:
-    tables.write_trajectory(tmp_path / "t", RUN.trajectory, METADATA)
+    tables.write_trajectory(tmp_path / "t", RUN.trajectory, RUN.odometry, METADATA)
     table = pq.read_table(tmp_path / "t")
     q = np.stack([table[f"q{axis}"].to_numpy() for axis in "xyzw"], axis=1)
     assert (q[:, 3] >= 0).all()
@@ -163,7 +165,7 @@ def test_quaternions_are_unit_with_w_not_negative(tmp_path: Path) -> None:
 def test_reading_what_is_not_there_or_not_ours_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "text").write_text("no table")
     pq.write_table(pa.table({"a": [1]}), tmp_path / "other")
-    tables.write_trajectory(tmp_path / "trajectory", RUN.trajectory, METADATA)
+    tables.write_trajectory(tmp_path / "trajectory", RUN.trajectory, RUN.odometry, METADATA)
     whole = (tmp_path / "trajectory").read_bytes()
     (tmp_path / "cut").write_bytes(whole[: len(whole) // 2])
     for name in ("missing", "text", "other", "trajectory", "cut"):
@@ -174,7 +176,7 @@ def test_reading_what_is_not_there_or_not_ours_is_one_line(tmp_path: Path) -> No
 
 
 def test_missing_column_is_named(tmp_path: Path) -> None:
-    tables.write_trajectory(tmp_path / "t", RUN.trajectory, METADATA)
+    tables.write_trajectory(tmp_path / "t", RUN.trajectory, RUN.odometry, METADATA)
     table = pq.read_table(tmp_path / "t").drop_columns(["qw"])
     pq.write_table(table, tmp_path / "t")
     with pytest.raises(ResultError, match="no column qw"):
@@ -182,7 +184,7 @@ def test_missing_column_is_named(tmp_path: Path) -> None:
 
 
 def test_null_where_none_may_be_is_named(tmp_path: Path) -> None:
-    tables.write_trajectory(tmp_path / "t", RUN.trajectory, METADATA)
+    tables.write_trajectory(tmp_path / "t", RUN.trajectory, RUN.odometry, METADATA)
     table = pq.read_table(tmp_path / "t")
     stamps = pa.array([None] * COUNT, pa.int64())
     table = table.set_column(0, pa.field("stamp_ns", pa.int64()), stamps)

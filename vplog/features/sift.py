@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Literal
 import cv2
 import numpy as np
 
-from vplog.data import Bytes, Features, Float32s
+from vplog.data import Features
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from vplog.data import Bytes, Float32s
 
 
 class SiftSettings(Settings):

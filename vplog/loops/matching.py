@@ -46,9 +46,8 @@ def match(a: Bytes, b: Bytes, ratio: float) -> tuple[Ints, Ints]:
     # in double, where both sides are exact up to one rounding of ratio^2
     distinct = best.astype(np.float64) < ratio**2 * second.astype(np.float64)
     chosen = np.flatnonzero(mutual & distinct)
-    chosen = chosen[
-        distances[:, best_b[chosen]].argmin(axis=0) == chosen
-    ]  # of rows of a at the same distance: the first
+    # rows of a at the same distance: the first
+    chosen = chosen[distances[:, best_b[chosen]].argmin(axis=0) == chosen]
     return chosen, best_b[chosen]
 
 

@@ -21,9 +21,11 @@ _HEADER = {
 }
 
 
-def write_schemas(folder: Path) -> list[Path]:
-    """Write the contracts into a folder; the files written, in order."""
+def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
+    """Write the contracts into a folder; the files written, in order. The pipeline's JSON Schema comes from outside:
+    the settings of all stages are known only to the pipeline."""
     texts = {"vplog.LoopClosure.proto": messages.loop_closure_proto()}
+    texts["pipeline.schema.json"] = json.dumps(pipeline_schema, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
     for name, schema in table_schemas().items():
         texts[f"{name}.json"] = json.dumps(_contract(name, schema), indent=2, ensure_ascii=False) + "\n"
     written = []

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def write_run_json(path: Path, record: dict[str, Any]) -> None:
     """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
-    text = json.dumps(_plain(record), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(plain(record), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with replacing(path) as stream:
         stream.write(text.encode())
 
@@ -38,17 +38,17 @@ def read_run_json(path: Path) -> dict[str, Any]:
 
 def canonical_json(tree: Any) -> str:
     """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
-    return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """The value with numpy scalars, arrays and paths as JSON has them."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):  # numpy scalars and arrays
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, PurePath):
         return str(value)
     if isinstance(value, float) and not math.isfinite(value):

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 import vplog
 from vplog import geometry
-from vplog.data import Closures, EdgeKind, Keyframes, PoseGraph, Trajectory, Verdict
+from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.errors import ResultError
 from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
@@ -114,6 +114,7 @@ TRAJECTORY = pa.schema(
     [
         _column("stamp_ns", pa.int64(), "ns", "Stamp of the odometry sample, in the log's clock."),
         *_pose_columns("", "world_from_body, optimised"),
+        *_pose_columns("odom_", "odom_from_body, as logged"),
     ]
 )
 
@@ -221,16 +222,21 @@ def read_edges(path: Path, world_from_body: Floats) -> tuple[PoseGraph, Floats, 
     return graph, _values(table, "weight"), _values(table, "residual")
 
 
-def write_trajectory(path: Path, trajectory: Trajectory, metadata: TableMetadata) -> None:
-    """trajectory.parquet."""
-    columns = {"stamp_ns": trajectory.stamp_ns, **_pose_values("", trajectory.world_from_body)}
+def write_trajectory(path: Path, trajectory: Trajectory, odometry: Odometry, metadata: TableMetadata) -> None:
+    """trajectory.parquet: every odometry sample as optimised and, sample for sample, as logged."""
+    columns = {
+        "stamp_ns": trajectory.stamp_ns,
+        **_pose_values("", trajectory.world_from_body),
+        **_pose_values("odom_", odometry.odom_from_body),
+    }
     _write(path, "trajectory", TRAJECTORY, columns, metadata)
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """The trajectory."""
+def read_trajectory(path: Path) -> tuple[Trajectory, Odometry]:
+    """The optimised trajectory and the odometry it corrects (its covariance is not in the file)."""
     table = _read(path, "trajectory", TRAJECTORY)
-    return Trajectory(_values(table, "stamp_ns"), _poses(table, ""))
+    stamp_ns = _values(table, "stamp_ns")
+    return Trajectory(stamp_ns, _poses(table, "")), Odometry(stamp_ns, _poses(table, "odom_"), None)
 
 
 def write_descriptors(

@@ -1,0 +1,3 @@
+from vplog.cli import main
+
+main()

@@ -1,0 +1,53 @@
+"""A finished run against the truth: trajectory error before and after, and whether the closures were right."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vplog import logs
+from vplog.data import Trajectory
+from vplog.errors import ResultError, TruthError
+from vplog.evaluate import closures, gps, trajectory
+from vplog.evaluate.truth import read_truth
+from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.results import run_record, tables
+
+
+def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -> dict[str, Any]:
+    """ATE and RPE of odometry and result, and the closures' precision and recall. `truth` is a TUM file or `gps`.
+
+    Raises TruthError or ResultError with one line.
+    """
+    record = run_record.read_run_json(folder / "run.json")
+    if not record.get("finished"):
+        raise ResultError(
+            f"The run in {folder} did not finish. Run it again: vplog run {record.get('log')} -o {folder}"
+        )
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+    if truth == "gps":
+        return {"truth": "gps", **_against_gps(Path(record["log"]), before, after, topics)}
+    known = read_truth(Path(truth))
+    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    ledger = tables.read_closures(folder / "closures.parquet")
+    stops = candidate_stops(keyframes, ProposeSettings.read(record["settings"]["propose"], f"{folder}/run.json"))
+    return {
+        "truth": truth,
+        "ate_before": asdict(trajectory.ate(before, known)),
+        "ate_after": asdict(trajectory.ate(after, known)),
+        "rpe_before": asdict(trajectory.rpe(before, known)),
+        "rpe_after": asdict(trajectory.rpe(after, known)),
+        "closures": asdict(closures.score_closures(keyframes, ledger, known, stops)),
+    }
+
+
+def _against_gps(path: Path, before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None) -> dict[str, Any]:
+    fixes = logs.open(path, topics).gps()
+    if fixes is None or not len(fixes.stamp_ns):
+        raise TruthError(f"{path} has no GPS fixes. Give a truth file: --truth FILE.tum")
+    return {
+        "ate_before": asdict(gps.ate_to_gps(before, fixes)),
+        "ate_after": asdict(gps.ate_to_gps(after, fixes)),
+    }

@@ -1,0 +1,347 @@
+"""The whole job: a tree of settings, and the stages in order."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+import vplog
+from vplog import logs
+from vplog.data import Closures, EdgeKind, Keyframes, Reference, Verdict
+from vplog.errors import LogError, SettingsError
+from vplog.extract import extract_frames, map_in_order, one_thread_each
+from vplog.features.sift import SiftSettings
+from vplog.features.store import FeatureStore
+from vplog.graph import build, consistency, correct
+from vplog.graph.noise import NoiseSettings, edge_covariance
+from vplog.graph.solve import GncSettings, OptimiserSettings
+from vplog.keyframes import KeyframeSettings, select_keyframes
+from vplog.loops.propose import ProposeSettings, propose
+from vplog.loops.verify import VerifySettings, verify
+from vplog.places import PlaceSettings
+from vplog.places.bobb import BobbSettings
+from vplog.results import g2o, mcap, run_record, tables, tum
+from vplog.settings import Settings, load_yaml, override
+from vplog.timing import Watch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from vplog.data import Ints, Odometry, PoseGraph, Solution
+    from vplog.stages import Log, PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+class LibrarySettings(Settings):
+    """Which images become the reference library where none is given."""
+
+    choose: Literal["random"] = "random"
+    """How: a random collection of the drive's own keyframes, as the paper (section IV)."""
+    size: int = 100
+    """L: how many, or all keyframes where there are fewer."""
+    seed: int = 0
+    """Of the choice."""
+
+
+class Pipeline(Settings):
+    """Every setting of a run. A pipeline file holds only what differs."""
+
+    keyframes: KeyframeSettings = KeyframeSettings()
+    """Which frames become nodes."""
+    features: SiftSettings = SiftSettings()
+    """Local features of a frame."""
+    library: LibrarySettings = LibrarySettings()
+    """The reference images that places are described by."""
+    places: PlaceSettings = BobbSettings()
+    """Place recognition."""
+    propose: ProposeSettings = ProposeSettings()
+    """Candidate closures."""
+    verify: VerifySettings = VerifySettings()
+    """Geometry of a candidate."""
+    noise: NoiseSettings = NoiseSettings()
+    """Odometry noise."""
+    solve: OptimiserSettings = GncSettings()
+    """Robust solve of the pose graph."""
+
+
+def load_pipeline(name: str, assignments: Iterable[str] = ()) -> Pipeline:
+    """A pipeline by shipped name (`default`, `paper`) or file, with `a.b=c` overrides. Raises SettingsError."""
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        shipped = pipeline_folder()
+        path = shipped / f"{name}.yaml"
+        if not path.is_file():
+            known = ", ".join(sorted(file.stem for file in shipped.glob("*.yaml")))
+            raise SettingsError(f"No pipeline {name!r}. Pipelines: {known}, or the path of a .yaml file.")
+    tree = load_yaml(path)
+    for assignment in assignments:
+        tree = override(tree, assignment)
+    return Pipeline.read(tree, path.name)
+
+
+def pipeline_schema() -> dict[str, Any]:
+    """JSON Schema of a pipeline file, for editors and outside checkers."""
+    return Pipeline.model_json_schema()
+
+
+def pipeline_folder() -> Path:
+    """Where the named pipelines are: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).parent
+    inside = package / "pipelines"
+    return inside if inside.is_dir() else package.parent / "pipelines"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """All that a finished run knows."""
+
+    keyframes: Keyframes
+    closures: Closures
+    graph: PoseGraph
+    solution: Solution
+    record: dict[str, Any] = field(default_factory=dict)
+
+
+def run(
+    path: Path,
+    out: Path,
+    pipeline: Pipeline,
+    library: Path | None = None,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> Run:
+    """Drive in, run folder out. Raises VplogError with one line where that cannot be."""
+    log = logs.open(path, topics)
+    watch, warnings = Watch(), []
+    begin_folder(out, pipeline, path, threads)
+    with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store:
+        hashes = aside.submit(hash_inputs, path)
+        with watch.stage("read"):
+            odometry = _odometry(log)
+            camera = log.camera()
+            keyframes, missing = select_keyframes(log.name, log.stamps(), odometry, pipeline.keyframes)
+            warnings += missing
+        with watch.stage("extract", len(keyframes.stamp_ns)):
+            chosen = set() if library else set(choose(keyframes.stamp_ns, pipeline.library).tolist())
+            keyframes, references, lost = extract(log, keyframes, chosen, pipeline, store, threads, progress)
+            warnings += lost
+        with watch.stage("learn", None if library else len(references)):
+            state = learn(pipeline, library, references, threads)
+        with watch.stage("describe", len(store)):
+            descriptors = describe(state, store, threads, progress)
+        with watch.stage("propose", len(store)):
+            proposals = propose(keyframes, descriptors, state.index(descriptors), pipeline.propose, threads)
+        with watch.stage("verify", len(proposals.query)):
+            closures = verify(
+                proposals, keyframes, camera, store.__getitem__, pipeline.verify, threads,
+                lambda done, total: progress("verify", done, total),
+            )  # fmt: skip
+        with watch.stage("solve"):
+            covariance, doubts, noise_source = edge_covariance(odometry, keyframes.stamp_ns, pipeline.noise)
+            graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
+            solution = consistency.keep_odometry_if_worse(graph, pipeline.solve(graph))
+            closures = judge(closures, graph, solution, rows)
+            trajectory = correct.correct_trajectory(odometry, keyframes, solution.world_from_body)
+            warnings += doubts + repairs
+        with watch.stage("write"):
+            settings = pipeline.model_dump(mode="json")
+            header = tables.TableMetadata(settings, state.hash)
+            poses = solution.world_from_body
+            if library is None:
+                state.save(out / "library")
+            tables.write_keyframes(out / "keyframes.parquet", keyframes, poses, header)
+            column = state.to_arrow(descriptors)
+            tables.write_descriptors(out / "descriptors.parquet", keyframes, [column], state.arrow_type, header)
+            tables.write_closures(out / "closures.parquet", closures, keyframes, header)
+            tables.write_edges(out / "edges.parquet", graph, solution, header)
+            tables.write_trajectory(out / "trajectory.parquet", trajectory, odometry, header)
+            tum.write_tum(out / "trajectory.tum", trajectory)
+            g2o.write_g2o(out / "graph.g2o", graph, poses)
+            mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, camera)
+        record = {
+            **_head(pipeline, path, threads),
+            "finished": True,
+            "inputs": hashes.result(),
+            "library": {"hash": state.hash, "from": str(library) if library else "the drive's own keyframes"},
+            "descriptor_bits": state.bits,
+            "counts": _counts(log, odometry, keyframes, closures),
+            "noise": noise_source,
+            "solution": {
+                "error_before": solution.error_before,
+                "error_after": solution.error_after,
+                "iterations": solution.iterations,
+                "converged": solution.converged,
+                "reason": solution.reason,
+            },
+            "stages": watch.stages,
+            "totals": watch.totals(),
+            "warnings": log.warnings + warnings,
+        }
+        run_record.write_run_json(out / "run.json", record)
+    return Run(keyframes, closures, graph, solution, record)
+
+
+def extract(
+    log: Log,
+    keyframes: Keyframes,
+    chosen: set[int],
+    pipeline: Pipeline,
+    store: FeatureStore,
+    threads: int,
+    progress: Progress,
+) -> tuple[Keyframes, list[Reference], list[str]]:
+    """Decode the keyframes, store their features, keep the chosen ones' images; undecodable frames are left out."""
+    kept, references, lost = [], [], []
+    total = len(keyframes.stamp_ns)
+    frames = extract_frames(log.frames(keyframes.stamp_ns), pipeline.features, threads)
+    for row, (stamp_ns, frame, features, why) in enumerate(frames):
+        progress("extract", row + 1, total)
+        if frame is None or features is None:
+            lost.append(why)
+            continue
+        kept.append(int(np.searchsorted(keyframes.stamp_ns, stamp_ns)))
+        store.append(features)
+        if kept[-1] in chosen:
+            references.append(Reference(frame.image, features, log.name, stamp_ns))
+    if len(kept) < 2:
+        why = f" The first: {lost[0]}" if lost else ""
+        raise LogError(f"{log.name}: {len(kept)} of {total} keyframes could be decoded, and a graph needs two.{why}")
+    warnings = (
+        [f"{total - len(kept)} of {total} keyframes were lost to damaged images. First: {lost[0]}"] if lost else []
+    )
+    return Keyframes(keyframes.drive, keyframes.stamp_ns[kept], keyframes.odom_from_body[kept]), references, warnings
+
+
+def choose(stamp_ns: Ints, settings: LibrarySettings) -> Ints:
+    """Rows of the frames that become references, increasing."""
+    count = min(settings.size, len(stamp_ns))
+    return np.sort(np.random.default_rng(settings.seed).choice(len(stamp_ns), count, replace=False))
+
+
+def learn(pipeline: Pipeline, library: Path | None, references: list[Reference], threads: int) -> PlaceState:
+    """The recogniser with a library: the one given, or one of the drive's own images."""
+    if library is not None:
+        return pipeline.places.load(library, threads)
+    return pipeline.places.learn(references, threads)
+
+
+def describe(state: PlaceState, store: FeatureStore, threads: int, progress: Progress) -> Sequence[Any]:
+    """A descriptor for every keyframe, in order."""
+    result = []
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        work = map_in_order(pool, lambda row: state.describe(store[row]), range(len(store)), ahead=4 * threads)
+        for descriptor in work:
+            result.append(descriptor)
+            progress("describe", len(result), len(store))
+    return result
+
+
+def judge(closures: Closures, graph: PoseGraph, solution: Solution, rows: Ints) -> Closures:
+    """The ledger with what the solve made of the closures in the graph: residuals, weights, verdicts."""
+    loops = np.array([kind == EdgeKind.LOOP for kind in graph.kind], bool)
+    before, after, weight = (np.full(len(closures), np.nan) for _ in range(3))
+    before[rows] = consistency.residual_before(graph)[loops]
+    after[rows] = consistency.residual_sigma(graph, solution.world_from_body)[loops]
+    weight[rows] = solution.weight[loops]
+    verdict = list(closures.verdict)
+    for row in rows[weight[rows] < 0.5]:
+        verdict[row] = Verdict.REJECTED_BY_SOLVER
+    return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)
+
+
+def build_library(
+    paths: Sequence[Path],
+    out: Path,
+    pipeline: Pipeline,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> PlaceState:
+    """A library of random frames of the logs, an equal share of each. Raises VplogError where that cannot be."""
+    references: list[Reference] = []
+    for number, path in enumerate(paths):
+        log = logs.open(path, topics)
+        share = pipeline.library.size * (number + 1) // len(paths) - pipeline.library.size * number // len(paths)
+        stamps = log.stamps()
+        seeded = pipeline.library.model_copy(update={"size": share, "seed": pipeline.library.seed + number})
+        wanted = stamps[choose(stamps, seeded)]
+        for done, (stamp_ns, frame, features, _) in enumerate(
+            extract_frames(log.frames(wanted), pipeline.features, threads)
+        ):
+            progress(f"extract {log.name}", done + 1, len(wanted))
+            if frame is not None and features is not None:
+                references.append(Reference(frame.image, features, log.name, stamp_ns))
+    state = pipeline.places.learn(references, threads)
+    state.save(out)
+    return state
+
+
+def begin_folder(out: Path, pipeline: Pipeline, path: Path, threads: int) -> None:
+    """Make the run folder, with a run.json that says the run is not finished until it is."""
+    if out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
+        raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
+    run_record.write_run_json(out / "run.json", {**_head(pipeline, path, threads), "finished": False})
+
+
+def _odometry(log: Log) -> Odometry:
+    odometry = log.odometry()
+    if odometry is None or len(odometry.stamp_ns) < 2:
+        raise LogError(
+            f"{log.name} has no odometry, and a trajectory is built on it. "
+            "`vplog info` lists the topics; choose one with --odometry-topic."
+        )
+    return odometry
+
+
+def _head(pipeline: Pipeline, path: Path, threads: int) -> dict[str, Any]:
+    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
+    return {
+        "vplog": vplog.__version__,
+        "log": str(path.resolve()),
+        "threads": threads,
+        "settings": pipeline.model_dump(mode="json"),
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in packages}},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def hash_inputs(path: Path) -> dict[str, str]:
+    """sha256 of every file of a log, by name."""
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    result = {}
+    for file in files:
+        with file.open("rb") as stream:
+            result[str(file.relative_to(path)) if path.is_dir() else file.name] = hashlib.file_digest(
+                stream, "sha256"
+            ).hexdigest()
+    return result
+
+
+def _counts(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures) -> dict[str, Any]:
+    verdicts = {verdict.value: closures.verdict.count(verdict) for verdict in Verdict if verdict in closures.verdict}
+    return {
+        "frames": len(log.stamps()),
+        "odometry": len(odometry.stamp_ns),
+        "keyframes": len(keyframes.stamp_ns),
+        "candidates": len(closures),
+        "verdicts": verdicts,
+    }

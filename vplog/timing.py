@@ -1,0 +1,61 @@
+"""Seconds, peak memory and rate of every stage of a run."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class Watch:
+    """Measures stages one after the other; `stages` is what run.json says of them."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, dict[str, Any]] = {}
+
+    @contextmanager
+    def stage(self, name: str, items: int | None = None) -> Iterator[None]:
+        """Measure a block; `items` frames (or candidates) are worked off in it."""
+        _forget_peak()
+        began, cpu = time.perf_counter(), time.process_time()
+        yield
+        seconds = time.perf_counter() - began
+        entry: dict[str, Any] = {
+            "seconds": round(seconds, 3),
+            "cpu_seconds": round(time.process_time() - cpu, 3),
+            "peak_memory_mb": round(peak_memory_mb(), 1),
+        }
+        if items is not None:
+            entry |= {"items": items, "items_per_second": round(items / max(seconds, 1e-9), 2)}
+        self.stages[name] = entry
+
+    def totals(self) -> dict[str, float]:
+        return {
+            "seconds": round(sum(stage["seconds"] for stage in self.stages.values()), 3),
+            "peak_memory_mb": max((stage["peak_memory_mb"] for stage in self.stages.values()), default=0.0),
+        }
+
+
+def _forget_peak() -> None:
+    """Start a new peak where the system can (Linux); elsewhere the peak is that of the whole run so far."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory since the stage began, in MB (10^6 bytes)."""
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    except (OSError, ValueError):
+        pass
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
