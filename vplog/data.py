@@ -140,6 +140,7 @@ class Verdict(StrEnum):
     DEGENERATE_MOTION = "degenerate_motion"
     NO_CALIBRATION = "no_calibration"
     IMPLAUSIBLE_POSE = "implausible_pose"
+    TOO_FAR = "too_far"
     REJECTED_BY_SOLVER = "rejected_by_solver"
 
     @property
@@ -156,6 +157,7 @@ _SENTENCES = {
     Verdict.DEGENERATE_MOTION: "The map frames around the match moved too little or too straight for triangulation.",
     Verdict.NO_CALIBRATION: "The images agree by epipolar geometry, but without calibration there is no metric pose.",
     Verdict.IMPLAUSIBLE_POSE: "The pose found would put the camera further away than a shared view can be.",
+    Verdict.TOO_FAR: "The views agree, but are further apart than one place is wide; nearer keyframes tell it better.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
 }
 

@@ -27,8 +27,9 @@ class KeyframeSettings(Settings):
     """Spacing in m; None takes 1 m, or a thousandth of the path where that is shorter (at least 5 cm)."""
     rotation_deg: float = 10.0
     """Turning by this much makes a keyframe too: a tenth to a seventh of a usual field of view."""
-    max_odometry_gap_s: float = 1.0
-    """Frames in a gap of the odometry longer than this are left out: what happened there is not known."""
+    max_odometry_gap_s: float | None = None
+    """Frames in a longer gap of the odometry are left out: what happened there is not known. None takes 1 s, or three
+    times the odometry's own period where that is longer: two samples lost in a row."""
 
 
 def select_keyframes(
@@ -39,7 +40,9 @@ def select_keyframes(
     Raises LogError where no two frames have odometry.
     """
     warnings = []
-    covered = _has_odometry(stamp_ns, odometry.stamp_ns, int(settings.max_odometry_gap_s * 1e9))
+    gap_ns = 3 * int(np.median(np.diff(odometry.stamp_ns))) if len(odometry.stamp_ns) > 1 else 0
+    gap_ns = max(gap_ns, 10**9) if settings.max_odometry_gap_s is None else int(settings.max_odometry_gap_s * 1e9)
+    covered = _has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
     if missing := int((~covered).sum()):
         warnings.append(f"{missing} of {len(stamp_ns)} frames have no odometry at their stamp and were left out.")
     stamp_ns = stamp_ns[covered]

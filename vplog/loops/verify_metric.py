@@ -54,6 +54,9 @@ class MetricSettings(Settings):
     max_depths: float = 0.5
     """Longest translation as a multiple of the inliers' median depth: half the depth to the side leaves half of a
     53-degree view, and half the depth ahead doubles every size."""
+    max_distance_m: float = 5.0
+    """Longest translation in m: a place is as wide as the paper's widest spacing of views (1-5 m, section IV). Beyond
+    it the pose may well be right, but its error grows with the distance, and a nearer keyframe says the same."""
     scale_share: float = 0.02
     """Standard deviation of the translation's length as a share of it, where odometry gave landmarks their scale."""
     rotation_floor: float = 0.002
@@ -136,6 +139,8 @@ def solve(
     moved = match_from_query[:3, 3]
     if np.linalg.norm(moved) > settings.max_depths * depth_m:
         return Pose(Verdict.IMPLAUSIBLE_POSE, count, spread)
+    if np.linalg.norm(moved) > settings.max_distance_m:
+        return Pose(Verdict.TOO_FAR, count, spread)
     if np.linalg.cond(hessian) > _SINGULAR:  # such as landmarks on one line through the camera
         return Pose(Verdict.DEGENERATE_MOTION, count, spread)
     pose_covariance = np.asarray(np.linalg.inv(hessian), np.float64) * max(1.0, excess)

@@ -48,7 +48,7 @@ def grid_cuts(length: int, cells: int) -> Int32s:
 
 @numba.njit(cache=True, nogil=True)
 def patches_of(points, x_cuts, y_cuts):
-    """(K, F) uint16: the patch m * N + n each point falls in. Points lie inside the image."""
+    """(K, F) uint16: the patch n * M + m each point falls in. Points lie inside the image."""
     K, F = x_cuts.shape[0], points.shape[0]
     M, N = x_cuts.shape[1] - 1, y_cuts.shape[1] - 1
     result = np.empty((K, F), np.uint16)
@@ -57,7 +57,7 @@ def patches_of(points, x_cuts, y_cuts):
             x, y = int(points[f, 0] + 0.5), int(points[f, 1] + 0.5)  # the pixel the point is in
             m = min(np.searchsorted(x_cuts[k], x, side="right") - 1, M - 1)
             n = min(np.searchsorted(y_cuts[k], y, side="right") - 1, N - 1)
-            result[k, f] = m * N + n
+            result[k, f] = n * M + m
     return result
 
 
@@ -80,51 +80,83 @@ def vote(H, H_size, posting_start, posting, patches, totals, x_cuts, y_cuts, gri
     not. Features with the reference's word u are posting[posting_start[u]:posting_start[u + 1]].
     The similarity is normalised histogram intersection, sum(min) / sum(max) (Jiang, Meng, Yuan, CVPR 2012).
     """
-    K = patches.shape[0]
-    N = y_cuts.shape[1] - 1
-    G = grid_x.shape[0] - 1
+    K, F = patches.shape
+    M, N, G = x_cuts.shape[1] - 1, y_cuts.shape[1] - 1, grid_x.shape[0] - 1
+    features, weights, bound = _split_words(H, posting_start, posting, F)
     V = np.zeros((G, G))
     common = np.zeros(totals.shape[1], np.int32)
-    touched = np.empty(totals.shape[1], np.int32)
+    strips = np.zeros((N, G))
     for k in range(K):
-        count = 0
-        for u in range(H.shape[0]):
-            if H[u] == 0:
-                continue
+        patch = patches[k]
+        for e in range(features.shape[0]):
+            common[patch[features[e]]] += weights[e]
+        for u in bound:
             for e in range(posting_start[u], posting_start[u + 1]):
-                p = patches[k, posting[e]]
+                p = patch[posting[e]]
                 before = 0  # features of this word in this patch already counted: min(H, H_mnk) stops at H
                 for other in range(posting_start[u], e):
-                    if patches[k, posting[other]] == p:
-                        before += 1
-                if before < H[u]:
-                    if common[p] == 0:
-                        touched[count] = p
-                        count += 1
-                    common[p] += 1
-        for t in range(count):
-            p = touched[t]
-            S = common[p] / (H_size + totals[k, p] - common[p])
-            common[p] = 0
-            m, n = p // N, p % N
-            _add_patch(V, S, x_cuts[k, m], x_cuts[k, m + 1], y_cuts[k, n], y_cuts[k, n + 1], grid_x, grid_y)
+                    before += patch[posting[other]] == p
+                common[p] += before < H[u]
+        # V += S x the pixels a patch shares with a cell (lines 11-13), first along x, then along y
+        for n in range(N):
+            strip = strips[n]
+            empty = True
+            for m in range(M):
+                p = n * M + m
+                if common[p]:
+                    if empty:
+                        strip[:] = 0.0
+                        empty = False
+                    S = common[p] / (H_size + totals[k, p] - common[p])
+                    common[p] = 0
+                    _spread(strip, S, x_cuts[k, m], x_cuts[k, m + 1], grid_x)
+            if not empty:
+                _stack(V, strip, y_cuts[k, n], y_cuts[k, n + 1], grid_y)
     return V
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_patch(V, S, x0, x1, y0, y1, grid_x, grid_y):
-    """V += S x the pixels that the patch [x0, x1) x [y0, y1) shares with each cell (Alg. 3 lines 11-13)."""
+def _split_words(H, posting_start, posting, F):
+    """Features whose words H never limits, with how many such words they have; and the words that H may limit."""
+    per_feature = np.zeros(F, np.int32)
+    bound = np.empty(H.shape[0], np.int64)
+    count = 0
+    for u in range(H.shape[0]):
+        if H[u] >= posting_start[u + 1] - posting_start[u]:
+            for e in range(posting_start[u], posting_start[u + 1]):
+                per_feature[posting[e]] += 1
+        elif H[u] > 0:
+            bound[count] = u
+            count += 1
+    features = np.flatnonzero(per_feature)
+    return features, per_feature[features], bound[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread(strip, S, x0, x1, grid_x):
+    """strip += S x the pixels that [x0, x1) shares with each cell along x."""
+    G = strip.shape[0]
+    column = min(np.int64(x0) * G // grid_x[G], G - 1)  # cells are even to a pixel: the first is this one or beside
+    while column > 0 and grid_x[column] > x0:
+        column -= 1
+    while grid_x[column + 1] <= x0:
+        column += 1
+    while column < G and grid_x[column] < x1:
+        strip[column] += S * (min(x1, grid_x[column + 1]) - max(x0, grid_x[column]))
+        column += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _stack(V, strip, y0, y1, grid_y):
+    """V += strip x the pixels that [y0, y1) shares with each cell along y."""
     G = V.shape[0]
-    first_x = np.searchsorted(grid_x, x0, side="right") - 1
-    row = np.searchsorted(grid_y, y0, side="right") - 1
-    while row < G and grid_y[row] < y1:
-        tall = min(y1, grid_y[row + 1]) - max(y0, grid_y[row])
-        column = first_x
-        while column < G and grid_x[column] < x1:
-            wide = min(x1, grid_x[column + 1]) - max(x0, grid_x[column])
-            V[row, column] += S * (wide * tall)
-            column += 1
-        row += 1
+    for row in range(G):
+        if grid_y[row] >= y1:
+            break
+        if grid_y[row + 1] > y0:
+            tall = min(y1, grid_y[row + 1]) - max(y0, grid_y[row])
+            for column in range(G):
+                V[row, column] += strip[column] * tall
 
 
 def box_shapes(grid: int, max_share: float, aspects: tuple[float, ...]) -> Int32s:
