@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     arguments = _parser().parse_args(argv)
-    logging.basicConfig(level=logging.WARNING, format="vplog: warning: %(message)s", stream=sys.stderr)
+    logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
         arguments.verb(arguments)
         sys.stdout.flush()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import platform
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -32,7 +34,7 @@ from vplog.settings import Settings, load_yaml, override
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from vplog.data import Ints, Odometry, PoseGraph, Solution
     from vplog.stages import Log, PlaceState
@@ -40,13 +42,31 @@ if TYPE_CHECKING:
     Progress = Callable[[str, int, int], None]
 
 
+_PAPER_SIZE = 100
+"""L of the paper's experiments (section IV)."""
+_FRAMES_A_REFERENCE = 8
+"""Keyframes per reference, twice the paper's J: four references then reach beyond a frame's neighbours in time."""
+_LEAST_SIZE = 8
+"""References of even the shortest drive: twice the paper's J, so that there is a choice."""
+
+
+_UNCALIBRATED = (
+    "Camera {camera} is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
+    "Record its camera_info, or name it with --camera-info-topic."
+)
+
+
+_NO_CLOSURE = "No closure passed verification: the trajectory is that of the odometry."
+
+
 class LibrarySettings(Settings):
     """Which images become the reference library where none is given."""
 
     choose: Literal["random"] = "random"
     """How: a random collection of the drive's own keyframes, as the paper (section IV)."""
-    size: int = 100
-    """L: how many, or all keyframes where there are fewer."""
+    size: int | None = None
+    """L: how many. None takes every eighth keyframe, at most the paper's 100: were every other frame a reference, the
+    four that explain a frame would be its neighbours in time, which a later visit shares with nobody."""
     seed: int = 0
     """Of the choice."""
 
@@ -123,7 +143,7 @@ def run(
     log = logs.open(path, topics)
     watch, warnings = Watch(), []
     begin_folder(out, pipeline, path, threads)
-    with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store:
+    with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store, _heard(warnings):
         hashes = aside.submit(hash_inputs, path)
         with watch.stage("read"):
             odometry = _odometry(log)
@@ -134,6 +154,8 @@ def run(
             chosen = set() if library else set(choose(keyframes.stamp_ns, pipeline.library).tolist())
             keyframes, references, lost = extract(log, keyframes, chosen, pipeline, store, threads, progress)
             warnings += lost
+        if camera.matrix is None:
+            warnings.append(_UNCALIBRATED.format(camera=camera.name))
         with watch.stage("learn", None if library else len(references)):
             state = learn(pipeline, library, references, threads)
         with watch.stage("describe", len(store)):
@@ -180,7 +202,7 @@ def run(
                 "error_after": solution.error_after,
                 "iterations": solution.iterations,
                 "converged": solution.converged,
-                "reason": solution.reason,
+                "reason": solution.reason if EdgeKind.LOOP in graph.kind else _NO_CLOSURE,
             },
             "stages": watch.stages,
             "totals": watch.totals(),
@@ -223,8 +245,10 @@ def extract(
 
 def choose(stamp_ns: Ints, settings: LibrarySettings) -> Ints:
     """Rows of the frames that become references, increasing."""
-    count = min(settings.size, len(stamp_ns))
-    return np.sort(np.random.default_rng(settings.seed).choice(len(stamp_ns), count, replace=False))
+    count = len(stamp_ns)
+    every = min(max(count // _FRAMES_A_REFERENCE, _LEAST_SIZE), _PAPER_SIZE)
+    size = min(count, every if settings.size is None else settings.size)
+    return np.sort(np.random.default_rng(settings.seed).choice(count, size, replace=False))
 
 
 def learn(pipeline: Pipeline, library: Path | None, references: list[Reference], threads: int) -> PlaceState:
@@ -268,9 +292,10 @@ def build_library(
 ) -> PlaceState:
     """A library of random frames of the logs, an equal share of each. Raises VplogError where that cannot be."""
     references: list[Reference] = []
+    size = pipeline.library.size or _PAPER_SIZE
     for number, path in enumerate(paths):
         log = logs.open(path, topics)
-        share = pipeline.library.size * (number + 1) // len(paths) - pipeline.library.size * number // len(paths)
+        share = size * (number + 1) // len(paths) - size * number // len(paths)
         stamps = log.stamps()
         seeded = pipeline.library.model_copy(update={"size": share, "seed": pipeline.library.seed + number})
         wanted = stamps[choose(stamps, seeded)]
@@ -283,6 +308,19 @@ def build_library(
     state = pipeline.places.learn(references, threads)
     state.save(out)
     return state
+
+
+@contextmanager
+def _heard(warnings: list[str]) -> Iterator[None]:
+    """What the stages log as warnings goes into run.json too."""
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: warnings.append(record.getMessage())
+    logger = logging.getLogger("vplog")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 def begin_folder(out: Path, pipeline: Pipeline, path: Path, threads: int) -> None:

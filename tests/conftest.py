@@ -1,0 +1,86 @@
+"""What many tests share: a small drive made on the spot, a finished run of it, the verbs, and the real drives."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from vplog import cli
+from vplog.demo import SMALL, make_drive
+from vplog.pipeline import load_pipeline, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.demo.record import Drive
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a verb ended and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """The one JSON object on stdout; anything beside it fails the test."""
+        assert self.code == 0, self.err
+        value = json.loads(self.out)
+        assert isinstance(value, dict)
+        return value
+
+    @property
+    def error(self) -> str:
+        """The one line of a known error: nothing on stdout, no traceback, and no fault of ours."""
+        assert (self.code, self.out) == (1, "")
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("vplog: error: "), lines[0]
+        assert "Internal error" not in lines[0]
+        assert "Traceback" not in lines[0]
+        return lines[0].removeprefix("vplog: error: ")
+
+
+@pytest.fixture
+def verb(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    """Run a verb in this process; what native libraries print counts too."""
+
+    def call(*arguments: object) -> Said:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli.main([str(argument) for argument in arguments])
+        out, err = capfd.readouterr()
+        assert isinstance(stop.value.code, int)
+        return Said(stop.value.code, out, err)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    """The small demo drive: about 45 frames, of which the last dozen pass known places."""
+    return make_drive(tmp_path_factory.mktemp("drive"), SMALL)
+
+
+@pytest.fixture(scope="session")
+def finished(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a default run on the small drive, with two threads. Tests read it and leave it as it is."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    run(drive.log, out, load_pipeline("default"), threads=2)
+    return out
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real data, which is not part of the project."""
+    folder = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no folder {folder}: set VPLOG_DATA to the folder with the real drives")
+    return folder

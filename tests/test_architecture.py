@@ -1,0 +1,126 @@
+"""Imports point one way, one folder talks to gtsam, one file talks to the user, and start-up is light."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import vplog
+from vplog.pipeline import Pipeline, load_pipeline, pipeline_folder
+from vplog.settings import load_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PACKAGE = Path(vplog.__file__).parent
+LAYERS = (
+    {"errors"},
+    {"data", "settings", "timing"},
+    {"geometry"},
+    {"stages"},
+    {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},
+    {"extract"},
+    {"pipeline", "evaluation"},
+    {"batch"},
+    {"cli"},
+    {"__main__"},
+)
+"""From what depends on nothing to what depends on all. A part sees the layers above its own line, and itself."""
+LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
+FILES = sorted(PACKAGE.rglob("*.py"))
+HEAVY = ("cv2", "faiss", "gtsam", "numba", "numpy", "pyarrow", "mcap", "rosbags", "pydantic", "rich")
+
+
+def name_of(file: Path) -> str:
+    return file.relative_to(PACKAGE).as_posix()
+
+
+def part_of(file: Path) -> str:
+    """The file or folder right below the package; the package's own __init__ is part of none."""
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(file: Path) -> Iterator[str]:
+    """Full names of all that a file imports, wherever in it and for whatever purpose."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name_of(file)}: imports are absolute"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def parts_used(file: Path) -> set[str]:
+    """The parts of the package that a file imports."""
+    used = {name.split(".")[1] for name in imports(file) if name.startswith("vplog.")}
+    return used - {"__version__"}
+
+
+@pytest.mark.parametrize("file", FILES, ids=name_of)
+def test_imports_point_one_way(file: Path) -> None:
+    part = part_of(file)
+    if part == "__init__":
+        assert not parts_used(file), "the package itself imports nothing of its own, so that any part can be loaded"
+        return
+    assert part in LEVEL, f"{part} has no place in the order of the parts: give it one here and in the README"
+    wrong = {used for used in parts_used(file) if used != part and LEVEL[used] >= LEVEL[part]}
+    assert not wrong, f"{name_of(file)} may not import {sorted(wrong)}"
+
+
+def test_the_check_sees_imports() -> None:
+    assert "loops" in parts_used(PACKAGE / "pipeline.py")
+    assert "pipeline" in parts_used(PACKAGE / "cli.py")
+
+
+def test_only_the_graph_knows_gtsam() -> None:
+    users = {part_of(file) for file in FILES if any(name.split(".")[0] == "gtsam" for name in imports(file))}
+    assert users == {"graph"}
+
+
+def speech(file: Path) -> list[str]:
+    """Calls that print or exit."""
+    found = []
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            streams = ("sys.stdout.", "sys.stderr.")
+            if name in {"print", "exit", "quit", "sys.exit", "os._exit"} or name.startswith(streams):
+                found.append(f"{name_of(file)}:{node.lineno} {name}")
+        elif isinstance(node, ast.Name) and node.id == "SystemExit":
+            found.append(f"{name_of(file)}:{node.lineno} SystemExit")
+    return found
+
+
+def test_only_the_command_line_prints_and_exits() -> None:
+    assert speech(PACKAGE / "cli.py")
+    assert not [line for file in FILES if file.name != "cli.py" for line in speech(file)]
+
+
+@pytest.mark.parametrize("file", FILES, ids=name_of)
+def test_nothing_is_left_to_do(file: Path) -> None:
+    left = re.findall(r"\b(?:TODO|FIXME|XXX|HACK|NotImplemented(?:Error)?)\b", file.read_text(encoding="utf-8"))
+    assert not left
+
+
+def test_the_command_line_starts_light() -> None:
+    code = "import sys, vplog.cli; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "vplog" in loaded
+    assert not loaded.intersection(HEAVY)
+
+
+@pytest.mark.parametrize("file", sorted(pipeline_folder().glob("*.yaml")), ids=lambda file: file.stem)
+def test_shipped_pipelines_load(file: Path) -> None:
+    """By name and by path, through the same checks as a user's own file."""
+    assert load_pipeline(file.stem) == load_pipeline(str(file)) == Pipeline.read(load_yaml(file), file.name)
+
+
+def test_the_default_pipeline_is_the_defaults_in_code() -> None:
+    assert load_pipeline("default") == Pipeline()
