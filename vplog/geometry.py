@@ -77,16 +77,16 @@ def log(a_from_b: Floats) -> Floats:
     """Twists (..., 6) of poses (..., 4, 4); the inverse of exp for angles below pi."""
     omega = so3_log(a_from_b[..., :3, :3])
     v = np.linalg.solve(_left_jacobian(omega), a_from_b[..., :3, 3:])[..., 0]
-    return np.concatenate([omega, v], axis=-1)
+    return np.asarray(np.concatenate([omega, v], axis=-1), np.float64)
 
 
 def _left_jacobian(omega: Floats) -> Floats:
     """V of the exponential: translation = V @ v."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     k = skew(omega)
-    small = angle < 1e-5  # the quotient below loses digits earlier than sin(x)/x does
+    small = angle < 1e-5  # the quotient of c loses digits earlier than sin(x)/x does
     safe = np.where(small, 1.0, angle)
-    b = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    b = np.where(small, 0.5 - angle**2 / 24.0, 0.5 * (np.sin(safe / 2.0) / (safe / 2.0)) ** 2)  # no 1 - cos
     c = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
     return np.eye(3) + b * k + c * (k @ k)
 

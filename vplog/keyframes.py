@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
 from vplog import geometry
 from vplog.data import Keyframes
@@ -23,11 +24,11 @@ _LEAST_SPACING_M = 0.05
 class KeyframeSettings(Settings):
     """A frame becomes a keyframe when the odometry has moved or turned far enough since the last one."""
 
-    distance_m: float | None = None
+    distance_m: float | None = Field(default=None, ge=0)
     """Spacing in m; None takes 1 m, or a thousandth of the path where that is shorter (at least 5 cm)."""
-    rotation_deg: float = 10.0
+    rotation_deg: float = Field(default=10.0, ge=0)
     """Turning by this much makes a keyframe too: a tenth to a seventh of a usual field of view."""
-    max_odometry_gap_s: float | None = None
+    max_odometry_gap_s: float | None = Field(default=None, ge=0, le=1e9)
     """Frames in a longer gap of the odometry are left out: what happened there is not known. None takes 1 s, or three
     times the odometry's own period where that is longer: two samples lost in a row."""
 
@@ -45,7 +46,7 @@ def select_keyframes(
     covered = _has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
     if missing := int((~covered).sum()):
         warnings.append(f"{missing} of {len(stamp_ns)} frames have no odometry at their stamp and were left out.")
-    stamp_ns = stamp_ns[covered]
+    stamp_ns = np.unique(stamp_ns[covered])
     if len(stamp_ns) < 2:
         raise LogError(
             f"{drive}: no two frames have odometry at their stamps "

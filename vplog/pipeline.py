@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from pydantic import model_validator
 
 import vplog
 from vplog import logs
@@ -91,6 +92,18 @@ class Pipeline(Settings):
     solve: OptimiserSettings = GncSettings()
     """Robust solve of the pose graph."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _default_kinds(cls, tree: Any) -> Any:
+        """A setting of a method may be changed without naming the method: no `kind` means the default's."""
+        if not isinstance(tree, dict):
+            return tree
+        kinds = {name: getattr(known.default, "kind", None) for name, known in cls.model_fields.items()}
+        return {
+            name: {"kind": kinds[name], **part} if kinds.get(name) and isinstance(part, dict) else part
+            for name, part in tree.items()
+        }
+
 
 def load_pipeline(name: str, assignments: Iterable[str] = ()) -> Pipeline:
     """A pipeline by shipped name (`default`, `paper`) or file, with `a.b=c` overrides. Raises SettingsError."""
@@ -101,10 +114,11 @@ def load_pipeline(name: str, assignments: Iterable[str] = ()) -> Pipeline:
         if not path.is_file():
             known = ", ".join(sorted(file.stem for file in shipped.glob("*.yaml")))
             raise SettingsError(f"No pipeline {name!r}. Pipelines: {known}, or the path of a .yaml file.")
-    tree = load_yaml(path)
+    tree, where = load_yaml(path), path.name
     for assignment in assignments:
         tree = override(tree, assignment)
-    return Pipeline.read(tree, path.name)
+        where += f" with --set {assignment}"
+    return Pipeline.read(tree, where)
 
 
 def pipeline_schema() -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from typing import TYPE_CHECKING, Any, Self
 
 import yaml
@@ -11,6 +12,10 @@ from vplog.errors import SettingsError
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+
+_NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
+"""What the parser raises: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
 
 
 class Settings(BaseModel):
@@ -27,7 +32,7 @@ class Settings(BaseModel):
             first = error.errors()[0]
             name = ".".join(str(part) for part in first["loc"]) or "the top level"
             raise SettingsError(
-                f"{where}: {name}: {first['msg']} (got {str(first['input'])[:80]!r}). "
+                f"{where}: {name}: {first['msg']} (got {reprlib.repr(first['input'])[:80]}). "
                 "`vplog config` prints every setting with its default."
             ) from None
 
@@ -40,7 +45,7 @@ def load_yaml(path: Path) -> dict[str, Any]:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise SettingsError(f"Cannot read {path}: {error}.") from None
-    except yaml.YAMLError as error:
+    except _NOT_YAML as error:
         raise SettingsError(f"{path} is not YAML: {str(error).splitlines()[0]}.") from None
     if tree is None:
         return {}
@@ -56,7 +61,7 @@ def override(tree: dict[str, Any], assignment: str) -> dict[str, Any]:
         raise SettingsError(f"--set {assignment}: write it as --set stage.setting=value.")
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except _NOT_YAML:
         raise SettingsError(f"--set {assignment}: {text!r} is not a YAML value.") from None
     return _with(tree, name.split("."), value)
 
@@ -65,7 +70,8 @@ def _with(tree: dict[str, Any], path: list[str], value: Any) -> dict[str, Any]:
     head, *rest = path
     if not rest:
         return {**tree, head: value}
-    below = tree.get(head) or {}
+    below = tree.get(head)
+    below = {} if below is None else below
     if not isinstance(below, dict):
         raise SettingsError(f"--set: {head} is a value, not a group of settings.")
     return {**tree, head: _with(below, rest, value)}

@@ -26,7 +26,7 @@ class DemoSettings(Settings):
     """Speed of the car along the axis of the street."""
     lateral_offset_m: float = Field(default=0.8, ge=0, le=1)
     """How far left of the first lap's track the car keeps after it."""
-    frame_rate_hz: float = Field(default=5.0, gt=0.1, le=60)
+    frame_rate_hz: float = Field(default=4.0, gt=0.1, le=60)
     """Camera frames per second."""
     width: int = Field(default=640, ge=64, le=4096)
     """Width of the images in px."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from vplog.data import Features
 from vplog.settings import Settings
@@ -21,11 +22,11 @@ class SiftSettings(Settings):
 
     kind: Literal["sift"] = "sift"
     """Which extractor."""
-    max_features: int = 1200
+    max_features: int = Field(default=1200, ge=1)
     """Features kept of an image, by response; 800 describe a place, verification takes them all."""
-    contrast_threshold: float = 0.04
+    contrast_threshold: float = Field(default=0.04, ge=0)
     """Weakest extremum kept, OpenCV's and Lowe's default."""
-    max_megapixels: float = 0.5
+    max_megapixels: float = Field(default=0.5, ge=0.001)
     """Larger images are halved in both directions until they are below; points stay in px of the full image."""
 
     def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
@@ -34,7 +35,11 @@ class SiftSettings(Settings):
         small, halvings = image, 0
         while small.size > self.max_megapixels * 1e6:
             small, halvings = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), halvings + 1
-        detector = cv2.SIFT.create(nfeatures=self.max_features, contrastThreshold=self.contrast_threshold)
+        detector = cv2.SIFT.create(
+            nfeatures=self.max_features,
+            contrastThreshold=self.contrast_threshold,
+            enable_precise_upscale=True,  # without it OpenCV's points lie a quarter of a pixel right of and below
+        )
         keypoints, found = detector.detectAndCompute(small, None)
         if not keypoints:
             nothing = np.zeros(0, np.float32)

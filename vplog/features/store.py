@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from typing import TYPE_CHECKING, Self
 
@@ -33,7 +34,8 @@ class FeatureStore:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # a full disk fails again here; append has said so, and the file goes
+            self._file.close()
         self._path.unlink(missing_ok=True)
 
     def __len__(self) -> int:

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 import numba
 import numpy as np
 import pyarrow as pa
+from pydantic import Field, PositiveFloat, model_validator
 
 from vplog.errors import LibraryError
 from vplog.places import library as lib
@@ -32,26 +33,34 @@ class BobbSettings(lib.WordSettings):
 
     kind: Literal["bobb"] = "bobb"
     """Which recogniser."""
-    references: int = 4
+    references: int = Field(default=4, ge=1)
     """J: reference images that explain an image."""
-    boxes: int = 4
+    boxes: int = Field(default=4, ge=1)
     """I: boxes mined on each of them."""
-    partitions: int = 200
+    partitions: int = Field(default=200, ge=1)
     """K: random partitions of a reference."""
-    columns: int = 32
+    columns: int = Field(default=32, ge=1, le=256)
     """M: patches of a partition along the image's width."""
-    rows: int = 16
+    rows: int = Field(default=16, ge=1, le=256)
     """N: patches of a partition along the image's height."""
-    window_share: float = 0.4
+    window_share: float = Field(default=0.4, gt=0, le=1)
     """Side of a window (subimage) as a share of the image's; the paper leaves it open."""
-    grid: int = 64
+    grid: int = Field(default=64, ge=1, le=255)
     """Boxes begin and end on a grid of this many cells along each side, at most 255: one byte a coordinate."""
-    max_box_share: float = 0.1
+    max_box_share: float = Field(default=0.1, gt=0, le=1)
     """Largest share of the reference a box may cover."""
-    aspects: tuple[float, ...] = (0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0)
+    aspects: tuple[PositiveFloat, ...] = Field(default=(0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0), min_length=1)
     """Width to height of the boxes tried, in units of the image's own; votes never shrink a box, so all are largest."""
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
     """Of the windows and the partitions."""
+
+    @model_validator(mode="after")
+    def _has_boxes(self) -> Self:
+        if self.grid**2 * self.max_box_share < 1:
+            raise ValueError(
+                f"max_box_share {self.max_box_share} of a grid of {self.grid} x {self.grid} is less than one cell"
+            )
+        return self
 
     def learn(self, references: Iterable[Reference], threads: int) -> BobbState:
         """Index the references and partition them. Raises LibraryError where they are too few or have no features."""
@@ -225,10 +234,15 @@ class BobbState:
         s = self.settings
         if not column.type.equals(self.arrow_type):
             raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
-        references = column.field("references").flatten().to_numpy().reshape(-1, s.references)
-        boxes = column.field("boxes").flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
+        lists = column.field("references"), column.field("boxes")
+        if column.null_count or any(part.null_count or part.flatten().null_count for part in lists):
+            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        references = lists[0].flatten().to_numpy().reshape(-1, s.references)
+        boxes = lists[1].flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
         if len(references) and (references.max() >= len(self.library) or references.min() < -1):
             raise LibraryError("The descriptors name references that this library does not have.")
+        if len(boxes) and boxes.max() > s.grid:
+            raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
         return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
 
     def save(self, folder: Path) -> None:

@@ -17,6 +17,7 @@ import faiss
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import Field
 
 import vplog
 from vplog.data import Features, Reference
@@ -36,17 +37,17 @@ _MAX_FEATURES = 50_000_000
 class WordSettings(Settings):
     """How features become words."""
 
-    features: int = 800
+    features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
-    neighbours: int = 10
+    neighbours: int = Field(default=10, ge=1)
     """Nearest library features looked at for each feature."""
-    max_l1: float = 0.4
+    max_l1: float = Field(default=0.4, ge=0)
     """Largest L1 distance of two descriptors of unit L1 length (0..2) that are the same word: the paper's check."""
-    hnsw_links: int = 16
+    hnsw_links: int = Field(default=16, ge=2)
     """Links of a node in the HNSW graph (Malkov & Yashunin 2018); recall of the first neighbour .94 at ef 16."""
-    hnsw_ef_construction: int = 40
+    hnsw_ef_construction: int = Field(default=40, ge=1)
     """Breadth of the search while the graph is built."""
-    hnsw_ef_search: int = 16
+    hnsw_ef_search: int = Field(default=16, ge=1)
     """Breadth of the search for a feature's neighbours; raised to `neighbours` where it is less."""
 
 
@@ -114,9 +115,7 @@ def _index(descriptors: Bytes, settings: WordSettings) -> Any:
     Squared distances are whole numbers below 2^24, so float32 sums them without rounding in any order.
     """
     # bytes as they are, not as floats: the same distances from a quarter of the memory, 1.5 times as fast
-    index = faiss.IndexHNSWSQ(
-        descriptors.shape[1], faiss.ScalarQuantizer.QT_8bit_direct, settings.hnsw_links, faiss.METRIC_L2
-    )
+    index: Any = faiss.index_factory(descriptors.shape[1], f"HNSW{settings.hnsw_links}_SQ8_direct")
     index.train(descriptors[:1].astype(np.float32))
     index.hnsw.efConstruction = settings.hnsw_ef_construction
     index.hnsw.efSearch = max(settings.hnsw_ef_search, settings.neighbours)
@@ -257,7 +256,7 @@ def read_library_record(folder: Path) -> dict[str, Any]:
         raise LibraryError(
             f"{folder} is not a library: it has no library.json. Build one: vplog library LOG -o {folder}"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise LibraryError(f"{folder}/library.json cannot be read: {error}.") from None
     if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
         raise LibraryError(f"{folder}/library.json lacks its hash or settings; build the library anew.")
@@ -272,7 +271,10 @@ def load_references(folder: Path) -> list[Reference]:
             if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
                 raise LibraryError(f"{folder}: the tables are not those of a library; build it anew.")
         features, references = (file.read() for file in files)
-    except (OSError, pa.ArrowException) as error:
+        if any(column.null_count for table in (features, references) for column in table.columns):
+            raise LibraryError(f"{folder}: the tables have empty cells; build the library anew.")
+        entries = references.to_pylist()
+    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
         raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}. Build the library anew.") from None
     owners = features["reference"].to_numpy()
     start = np.searchsorted(owners, np.arange(len(references) + 1))
@@ -282,17 +284,24 @@ def load_references(folder: Path) -> list[Reference]:
     sizes = features["size"].to_numpy()
     descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
     result = []
-    for row, entry in enumerate(references.to_pylist()):
+    for row, entry in enumerate(entries):
         part = slice(int(start[row]), int(start[row + 1]))
         width, height = entry["width"], entry["height"]
         if not (0 < width < 2**15 and 0 < height < 2**15) or not np.all(
             (points[part] > -1) & (points[part] < [width, height])
         ):
             raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
-        image = cv2.imdecode(np.frombuffer(entry["image"], np.uint8), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise LibraryError(f"{folder}: the image of reference {row} cannot be decoded; build the library anew.")
+        image = _decode(entry["image"])
+        if image is None or image.shape != (height, width):
+            raise LibraryError(f"{folder}: the image of reference {row} is damaged; build the library anew.")
         nothing = np.full(part.stop - part.start, np.nan, np.float32)
         found = Features(points[part], sizes[part], descriptors[part], nothing, width, height)
         result.append(Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"]))
     return result
+
+
+def _decode(data: bytes) -> np.ndarray | None:
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # no bytes at all, or a size that OpenCV refuses
+        return None

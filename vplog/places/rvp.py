@@ -48,15 +48,16 @@ def grid_cuts(length: int, cells: int) -> Int32s:
 
 @numba.njit(cache=True, nogil=True)
 def patches_of(points, x_cuts, y_cuts):
-    """(K, F) uint16: the patch n * M + m each point falls in. Points lie inside the image."""
+    """(K, F) uint16: the patch n * M + m each point falls in; points past an edge count to the pixel at the edge."""
     K, F = x_cuts.shape[0], points.shape[0]
     M, N = x_cuts.shape[1] - 1, y_cuts.shape[1] - 1
     result = np.empty((K, F), np.uint16)
     for k in range(K):
         for f in range(F):
-            x, y = int(points[f, 0] + 0.5), int(points[f, 1] + 0.5)  # the pixel the point is in
-            m = min(np.searchsorted(x_cuts[k], x, side="right") - 1, M - 1)
-            n = min(np.searchsorted(y_cuts[k], y, side="right") - 1, N - 1)
+            x = min(max(int(points[f, 0] + 0.5), 0), x_cuts[k, M] - 1)  # the pixel the point is in
+            y = min(max(int(points[f, 1] + 0.5), 0), y_cuts[k, N] - 1)
+            m = np.searchsorted(x_cuts[k], x, side="right") - 1
+            n = np.searchsorted(y_cuts[k], y, side="right") - 1
             result[k, f] = n * M + m
     return result
 
@@ -160,13 +161,15 @@ def _stack(V, strip, y0, y1, grid_y):
 
 
 def box_shapes(grid: int, max_share: float, aspects: tuple[float, ...]) -> Int32s:
-    """(A, 2) width and height in cells of the largest boxes of at most `max_share` of the image, one per aspect."""
+    """(A, 2) width and height in cells of the largest boxes of at most `max_share` of the image, one per aspect.
+
+    The share is one cell at least.
+    """
     area = int(grid * grid * max_share)
     shapes = []
     for aspect in aspects:
-        width = min(max(int(math.sqrt(area * aspect) + 0.5), 1), grid)
-        height = min(area // width, grid)
-        shapes.append((width, max(height, 1)))
+        width = min(max(int(math.sqrt(area * aspect) + 0.5), 1), grid, area)
+        shapes.append((width, min(area // width, grid)))
     return np.array(sorted(set(shapes)), np.int32)
 
 

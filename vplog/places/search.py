@@ -31,7 +31,7 @@ class BoxIndex:
         entries = entries[flat[entries] >= 0]
         self._list_start = np.searchsorted(flat[entries], np.arange(library_size + 1)).astype(np.int64)
         self._list_place = (entries // max(references.shape[1], 1)).astype(np.int32)
-        self._list_boxes = np.ascontiguousarray(boxes.reshape(len(flat), -1, 4)[entries])
+        self._list_boxes = np.ascontiguousarray(boxes.reshape(len(flat), *boxes.shape[2:])[entries])
 
     def __len__(self) -> int:
         return self._count

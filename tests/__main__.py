@@ -1,0 +1,38 @@
+"""Every check of the project: lint, format, types, tests. `python -m tests`, from the top of the checkout.
+
+Arguments go to pytest. The exit status is 0 only when all passed; every check runs even if one before it failed.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+TOP = Path(__file__).parents[1]
+CHECKS = {
+    "lint": ["-m", "ruff", "check", "."],
+    "format": ["-m", "ruff", "format", "--check", "."],
+    "types": ["-m", "pyright"],
+    "tests": ["-m", "pytest", *sys.argv[1:]],
+}
+
+
+def main() -> int:
+    # one thread a library: the tests start workers of their own, and a BLAS pool inside each only gets in their way
+    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
+    failed = []
+    for name, command in CHECKS.items():
+        print(f"== {name}", flush=True)
+        began = time.monotonic()
+        if subprocess.run([sys.executable, *command], cwd=TOP, env=environment, check=False).returncode:
+            failed.append(name)
+        print(f"== {name}: {time.monotonic() - began:.0f} s", flush=True)
+    print(f"== failed: {', '.join(failed)}" if failed else "== all checks passed", flush=True)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
