@@ -47,8 +47,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def columns(folder: Path, table: str) -> dict[str, np.ndarray]:
+    """A table as pyarrow alone reads it; matrices are lists, or None."""
     read = pq.read_table(folder / f"{table}.parquet")
-    return {name: np.array(read[name].to_pylist()) for name in read.schema.names}
+    return {name: read[name].to_numpy() for name in read.schema.names}
 
 
 def test_a_run_folder_holds_every_file_and_no_scratch(finished: Path) -> None:

@@ -152,7 +152,7 @@ def test_drive_without_closures_or_keyframes(tmp_path: Path, count: int) -> None
     keyframes = Keyframes("short", RUN.keyframes.stamp_ns[:count], RUN.keyframes.odom_from_body[:count])
     graph = dataclasses.replace(RUN.graph, a=RUN.graph.a[:0], b=RUN.graph.b[:0], kind=[])
     write_mcap(tmp_path / "r", keyframes, RUN.solution.world_from_body[:count], graph, nothing, METADATA)
-    assert len(decode((tmp_path / "r").read_bytes())) == (5 if count else 0)
+    assert len(decode((tmp_path / "r").read_bytes())) == (7 if count else 0)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
@@ -172,6 +172,8 @@ def test_rerun_opens_it(tmp_path: Path) -> None:
     for entity, rows, component in (
         ("/path/optimised", 2, "InstancePoses3D:translations"),
         ("/path/odometry", 1, "CoordinateFrame:frame"),
+        ("/path/optimised_points", 1, "Points3D:positions"),
+        ("/path/odometry_points", 1, "Points3D:positions"),
         ("/tf", COUNT, "Transform3D:translation"),
         ("/tf_static", 1, "Transform3D:child_frame"),
         ("/graph", 1, "foxglove.SceneUpdate:message"),

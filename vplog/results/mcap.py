@@ -11,6 +11,8 @@ import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.writer import CompressionType, Writer
@@ -63,6 +65,9 @@ def write_mcap(
         writer.add_metadata("vplog", {**header, "drive": keyframes.drive})
         optimised = _Channel(writer, "/path/optimised", PosesInFrame)
         odometry = _Channel(writer, "/path/odometry", PosesInFrame)
+        # the same positions as points: rerun reads the paths, but draws point clouds
+        optimised_points = _Channel(writer, "/path/optimised_points", PointCloud)
+        odometry_points = _Channel(writer, "/path/odometry_points", PointCloud)
         scene = _Channel(writer, "/graph", SceneUpdate)
         static = _Channel(writer, "/tf_static", FrameTransforms)
         transforms = _Channel(writer, "/tf", FrameTransforms)
@@ -75,7 +80,10 @@ def write_mcap(
             if node == 0:
                 world_from_odom = world_from_body[0] @ geometry.inverse(keyframes.odom_from_body[0])
                 optimised.write(stamp_ns, _path(stamp_ns, bodies))
-                odometry.write(stamp_ns, _path(stamp_ns, _parts(world_from_odom @ keyframes.odom_from_body)))
+                drifted = world_from_odom @ keyframes.odom_from_body
+                odometry.write(stamp_ns, _path(stamp_ns, _parts(drifted)))
+                optimised_points.write(stamp_ns, _points(stamp_ns, world_from_body, _GREEN))
+                odometry_points.write(stamp_ns, _points(stamp_ns, drifted, _GREY))
                 scene.write(stamp_ns, _scene(stamp_ns, world_from_body, graph, closures))
                 if camera is not None:
                     [part] = _parts(camera.body_from_camera[None])
@@ -111,6 +119,21 @@ def _path(stamp_ns: int, parts: list[Part]) -> PosesInFrame:
         pose = message.poses.add()
         pose.position.x, pose.position.y, pose.position.z = position
         pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = quaternion
+    return message
+
+
+def _points(stamp_ns: int, poses: Floats, color: tuple[float, float, float, float]) -> PointCloud:
+    """The positions of poses (R, 4, 4), all in one colour."""
+    packed = np.zeros(len(poses), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
+    packed["position"] = poses[:, :3, 3]
+    packed["color"] = np.round(255 * np.array(color))
+    message = PointCloud(frame_id=MAP, point_stride=packed.itemsize, data=packed.tobytes())
+    message.timestamp.FromNanoseconds(stamp_ns)
+    message.pose.orientation.w = 1.0
+    for at, name in enumerate("xyz"):
+        message.fields.add(name=name, offset=4 * at, type=PackedElementField.FLOAT32)
+    for at, name in enumerate(("red", "green", "blue", "alpha")):
+        message.fields.add(name=name, offset=12 + at, type=PackedElementField.UINT8)
     return message
 
 

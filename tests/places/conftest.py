@@ -1,0 +1,23 @@
+"""One small library for all tests of the folder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from .pictures import SMALL, reference
+
+if TYPE_CHECKING:
+    from vplog.data import Reference
+    from vplog.places.bobb import BobbState
+
+
+@pytest.fixture(scope="session")
+def references() -> list[Reference]:
+    return [reference(seed) for seed in range(12)]
+
+
+@pytest.fixture(scope="session")
+def state(references: list[Reference]) -> BobbState:
+    return SMALL.learn(references, 2)

@@ -1,0 +1,227 @@
+"""Words of features, and libraries on disk."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from vplog.errors import LibraryError, SettingsError
+from vplog.places import library as lib
+from vplog.places.bobb import BobbSettings
+
+from .pictures import SMALL, noisy, nothing, reference, texture
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Reference
+    from vplog.places.bobb import BobbState
+
+
+def _lists(words: lib.Words) -> list[list[int]]:
+    return [words.values[a:b].tolist() for a, b in zip(words.start[:-1], words.start[1:], strict=True)]
+
+
+def _l1(descriptors: np.ndarray, library: np.ndarray) -> np.ndarray:
+    """(M, F) distances to every library feature, in float64."""
+    a = descriptors / descriptors.sum(1, keepdims=True, dtype=np.float64)
+    b = library / library.sum(1, keepdims=True, dtype=np.float64)
+    return np.array([np.abs(b - row).sum(1) for row in a])
+
+
+def test_words_are_near_and_most_of_those_that_exist(state: BobbState, references: list[Reference]) -> None:
+    library = state.library
+    descriptors = np.concatenate([noisy(r.features, 1, 8.0).descriptors[:40] for r in references[:4]])
+    words = _lists(library.translate(descriptors))
+    distance = _l1(descriptors, library.descriptors)
+    squared = ((descriptors[:, None, :].astype(np.int64) - library.descriptors[None]) ** 2).sum(-1)
+    found = true = 0
+    for row, each in enumerate(words):
+        assert each == sorted(set(each))
+        assert len(each) <= SMALL.neighbours
+        assert (distance[row, each] < SMALL.max_l1 + 1e-6).all()
+        nearest = np.argsort(squared[row], kind="stable")[: SMALL.neighbours]
+        expected = set(nearest[distance[row, nearest] < SMALL.max_l1].tolist())
+        found, true = found + len(expected & set(each)), true + len(expected)
+    assert true > 100
+    assert found / true > 0.9
+
+
+def test_features_of_another_kind_have_no_words(state: BobbState) -> None:
+    flat = np.full((3, 128), 45, np.uint8)
+    assert state.library.translate(flat).start.tolist() == [0, 0, 0, 0]
+    zeros = np.zeros((2, 128), np.uint8)
+    assert state.library.translate(zeros).values.size == 0
+    assert state.library.translate(nothing().descriptors).start.tolist() == [0]
+
+
+def test_own_words_hold_the_feature_itself(state: BobbState) -> None:
+    for feature, each in enumerate(_lists(state.library.words)):
+        assert feature in each
+        assert each == sorted(set(each))
+        assert each[-1] < state.library.start[-1]
+
+
+def test_repeated_features_are_words_of_each_other() -> None:
+    once = reference(3)
+    library = lib.build_library([once, once], lib.WordSettings(features=50), 1)
+    words = _lists(library.words)
+    shared = sum(feature + 50 in words[feature] for feature in range(50))
+    assert shared > 45
+    assert all(feature in words[feature] for feature in range(100))
+
+
+def test_words_do_not_depend_on_batches_or_threads(state: BobbState, references: list[Reference]) -> None:
+    library = state.library
+    images = [noisy(r.features, 2).descriptors for r in references]
+    whole = _lists(library.translate(np.concatenate(images)))
+    one_by_one = [each for image in images[:2] for row in image for each in _lists(library.translate(row[None]))]
+    assert whole[: len(one_by_one)] == one_by_one
+    with ThreadPoolExecutor(4) as pool:
+        batches = list(pool.map(library.translate, images * 3))
+    assert [each for batch in batches for each in _lists(batch)] == whole * 3
+
+
+def test_only_the_strongest_features_are_kept(references: list[Reference]) -> None:
+    library = lib.build_library(references[:3], lib.WordSettings(features=20), 1)
+    assert library.start.tolist() == [0, 20, 40, 60]
+    np.testing.assert_array_equal(library.descriptors[20:40], references[1].features.descriptors[:20])
+    assert library.size(2) == (320, 200)
+
+
+def test_a_library_needs_features() -> None:
+    with pytest.raises(LibraryError, match="at least one reference"):
+        lib.build_library([], SMALL, 1)
+    empty = replace(reference(0), features=nothing())
+    with pytest.raises(LibraryError, match="None of the 2 reference images"):
+        lib.build_library([empty, empty], SMALL, 1)
+
+
+@pytest.fixture
+def saved(tmp_path: Path, references: list[Reference]) -> Path:
+    SMALL.learn([*references[:4], replace(reference(5), features=nothing())], 1).save(tmp_path / "library")
+    return tmp_path / "library"
+
+
+def _refused(folder: Path) -> str:
+    with pytest.raises((LibraryError, SettingsError)) as error:
+        BobbSettings().load(folder, 1)
+    message = str(error.value)
+    assert "\n" not in message
+    assert str(folder) in message
+    return message
+
+
+def test_a_reference_without_features_survives_the_disk(saved: Path) -> None:
+    loaded = BobbSettings().load(saved, 1)
+    assert len(loaded.library) == 5
+    assert loaded.library.start[-1] == loaded.library.start[-2]
+    np.testing.assert_array_equal(loaded.library.references[4].image, texture(5))
+    assert loaded.library.references[1].drive == "drive 1"
+    assert loaded.library.references[1].stamp_ns == 10**18 + 1
+
+
+def test_folders_that_are_no_library(tmp_path: Path) -> None:
+    assert "no library.json" in _refused(tmp_path)
+    assert "no library.json" in _refused(tmp_path / "missing")
+    (tmp_path / "file").write_text("hello")
+    _refused(tmp_path / "file")
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"hash": 1}', '{"hash": "x", "settings": []}', "[" * 100_000, "\0"])
+def test_damaged_records(saved: Path, text: str) -> None:
+    (saved / "library.json").write_text(text)
+    _refused(saved)
+
+
+@pytest.mark.parametrize("change", [{"seed": 9}, {"references": 50}, {"grid": 300}, {"partitions": 0}, {"new": 1}])
+def test_changed_settings_are_noticed(saved: Path, change: dict[str, int]) -> None:
+    record = json.loads((saved / "library.json").read_text())
+    (saved / "library.json").write_text(json.dumps({**record, "settings": {**record["settings"], **change}}))
+    _refused(saved)
+
+
+def _replace(path: Path, column: str, values: pa.Array) -> None:
+    table = pq.read_table(path)
+    at = table.column_names.index(column)
+    pq.write_table(table.set_column(at, table.schema.field(at), values), path)
+
+
+def test_changed_features_are_noticed(saved: Path) -> None:
+    path = saved / "features.parquet"
+    rows = pq.read_table(path)["descriptor"].to_pylist()
+    rows[7] = rows[8]
+    _replace(path, "descriptor", pa.array(rows, pa.binary(128)))
+    assert "hash" in _refused(saved)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("features", "x", 321.0),
+        ("features", "y", -5.0),
+        ("features", "x", float("nan")),
+        ("features", "x", None),
+        ("features", "descriptor", None),
+        ("features", "reference", 5),
+        ("features", "reference", -1),
+        ("features", "reference", None),
+        ("references", "width", 0),
+        ("references", "width", 40_000),
+        ("references", "height", 199),
+        ("references", "drive", None),
+        ("references", "image", None),
+        ("references", "image", b""),
+        ("references", "image", b"no picture"),
+    ],
+)
+def test_cells_that_make_no_sense(saved: Path, table: str, column: str, value: object) -> None:
+    path = saved / f"{table}.parquet"
+    old = pq.read_table(path)[column]
+    _replace(path, column, pa.array([*old.to_pylist()[:-1], value], old.type))
+    _refused(saved)
+
+
+def test_tables_of_another_kind(saved: Path) -> None:
+    pq.write_table(pa.table({"a": [1]}), saved / "features.parquet")
+    assert "not those of a library" in _refused(saved)
+
+
+@pytest.mark.parametrize("name", ["features.parquet", "references.parquet"])
+def test_missing_and_cut_tables(saved: Path, name: str) -> None:
+    data = (saved / name).read_bytes()
+    for part in (data[: len(data) // 2], b"", data[:-1]):
+        (saved / name).write_bytes(part)
+        _refused(saved)
+    (saved / name).unlink()
+    _refused(saved)
+
+
+def test_flipped_bytes_are_refused_or_harmless(saved: Path) -> None:
+    """References or one line, whatever byte is hit; what gets through is noticed by the hash."""
+    rng = np.random.default_rng(0)
+    refused = 0
+    for name in ("features.parquet", "references.parquet"):
+        data = (saved / name).read_bytes()
+        for at in [*rng.integers(0, len(data), 25), *rng.integers(len(data) - 1500, len(data), 40)]:
+            (saved / name).write_bytes(data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :])
+            try:
+                lib.load_references(saved)
+            except LibraryError as error:
+                assert "\n" not in str(error)
+                refused += 1
+        (saved / name).write_bytes(data)
+    assert refused > 40
+
+
+def test_a_library_that_cannot_be_written(state: BobbState, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(LibraryError, match="Cannot write the library"):
+        state.save(tmp_path / "file")
