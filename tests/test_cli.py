@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from conftest import Said
+
     from vplog.demo.record import Drive
 
     Verb = Callable[..., Said]
@@ -131,6 +132,7 @@ def test_json_of_info(verb: Verb, drive: Drive) -> None:
     assert said.err == ""
     assert said.json["kind"] == "mcap"
     assert {topic["name"]: topic["count"] for topic in said.json["topics"]}[IMAGE] == len(drive.stamp_ns)
+    assert drive.camera.matrix is not None
     np.testing.assert_allclose(said.json["camera"]["matrix"], drive.camera.matrix)
 
 
@@ -265,7 +267,7 @@ def image_folder(folder: Path, _: Path) -> Path:
         (wrong_magic, "RIFF"),
         (no_images, "image"),
         (no_odometry, "odometry"),
-        (no_messages, "image|message"),
+        (no_messages, "odometry"),
         (one_frame, "two"),
         (no_decodable_image, "decoded"),
         (only_nan_odometry, "odometry"),
@@ -278,7 +280,7 @@ def test_a_log_that_cannot_be_run_is_one_line(
 ) -> None:
     log = make(tmp_path, drive.log)
     error = verb("run", log, "-o", tmp_path / "run", *QUICK).error
-    assert any(word in error for word in why.split("|")), error
+    assert why in error
     assert not (tmp_path / "run" / ".features").exists()
     if (tmp_path / "run" / "run.json").exists():
         assert record_of(tmp_path / "run")["finished"] is False
@@ -311,6 +313,8 @@ def test_two_drives_are_not_one_run(verb: Verb, drive: Drive, tmp_path: Path) ->
         (("--set", "propose.per_query=many"), "many"),
         (("--set", "propose.per_query=.nan"), "propose.per_query"),
         (("--set", "propose=1"), "propose"),
+        (("--set", "library.size=0"), "library.size"),
+        (("--set", "library.seed=-1"), "library.seed"),
         (("--set", "propose.per_query.more=1"), "per_query"),
         (("--set", "propose.per_query"), "stage.setting=value"),
         (("--set", "propose.per_query=["), "YAML"),
@@ -347,8 +351,8 @@ def test_output_of_the_other_verbs_that_cannot_be_written(verb: Verb, drive: Dri
     (tmp_path / "file").write_text("mine")
     for out in ("file", "file/below"):
         assert "file" in verb("schemas", "-o", tmp_path / out).error
-        assert "file" in verb("demo", "-o", tmp_path / out).error
         assert "file" in verb("library", drive.log, "-o", tmp_path / out, *QUICK).error
+    assert "file" in verb("demo", "-o", tmp_path / "file" / "below").error
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -370,8 +374,10 @@ def test_a_library_that_cannot_be_used_is_one_line(
         (library / "references.parquet").write_bytes(b"")
     changed = ("--set", "places.boxes=3") if damage == "other settings" else ()
     error = verb("run", drive.log, "-o", tmp_path / "run", "--library", library, *QUICK, *changed).error
-    assert str(library) in error or "library" in error
+    assert str(library) in error
     assert not (tmp_path / "run" / ".features").exists()
+    if "table" not in damage:
+        assert not (tmp_path / "run").exists(), "told before the run began"
 
 
 def test_a_truth_that_does_not_fit_is_one_line(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
@@ -390,9 +396,7 @@ def test_a_truth_that_does_not_fit_is_one_line(verb: Verb, drive: Drive, finishe
     assert "clock" in verb("evaluate", finished, "--truth", tmp_path / "other.tum").error
 
 
-def test_what_is_no_finished_run_cannot_be_evaluated(
-    verb: Verb, drive: Drive, finished: Path, tmp_path: Path
-) -> None:
+def test_what_is_no_finished_run_cannot_be_evaluated(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
     assert "run.json" in verb("evaluate", tmp_path / "nowhere", "--truth", drive.truth).error
     assert "run.json" in verb("evaluate", drive.log.parent, "--truth", drive.truth).error
     run = tmp_path / "run"
@@ -484,25 +488,20 @@ def test_frames_without_odometry_are_left_out_with_a_warning(verb: Verb, drive: 
     assert_all_finite(tmp_path / "run")
 
 
-def test_standing_still_makes_no_closures(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_standing_still_all_the_time_is_said(verb: Verb, drive: Drive, tmp_path: Path) -> None:
     """The odometry says that nothing moves, whatever the camera sees."""
-    first: list[bytes] = []
+    first: list[Any] = []
 
     def hold(topic: str, _: int, data: bytes) -> bytes:
         if topic != ODOMETRY:
             return data
-        first.append(data)
-        still: Any = _STORE.deserialize_cdr(first[0], TYPES[ODOMETRY])
-        now: Any = _STORE.deserialize_cdr(data, TYPES[ODOMETRY])
-        now.pose = still.pose
-        return bytes(_STORE.serialize_cdr(now, TYPES[ODOMETRY]))
+        message: Any = _STORE.deserialize_cdr(data, TYPES[ODOMETRY])
+        first.append(message.pose)
+        message.pose = first[0]
+        return bytes(_STORE.serialize_cdr(message, TYPES[ODOMETRY]))
 
-    said = verb("run", rewritten(drive.log, tmp_path / "still.mcap", hold), "-o", tmp_path / "run", *QUICK, "--json")
-    if said.code == 1:
-        assert "move" in said.error
-        return
-    assert "accepted" not in said.json["counts"]["verdicts"]
-    assert_all_finite(tmp_path / "run")
+    still = rewritten(drive.log, tmp_path / "still.mcap", hold)
+    assert "nothing moves" in verb("run", still, "-o", tmp_path / "run", *QUICK).error
 
 
 # Runs that are cut short
@@ -539,18 +538,15 @@ def test_killed_in_the_middle_and_run_again(verb: Verb, drive: Drive, tmp_path: 
     assert verb("evaluate", tmp_path / "run", "--truth", drive.truth, "--json").json["ate_after"]["count"] > 0
 
 
-@pytest.mark.parametrize("limit", [2_000, 100_000, 7_000_000])
+@pytest.mark.parametrize("limit", [2_000, 100_000])
 def test_a_full_disk_is_one_line(drive: Drive, tmp_path: Path, limit: int) -> None:
-    """A limit on the size of a file stands in for the disk: for run.json, the features, or what comes after."""
+    """A limit on the size of a file stands in for the disk: too small for run.json, or for the features."""
 
     def small_files() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = started("run", drive.log, "-o", tmp_path / "run", *QUICK, preexec_fn=small_files)
     out, err = process.communicate(timeout=120)
-    if process.returncode == 0:
-        pytest.skip(f"no file of this run is larger than {limit} bytes")
     assert (process.returncode, out) == (1, "")
     assert err.startswith("vplog: error: Cannot")
     assert len(err.splitlines()) == 1, err
@@ -565,5 +561,5 @@ def test_results_that_cannot_be_printed_are_one_line() -> None:
         command = [sys.executable, "-m", "vplog", "config"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith("vplog: error: ")
+    assert done.stderr.startswith("vplog: error: Cannot")
     assert len(done.stderr.splitlines()) == 1, done.stderr

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from conftest import Said
+
     from vplog.demo.record import Drive
 
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
@@ -180,7 +181,7 @@ def test_gtsam_reads_the_graph(finished: Path) -> None:
 def test_duckdb_joins_the_tables(finished: Path) -> None:
     def ask(query: str) -> list[tuple[Any, ...]]:
         named = re.sub(r"\[(\w+)\]", lambda name: f"read_parquet('{finished / name[1]}.parquet')", query)
-        return duckdb.sql(named).fetchall()
+        return duckdb.connect().execute(named).fetchall()
 
     for table in TABLES:
         [(rows,)] = ask(f"select count(*) from [{table}]")  # noqa: S608 - names from this file

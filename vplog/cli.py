@@ -48,8 +48,11 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         _fail(arguments, str(error))
     except MemoryError:
         _fail(arguments, "Out of memory. Use fewer --threads, or a shorter log.")
+    except OSError as error:  # a full disk, a drive that went away
+        _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
     except Exception as error:  # a fault of ours: still one line, and how to see more
-        _fail(arguments, f"Internal error: {type(error).__name__}: {str(error).splitlines()[:1]}. See it with --debug.")
+        text = " ".join(str(error).split())[:200]
+        _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
 
 

@@ -28,11 +28,12 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     if truth == "gps":
-        return {"truth": "gps", **_against_gps(Path(record["log"]), before, after, topics)}
+        return {"truth": "gps", **_against_gps(Path(_recorded(record, folder, str, "log")), before, after, topics)}
     known = read_truth(Path(truth))
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
-    stops = candidate_stops(keyframes, ProposeSettings.read(record["settings"]["propose"], f"{folder}/run.json"))
+    settings = _recorded(record, folder, dict, "settings", "propose")
+    stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
     return {
         "truth": truth,
         "ate_before": asdict(trajectory.ate(before, known)),
@@ -41,6 +42,15 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
         "rpe_after": asdict(trajectory.rpe(after, known)),
         "closures": asdict(closures.score_closures(keyframes, ledger, known, stops)),
     }
+
+
+def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
+    """What run.json holds under these names. Raises ResultError where that is not of the kind, or not there."""
+    for name in names:
+        record = record.get(name) if isinstance(record, dict) else None
+    if not isinstance(record, kind):
+        raise ResultError(f"{folder}/run.json lacks {'.'.join(names)}. Run `vplog run` again to write it anew.")
+    return record
 
 
 def _against_gps(path: Path, before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None) -> dict[str, Any]:

@@ -61,11 +61,10 @@ def select_keyframes(
 
 def _has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> np.ndarray:
     right = np.searchsorted(odometry_ns, stamp_ns)
-    inside = (right < len(odometry_ns)) & ((right > 0) | (stamp_ns == odometry_ns[0])) & (len(odometry_ns) > 1)
-    right = np.clip(right, 1, max(len(odometry_ns) - 1, 1))
-    if len(odometry_ns) < 2:
-        return np.zeros(len(stamp_ns), bool)
-    return inside & (odometry_ns[right] - odometry_ns[right - 1] <= gap_ns)
+    inside = (right > 0) & (right < len(odometry_ns))
+    right = np.minimum(right, len(odometry_ns) - 1)
+    sampled = odometry_ns[right] == stamp_ns  # known whatever lies beside it
+    return sampled | (inside & (odometry_ns[right] - odometry_ns[right - 1] <= gap_ns))
 
 
 def _spacing(poses: Floats) -> float:

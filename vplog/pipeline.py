@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 import vplog
 from vplog import logs
 from vplog.data import Closures, EdgeKind, Keyframes, Reference, Verdict
-from vplog.errors import LogError, SettingsError
+from vplog.errors import LibraryError, LogError, SettingsError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.features.sift import SiftSettings
 from vplog.features.store import FeatureStore
@@ -30,6 +30,7 @@ from vplog.loops.propose import ProposeSettings, propose
 from vplog.loops.verify import VerifySettings, verify
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
+from vplog.places.library import read_library_record
 from vplog.results import g2o, mcap, run_record, tables, tum
 from vplog.settings import Settings, load_yaml, override
 from vplog.timing import Watch
@@ -65,10 +66,10 @@ class LibrarySettings(Settings):
 
     choose: Literal["random"] = "random"
     """How: a random collection of the drive's own keyframes, as the paper (section IV)."""
-    size: int | None = None
+    size: int | None = Field(default=None, ge=1, le=1_000_000)
     """L: how many. None takes every eighth keyframe, at most the paper's 100: were every other frame a reference, the
     four that explain a frame would be its neighbours in time, which a later visit shares with nobody."""
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
     """Of the choice."""
 
 
@@ -117,7 +118,7 @@ def load_pipeline(name: str, assignments: Iterable[str] = ()) -> Pipeline:
     tree, where = load_yaml(path), path.name
     for assignment in assignments:
         tree = override(tree, assignment)
-        where += f" with --set {assignment}"
+        where = f"{path.name} and --set"
     return Pipeline.read(tree, where)
 
 
@@ -156,6 +157,7 @@ def run(
     """Drive in, run folder out. Raises VplogError with one line where that cannot be."""
     log = logs.open(path, topics)
     watch, warnings = Watch(), []
+    check_library(library, pipeline)
     begin_folder(out, pipeline, path, threads)
     with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store, _heard(warnings):
         hashes = aside.submit(hash_inputs, path)
@@ -238,6 +240,11 @@ def extract(
     """Decode the keyframes, store their features, keep the chosen ones' images; undecodable frames are left out."""
     kept, references, lost = [], [], []
     total = len(keyframes.stamp_ns)
+    if total < 2:
+        raise LogError(
+            f"{log.name}: by the odometry nothing moves far enough for a second keyframe, and a graph needs two. "
+            "Set keyframes.distance_m lower, or choose another topic with --odometry-topic."
+        )
     frames = extract_frames(log.frames(keyframes.stamp_ns), pipeline.features, threads)
     for row, (stamp_ns, frame, features, why) in enumerate(frames):
         progress("extract", row + 1, total)
@@ -294,6 +301,19 @@ def judge(closures: Closures, graph: PoseGraph, solution: Solution, rows: Ints) 
     for row in rows[weight[rows] < 0.5]:
         verdict[row] = Verdict.REJECTED_BY_SOLVER
     return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)
+
+
+def check_library(folder: Path | None, pipeline: Pipeline) -> None:
+    """Before any work: is what was given a library, and made as this run describes places? Raises LibraryError."""
+    if folder is None:
+        return
+    made = pipeline.places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
+    for name, value in pipeline.places:
+        if getattr(made, name) != value:
+            raise LibraryError(
+                f"{folder} was made with places.{name}={getattr(made, name)}, and this run asks for {value}. "
+                f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
+            )
 
 
 def build_library(

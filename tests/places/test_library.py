@@ -38,7 +38,7 @@ def _l1(descriptors: np.ndarray, library: np.ndarray) -> np.ndarray:
 
 def test_words_are_near_and_most_of_those_that_exist(state: BobbState, references: list[Reference]) -> None:
     library = state.library
-    descriptors = np.concatenate([noisy(r.features, 1, 8.0).descriptors[:40] for r in references[:4]])
+    descriptors = np.concatenate([noisy(r.features, 1, 8.0).descriptors[:25] for r in references[:4]])
     words = _lists(library.translate(descriptors))
     distance = _l1(descriptors, library.descriptors)
     squared = ((descriptors[:, None, :].astype(np.int64) - library.descriptors[None]) ** 2).sum(-1)
@@ -115,7 +115,6 @@ def _refused(folder: Path) -> str:
         BobbSettings().load(folder, 1)
     message = str(error.value)
     assert "\n" not in message
-    assert str(folder) in message
     return message
 
 
@@ -129,7 +128,7 @@ def test_a_reference_without_features_survives_the_disk(saved: Path) -> None:
 
 
 def test_folders_that_are_no_library(tmp_path: Path) -> None:
-    assert "no library.json" in _refused(tmp_path)
+    assert f"{tmp_path} is not a library: it has no library.json" in _refused(tmp_path)
     assert "no library.json" in _refused(tmp_path / "missing")
     (tmp_path / "file").write_text("hello")
     _refused(tmp_path / "file")
@@ -210,7 +209,7 @@ def test_flipped_bytes_are_refused_or_harmless(saved: Path) -> None:
     refused = 0
     for name in ("features.parquet", "references.parquet"):
         data = (saved / name).read_bytes()
-        for at in [*rng.integers(0, len(data), 25), *rng.integers(len(data) - 1500, len(data), 40)]:
+        for at in [*rng.integers(0, len(data), 15), *rng.integers(len(data) - 1500, len(data), 25)]:
             (saved / name).write_bytes(data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :])
             try:
                 lib.load_references(saved)
@@ -218,7 +217,7 @@ def test_flipped_bytes_are_refused_or_harmless(saved: Path) -> None:
                 assert "\n" not in str(error)
                 refused += 1
         (saved / name).write_bytes(data)
-    assert refused > 40
+    assert refused > 25
 
 
 def test_a_library_that_cannot_be_written(state: BobbState, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def _fast(case: Case) -> tuple[np.ndarray, Int32s, Int32s]:
 
 def test_votes_and_box_agree_with_the_literal_algorithm() -> None:
     voted = bound = 0
-    for seed in range(150):
+    for seed in range(120):
         case = _case(seed)
         cells, grid_x, grid_y = _fast(case)
         V = voting_image(case.H, case.picture, case.cuts.x_cuts, case.cuts.y_cuts)
@@ -84,7 +84,7 @@ def test_votes_and_box_agree_with_the_literal_algorithm() -> None:
         voted += V.any()
         held = Counter(word for each in case.picture.words for word in each)
         bound += any(0 < case.H[word] < held[word] for word in held)
-    assert min(voted, bound) > 75  # the cases are worth the name
+    assert min(voted, bound) > 60  # the cases are worth the name
 
 
 def test_described_boxes_agree_with_the_literal_algorithm(state: BobbState, references: list[Reference]) -> None:
@@ -127,6 +127,7 @@ def test_partitions_cover_the_image_once() -> None:
             assert (np.diff(xs, axis=1) >= 0).all()
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.integers(1, 4000), st.integers(1, 255))
 def test_grid_cells_are_even_to_a_pixel(length: int, cells: int) -> None:
     cuts = rvp.grid_cuts(length, cells)
@@ -134,6 +135,7 @@ def test_grid_cells_are_even_to_a_pixel(length: int, cells: int) -> None:
     assert np.ptp(np.diff(cuts)) <= 1
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.integers(1, 255), st.floats(0.01, 1.0), st.lists(st.floats(0.05, 20.0), min_size=1, max_size=5))
 def test_boxes_are_the_largest_that_are_allowed(grid: int, share: float, aspects: list[float]) -> None:
     if grid * grid * share < 1:
@@ -146,7 +148,7 @@ def test_boxes_are_the_largest_that_are_allowed(grid: int, share: float, aspects
         assert height == grid or width * (height + 1) > int(share * grid * grid)
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 9), st.floats(0.15, 1.0))
 def test_counted_boxes_are_those_there_are(grid: int, share: float) -> None:
     if grid * grid * share >= 1:
@@ -182,5 +184,3 @@ def test_a_feature_counts_once_a_reference() -> None:
     # references 0..2 own features 0-3, 4-5, 6-9; feature 0 has two words of reference 0 and one of 2, feature 1 none
     start, values = np.array([0, 3, 3, 4], np.int32), np.array([1, 2, 7, 9], np.int32)
     assert bobb._count_matches(start, values, np.array([0, 4, 6, 10], np.int32)).tolist() == [1, 0, 2]
-
-

@@ -57,7 +57,9 @@ def build_graph(
             )
         a, b = np.concatenate([a, match]), np.concatenate([b, query])
         a_from_b = np.concatenate([a_from_b, closures.match_from_query[rows]])
-        information = np.concatenate([information, closures.information[rows]])
+        information = np.concatenate(
+            [information, closures.information[rows] / _shared(match, query, n)[:, None, None]]
+        )
     graph = PoseGraph(
         world_from_body=np.array(poses, np.float64),
         a=a.astype(np.int32),
@@ -68,6 +70,12 @@ def build_graph(
     )
     graph, warnings = checked(graph)
     return graph, rows.astype(np.int64), warnings
+
+
+def _shared(match: Int32s, query: Int32s, n: int) -> Floats:
+    """(L,) how many closures the busier end of each has."""
+    at_match, at_query = np.bincount(match, minlength=n), np.bincount(query, minlength=n)
+    return np.maximum(at_match[match], at_query[query]).astype(np.float64)
 
 
 def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
