@@ -218,19 +218,24 @@ def config(arguments: argparse.Namespace) -> None:
 
 def schemas(arguments: argparse.Namespace) -> None:
     """Write the contracts for outsiders."""
-    from vplog.errors import ResultError
     from vplog.pipeline import pipeline_schema
     from vplog.results.contracts import write_schemas
 
-    try:
-        arguments.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"Cannot make the folder {arguments.output}: {error.strerror}.") from None
+    _folder(arguments.output)
     written = [str(path) for path in write_schemas(arguments.output, pipeline_schema())]
     if arguments.json:
         _print_json({"written": written})
     else:
         print("\n".join(written))
+
+
+def _folder(path: Path) -> None:
+    from vplog.errors import ResultError
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"Cannot make the folder {path}: {error.strerror}. Choose another with -o.") from None
 
 
 def demo(arguments: argparse.Namespace) -> None:
@@ -240,6 +245,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from vplog.pipeline import run as run_pipeline
 
     pipeline = _pipeline(arguments)
+    _folder(arguments.output)
     with _Progress(arguments) as progress:
         progress("render", 0, 1)
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import platform
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -366,6 +367,8 @@ def begin_folder(out: Path, pipeline: Pipeline, path: Path, threads: int) -> Non
     except OSError as error:
         raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
     run_record.write_run_json(out / "run.json", {**_head(pipeline, path, threads), "finished": False})
+    if (out / "library" / "library.json").is_file():  # an earlier run's, which would not be this one's
+        shutil.rmtree(out / "library")
 
 
 def _odometry(log: Log) -> Odometry:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
 from vplog import geometry
 from vplog.settings import Settings
@@ -20,15 +21,15 @@ class CalibrationSettings(Settings):
     small residuals: only another sensor can tell. A wrong one is not corrected, but closures then claim less.
     """
 
-    pairs: int = 32
+    pairs: int = Field(default=32, ge=0, le=10_000)
     """Pairs of keyframes that are compared; their mean is six times surer than one."""
-    angle: float = 0.15
+    angle: float = Field(default=0.15, gt=0, lt=3.2)
     """Rotation of a pair in rad, by odometry: enough to stand out of its noise, little enough to share a view."""
-    reach: int = 8
+    reach: int = Field(default=8, ge=1, le=1000)
     """Keyframes that a pair may be apart."""
-    least_share: float = 0.01
+    least_share: float = Field(default=0.01, ge=0, le=1)
     """Share of the rotation that is never claimed to be known better: a careful calibration's focal length."""
-    most_share: float = 0.2
+    most_share: float = Field(default=0.2, gt=0, le=1)
     """A larger disagreement is the odometry's, not a lens's: it is taken as this much."""
 
 

@@ -32,21 +32,21 @@ class LandmarkSettings(Settings):
     """Keyframes before and after the map frame that its features are triangulated with."""
     pixel_sigma: float = Field(default=0.7, gt=0.0)
     """Standard deviation in px of a feature's position along each axis; a SIFT point repeats to 0.5 to 1 px."""
-    depth_sigma: float = 1.425e-3
+    depth_sigma: float = Field(default=1.425e-3, gt=0)
     """Standard deviation in 1/m of measured inverse depth, so that sigma_z = depth_sigma z^2: Khoshelham & Elberink
     2012, section 3.2, for the Kinect (1.425e-3 m^-1)."""
-    depth_share: float = 0.01
+    depth_share: float = Field(default=0.01, ge=0)
     """Further error of measured depth as a share of it: registration to the colour image and its calibration."""
-    depth_range_m: float = 20.0
+    depth_range_m: float = Field(default=20.0, gt=0)
     """Measured depths beyond this are taken as unknown: twice the longest range of common depth cameras."""
     odometry_rotation: float = Field(default=0.005, gt=0.0)
     """Standard deviation in rad of the odometry's rotation between neighbouring keyframes, before images refine it."""
-    odometry_share: float = 0.02
+    odometry_share: float = Field(default=0.02, gt=0)
     """Standard deviation of the odometry's translation between neighbouring keyframes, as a share of its length."""
-    certainty: float = 3.0
+    certainty: float = Field(default=3.0, gt=0)
     """A landmark is known where its inverse depth is this many sigmas above zero: its depth is then sure to a third,
     and a point at infinity passes once in a thousand."""
-    gate_px: float = 4.0
+    gate_px: float = Field(default=4.0, gt=0)
     """Reprojection error in px beyond which an observation leaves its track: four to six sigmas."""
     iterations: int = Field(default=5, ge=1)
     """Gauss-Newton steps of the window's bundle adjustment; odometry starts it within its linear range."""

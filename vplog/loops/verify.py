@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from vplog import geometry
 from vplog.data import Closures, Verdict
@@ -37,7 +38,7 @@ _SUSPICIOUS_SHARE = 0.05
 class VerifySettings(Settings):
     """How a proposed closure is checked."""
 
-    min_matches: int = 25
+    min_matches: int = Field(default=25, ge=0)
     """Feature matches below which two images are not looked at further. Of the 20 that must agree in the end a fifth
     has no landmark, and two images of different places share 16 by chance, seldom 25."""
     matching: MatchSettings = MatchSettings()

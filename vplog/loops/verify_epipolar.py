@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from vplog.data import Verdict
 from vplog.loops import chance
@@ -24,15 +25,15 @@ _MODELS = 3
 class EpipolarSettings(Settings):
     """When two uncalibrated images are said to show one place."""
 
-    min_inliers: int = 20
+    min_inliers: int = Field(default=20, ge=8)
     """Matches that must agree; a line is a weak test, so no fewer than for a pose."""
-    log10_false_alarms: float = -6.0
+    log10_false_alarms: float = Field(default=-6.0, le=0)
     """Most wrong geometries expected by chance, as log10 (Moisan & Stival 2004)."""
-    max_error_px: float = 2.0
+    max_error_px: float = Field(default=2.0, gt=0)
     """Distance in px to the epipolar line that is an agreement: two sigmas of a SIFT point."""
-    rounds: int = 2000
+    rounds: int = Field(default=2000, ge=1, le=1_000_000)
     """Most samples of RANSAC: a geometry is found with 99 % where 42 % of the matches are right."""
-    min_spread: float = 0.1
+    min_spread: float = Field(default=0.1, ge=0, le=1)
     """Share of the image that the inliers' bounding box must cover; less is one object, not a place."""
 
 

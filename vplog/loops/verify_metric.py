@@ -37,32 +37,32 @@ class MetricSettings(Settings):
 
     min_inliers: int = Field(default=20, ge=6)
     """Matches that must agree with the pose; RTAB-Map's and ORB-SLAM's usual bound, well above chance."""
-    min_share: float = 0.25
+    min_share: float = Field(default=0.25, ge=0, le=1)
     """Share of the matches with landmarks that must agree: repeated structure lets a wrong pose gather some."""
-    log10_false_alarms: float = -6.0
+    log10_false_alarms: float = Field(default=-6.0, le=0)
     """Most wrong poses expected by chance, as log10: at -6 one in a million pairs without a common view, where matches
     fall anywhere in the image (Moulon, Monasse & Marlet 2012)."""
-    ransac_px: float = 4.0
+    ransac_px: float = Field(default=4.0, gt=0)
     """Reprojection error in px that RANSAC calls an agreement; wide, as landmarks are uncertain too."""
-    ransac_rounds: int = 500
+    ransac_rounds: int = Field(default=500, ge=1, le=1_000_000)
     """Most samples of RANSAC: a pose is found with 99 % where 21 % of the matches are right."""
-    max_error_px: float = 8.0
+    max_error_px: float = Field(default=8.0, gt=0)
     """Reprojection error in px that no landmark's uncertainty excuses."""
-    min_spread: float = 0.1
+    min_spread: float = Field(default=0.1, ge=0, le=1)
     """Share of the image that the inliers' bounding box must cover; less is one object, not a place, and a pose from
     under a third of the field of view magnifies every pixel of noise."""
-    max_depths: float = 0.5
+    max_depths: float = Field(default=0.5, gt=0)
     """Longest translation as a multiple of the inliers' median depth: half the depth to the side leaves half of a
     53-degree view, and half the depth ahead doubles every size."""
-    max_distance_m: float = 5.0
+    max_distance_m: float = Field(default=5.0, gt=0)
     """Longest translation in m: a place is as wide as the paper's widest spacing of views (1-5 m, section IV). Beyond
     it the pose may well be right, but its error grows with the distance, and a nearer keyframe says the same."""
-    scale_share: float = 0.02
+    scale_share: float = Field(default=0.02, ge=0)
     """Standard deviation of the translation's length as a share of it, where odometry gave landmarks their scale."""
-    rotation_floor: float = 0.002
+    rotation_floor: float = Field(default=0.002, ge=0)
     """Least standard deviation of the rotation in rad: calibration and rolling shutter leave about a tenth of a
     degree that no number of matches averages out."""
-    translation_floor: float = 0.005
+    translation_floor: float = Field(default=0.005, ge=0)
     """Least standard deviation of the translation as a share of the inliers' median depth, for the same causes."""
 
 
