@@ -15,7 +15,7 @@ TOP = Path(__file__).parents[1]
 CHECKS = {
     "lint": ["-m", "ruff", "check", "."],
     "format": ["-m", "ruff", "format", "--check", "."],
-    "types": ["-m", "pyright"],
+    "types": ["-m", "pyright", "--pythonpath", sys.executable],
     "tests": ["-m", "pytest", *sys.argv[1:]],
 }
 

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import platform
-import shutil
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-import vplog
-from vplog import logs
+from vplog import logs, record
 from vplog.data import Closures, EdgeKind, Keyframes, Reference, Verdict
 from vplog.errors import LibraryError, LogError, SettingsError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
@@ -32,25 +25,18 @@ from vplog.loops.verify import VerifySettings, verify
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
 from vplog.places.library import read_library_record
+from vplog.references import PAPER_SIZE, LibrarySettings, choose
 from vplog.results import g2o, mcap, run_record, tables, tum
 from vplog.settings import Settings, load_yaml, override
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
-    from vplog.data import Ints, Odometry, PoseGraph, Solution
+    from vplog.data import Camera, Ints, Odometry, PoseGraph, Solution, Trajectory
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]
-
-
-_PAPER_SIZE = 100
-"""L of the paper's experiments (section IV)."""
-_FRAMES_A_REFERENCE = 8
-"""Keyframes per reference, twice the paper's J: four references then reach beyond a frame's neighbours in time."""
-_LEAST_SIZE = 8
-"""References of even the shortest drive: twice the paper's J, so that there is a choice."""
 
 
 _UNCALIBRATED = (
@@ -60,18 +46,6 @@ _UNCALIBRATED = (
 
 
 _NO_CLOSURE = "No closure passed verification: the trajectory is that of the odometry."
-
-
-class LibrarySettings(Settings):
-    """Which images become the reference library where none is given."""
-
-    choose: Literal["random"] = "random"
-    """How: a random collection of the drive's own keyframes, as the paper (section IV)."""
-    size: int | None = Field(default=None, ge=1, le=1_000_000)
-    """L: how many. None takes every eighth keyframe, at most the paper's 100: were every other frame a reference, the
-    four that explain a frame would be its neighbours in time, which a later visit shares with nobody."""
-    seed: int = Field(default=0, ge=0)
-    """Of the choice."""
 
 
 class Pipeline(Settings):
@@ -159,9 +133,9 @@ def run(
     log = logs.open(path, topics)
     watch, warnings = Watch(), []
     check_library(library, pipeline)
-    begin_folder(out, pipeline, path, threads)
-    with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store, _heard(warnings):
-        hashes = aside.submit(hash_inputs, path)
+    record.begin_folder(out, pipeline, path, threads)
+    with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store, record.heard(warnings):
+        hashes = aside.submit(record.hash_inputs, path)
         with watch.stage("read"):
             odometry = _odometry(log)
             camera = log.camera()
@@ -192,27 +166,20 @@ def run(
             trajectory = correct.correct_trajectory(odometry, keyframes, solution.world_from_body)
             warnings += doubts + repairs
         with watch.stage("write"):
-            settings = pipeline.model_dump(mode="json")
-            header = tables.TableMetadata(settings, state.hash)
-            poses = solution.world_from_body
-            if library is None:
-                state.save(out / "library")
-            tables.write_keyframes(out / "keyframes.parquet", keyframes, poses, header)
+            done = Run(keyframes, closures, graph, solution)
+            header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
             column = state.to_arrow(descriptors)
             tables.write_descriptors(out / "descriptors.parquet", keyframes, [column], state.arrow_type, header)
-            tables.write_closures(out / "closures.parquet", closures, keyframes, header)
-            tables.write_edges(out / "edges.parquet", graph, solution, header)
-            tables.write_trajectory(out / "trajectory.parquet", trajectory, odometry, header)
-            tum.write_tum(out / "trajectory.tum", trajectory)
-            g2o.write_g2o(out / "graph.g2o", graph, poses)
-            mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, camera)
-        record = {
-            **_head(pipeline, path, threads),
+            write_results(out, done, odometry, trajectory, camera, header)
+            if library is None:
+                state.save(out / "library")
+        account = {
+            **record.head(pipeline, path, threads),
             "finished": True,
             "inputs": hashes.result(),
             "library": {"hash": state.hash, "from": str(library) if library else "the drive's own keyframes"},
             "descriptor_bits": state.bits,
-            "counts": _counts(log, odometry, keyframes, closures),
+            "counts": record.counts(log, odometry, keyframes, closures),
             "noise": noise_source,
             "solution": {
                 "error_before": solution.error_before,
@@ -225,8 +192,29 @@ def run(
             "totals": watch.totals(),
             "warnings": log.warnings + warnings,
         }
-        run_record.write_run_json(out / "run.json", record)
-    return Run(keyframes, closures, graph, solution, record)
+        run_record.write_run_json(out / "run.json", account)
+    return replace(done, record=account)
+
+
+def write_results(
+    out: Path,
+    done: Run,
+    odometry: Odometry,
+    trajectory: Trajectory,
+    camera: Camera,
+    header: tables.TableMetadata,
+) -> None:
+    """The files of a run folder that every method writes alike."""
+    keyframes, closures, graph, solution = done.keyframes, done.closures, done.graph, done.solution
+    poses = solution.world_from_body
+    residual = consistency.residual_sigma(graph, poses)
+    tables.write_keyframes(out / "keyframes.parquet", keyframes, poses, header)
+    tables.write_closures(out / "closures.parquet", closures, keyframes, header)
+    tables.write_edges(out / "edges.parquet", graph, solution, residual, header)
+    tables.write_trajectory(out / "trajectory.parquet", trajectory, odometry, header)
+    tum.write_tum(out / "trajectory.tum", trajectory)
+    g2o.write_g2o(out / "graph.g2o", graph, poses)
+    mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, camera)
 
 
 def extract(
@@ -263,14 +251,6 @@ def extract(
         [f"{total - len(kept)} of {total} keyframes were lost to damaged images. First: {lost[0]}"] if lost else []
     )
     return Keyframes(keyframes.drive, keyframes.stamp_ns[kept], keyframes.odom_from_body[kept]), references, warnings
-
-
-def choose(stamp_ns: Ints, settings: LibrarySettings) -> Ints:
-    """Rows of the frames that become references, increasing."""
-    count = len(stamp_ns)
-    every = min(max(count // _FRAMES_A_REFERENCE, _LEAST_SIZE), _PAPER_SIZE)
-    size = min(count, every if settings.size is None else settings.size)
-    return np.sort(np.random.default_rng(settings.seed).choice(count, size, replace=False))
 
 
 def learn(pipeline: Pipeline, library: Path | None, references: list[Reference], threads: int) -> PlaceState:
@@ -327,7 +307,7 @@ def build_library(
 ) -> PlaceState:
     """A library of random frames of the logs, an equal share of each. Raises VplogError where that cannot be."""
     references: list[Reference] = []
-    size = pipeline.library.size or _PAPER_SIZE
+    size = pipeline.library.size or PAPER_SIZE
     for number, path in enumerate(paths):
         log = logs.open(path, topics)
         share = size * (number + 1) // len(paths) - size * number // len(paths)
@@ -345,32 +325,6 @@ def build_library(
     return state
 
 
-@contextmanager
-def _heard(warnings: list[str]) -> Iterator[None]:
-    """What the stages log as warnings goes into run.json too."""
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: warnings.append(record.getMessage())
-    logger = logging.getLogger("vplog")
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-
-
-def begin_folder(out: Path, pipeline: Pipeline, path: Path, threads: int) -> None:
-    """Make the run folder, with a run.json that says the run is not finished until it is."""
-    if out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
-        raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
-    run_record.write_run_json(out / "run.json", {**_head(pipeline, path, threads), "finished": False})
-    if (out / "library" / "library.json").is_file():  # an earlier run's, which would not be this one's
-        shutil.rmtree(out / "library")
-
-
 def _odometry(log: Log) -> Odometry:
     odometry = log.odometry()
     if odometry is None or len(odometry.stamp_ns) < 2:
@@ -379,44 +333,3 @@ def _odometry(log: Log) -> Odometry:
             "`vplog info` lists the topics; choose one with --odometry-topic."
         )
     return odometry
-
-
-def _head(pipeline: Pipeline, path: Path, threads: int) -> dict[str, Any]:
-    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
-    return {
-        "vplog": vplog.__version__,
-        "log": str(path.resolve()),
-        "threads": threads,
-        "settings": pipeline.model_dump(mode="json"),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in packages}},
-    }
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def hash_inputs(path: Path) -> dict[str, str]:
-    """sha256 of every file of a log, by name."""
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    result = {}
-    for file in files:
-        with file.open("rb") as stream:
-            result[str(file.relative_to(path)) if path.is_dir() else file.name] = hashlib.file_digest(
-                stream, "sha256"
-            ).hexdigest()
-    return result
-
-
-def _counts(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures) -> dict[str, Any]:
-    verdicts = {verdict.value: closures.verdict.count(verdict) for verdict in Verdict if verdict in closures.verdict}
-    return {
-        "frames": len(log.stamps()),
-        "odometry": len(odometry.stamp_ns),
-        "keyframes": len(keyframes.stamp_ns),
-        "candidates": len(closures),
-        "verdicts": verdicts,
-    }

@@ -187,8 +187,8 @@ def read_closures(path: Path) -> Closures:
     )
 
 
-def write_edges(path: Path, graph: PoseGraph, solution: Solution, metadata: TableMetadata) -> None:
-    """edges.parquet: the graph, the weights and the residuals of its solution."""
+def write_edges(path: Path, graph: PoseGraph, solution: Solution, residual: Floats, metadata: TableMetadata) -> None:
+    """edges.parquet: the graph, the weights of its solution and the residual (E,) of each edge in sigma."""
     columns = {
         "a": graph.a,
         "b": graph.b,
@@ -196,16 +196,9 @@ def write_edges(path: Path, graph: PoseGraph, solution: Solution, metadata: Tabl
         **_pose_values("", graph.a_from_b),
         "information": graph.information,
         "weight": solution.weight,
-        "residual": edge_residuals(graph, solution.world_from_body),
+        "residual": residual,
     }
     _write(path, "edges", EDGES, columns, metadata)
-
-
-def edge_residuals(graph: PoseGraph, world_from_body: Floats) -> Floats:
-    """(E,) sigma: Mahalanobis distance of each measured a_from_b to that of the poses (N, 4, 4)."""
-    solved = geometry.between(world_from_body[graph.a], world_from_body[graph.b])
-    xi = geometry.log(geometry.between(graph.a_from_b, solved))
-    return np.sqrt(np.maximum(np.einsum("ei,eij,ej->e", xi, graph.information, xi), 0.0))
 
 
 def read_edges(path: Path, world_from_body: Floats) -> tuple[PoseGraph, Floats, Floats]:

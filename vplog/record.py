@@ -1,0 +1,91 @@
+"""The run folder's own account: what was run, on what, and what was said on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import platform
+import shutil
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+import vplog
+from vplog.data import Verdict
+from vplog.errors import SettingsError
+from vplog.results import run_record
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.data import Closures, Keyframes, Odometry
+    from vplog.settings import Settings
+    from vplog.stages import Log
+
+
+def begin_folder(out: Path, pipeline: Settings, path: Path, threads: int) -> None:
+    """Make the run folder, with a run.json that says the run is not finished until it is."""
+    if out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
+        raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
+    run_record.write_run_json(out / "run.json", {**head(pipeline, path, threads), "finished": False})
+    if (out / "library" / "library.json").is_file():  # an earlier run's, which would not be this one's
+        shutil.rmtree(out / "library")
+
+
+def head(pipeline: Settings, path: Path, threads: int) -> dict[str, Any]:
+    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
+    return {
+        "vplog": vplog.__version__,
+        "log": str(path.resolve()),
+        "threads": threads,
+        "settings": pipeline.model_dump(mode="json"),
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in packages}},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def hash_inputs(path: Path) -> dict[str, str]:
+    """sha256 of every file of a log, by name."""
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    result = {}
+    for file in files:
+        with file.open("rb") as stream:
+            result[str(file.relative_to(path)) if path.is_dir() else file.name] = hashlib.file_digest(
+                stream, "sha256"
+            ).hexdigest()
+    return result
+
+
+def counts(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures) -> dict[str, Any]:
+    verdicts = {verdict.value: closures.verdict.count(verdict) for verdict in Verdict if verdict in closures.verdict}
+    return {
+        "frames": len(log.stamps()),
+        "odometry": len(odometry.stamp_ns),
+        "keyframes": len(keyframes.stamp_ns),
+        "candidates": len(closures),
+        "verdicts": verdicts,
+    }
+
+
+@contextmanager
+def heard(warnings: list[str]) -> Iterator[None]:
+    """What the stages log as warnings goes into run.json too."""
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: warnings.append(record.getMessage())
+    logger = logging.getLogger("vplog")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
