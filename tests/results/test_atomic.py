@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,17 +48,21 @@ def test_full_disk_is_one_line(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
+@contextmanager
 def small_disk() -> Iterator[None]:
-    """No file may grow beyond 1 kB: a write fails as on a full disk, in the middle of a file."""
+    """No file may grow beyond 1 kB: a write fails as on a full disk, in the middle of a file.
+
+    Around the write alone: the runner's own output may go to a file too.
+    """
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.usefixtures("small_disk")
 @pytest.mark.parametrize("name", ["closures", "descriptors", "tum", "g2o", "mcap", "json"])
 def test_every_writer_says_that_the_disk_is_full_and_leaves_nothing(tmp_path: Path, name: str) -> None:
     run, path = make_run(), tmp_path / "file"
@@ -71,7 +76,7 @@ def test_every_writer_says_that_the_disk_is_full_and_leaves_nothing(tmp_path: Pa
         "mcap": lambda: write_mcap(path, run.keyframes, world, run.graph, run.closures, METADATA),
         "json": lambda: write_run_json(path, {"values": list(range(1000))}),
     }[name]
-    with pytest.raises(ResultError, match="Cannot write") as caught:
+    with pytest.raises(ResultError, match="Cannot write") as caught, small_disk():
         write()
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
