@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     Bytes = NDArray[np.uint8]
 
 
+THUMBNAIL_SIDE = 128
+"""px; GIST is commonly computed on 128 x 128, and SeqSLAM's thumbnails are smaller."""
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """One camera and where it sits on the body."""
@@ -103,6 +107,8 @@ class Features:
     width: int
     """Width of the image in px, the frame of `points`."""
     height: int
+    thumbnail: Bytes | None = None
+    """(THUMBNAIL_SIDE, THUMBNAIL_SIDE) uint8: the whole image by area averages, None where it is not at hand."""
 
     def __len__(self) -> int:
         return len(self.points)

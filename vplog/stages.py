@@ -74,6 +74,12 @@ class Extractor(Protocol):
 class PlaceIndex(Protocol):
     """A map of places, rebuilt from descriptors alone."""
 
+    def __len__(self) -> int: ...
+
+    def scores(self, descriptor: Any, stop: int | None = None) -> Float32s:
+        """(stop,) similarity to each of the rows below `stop` (all where None), comparable between queries."""
+        ...
+
     def query(self, descriptor: Any, k: int, stop: int | None = None) -> Ranking:
         """The k best rows below `stop` (all rows where None). Rows that share nothing are left out."""
         ...

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from vplog.data import Features
+from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.errors import ResultError
 from vplog.features.store import FeatureStore
 
@@ -29,6 +29,7 @@ def _features(seed: int, count: int | None = None) -> Features:
         depth_m=depth,
         width=640 + seed,
         height=480 - seed,
+        thumbnail=rng.integers(0, 256, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), dtype=np.uint8) if seed % 3 else None,
     )
 
 
@@ -39,6 +40,9 @@ def _equal(a: Features, b: Features) -> bool:
         and getattr(a, name).tobytes() == getattr(b, name).tobytes()
         for name in ("points", "sizes", "descriptors", "depth_m")
     )
+    assert (a.thumbnail is None) == (b.thumbnail is None)
+    if a.thumbnail is not None and b.thumbnail is not None:
+        same = same and np.array_equal(a.thumbnail, b.thumbnail)
     return same and (a.width, a.height) == (b.width, b.height)
 
 

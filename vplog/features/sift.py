@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Features
+from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -26,15 +27,18 @@ class SiftSettings(Settings):
     """Features kept of an image, by response; 800 describe a place, verification takes them all."""
     contrast_threshold: float = Field(default=0.04, ge=0)
     """Weakest extremum kept, OpenCV's and Lowe's default."""
-    max_megapixels: float = Field(default=0.5, ge=0.001)
-    """Larger images are halved in both directions until they are below; points stay in px of the full image."""
+    max_megapixels: float = Field(default=0.52, ge=0.001)
+    """Larger images are reduced to this, half of full HD (960 x 540) as it is; points stay in px of the full image."""
 
     def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
         """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points."""
         height, width = image.shape
-        small, halvings = image, 0
-        while small.size > self.max_megapixels * 1e6:
-            small, halvings = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), halvings + 1
+        thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        small = image
+        if image.size > self.max_megapixels * 1e6:
+            share = math.sqrt(self.max_megapixels * 1e6 / image.size)
+            smaller = (max(round(width * share), 1), max(round(height * share), 1))
+            small = cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
         detector = cv2.SIFT.create(
             nfeatures=self.max_features,
             contrastThreshold=self.contrast_threshold,
@@ -43,22 +47,24 @@ class SiftSettings(Settings):
         keypoints, found = detector.detectAndCompute(small, None)
         if not keypoints:
             nothing = np.zeros(0, np.float32)
-            return Features(np.zeros((0, 2), np.float32), nothing, np.zeros((0, 128), np.uint8), nothing, width, height)
+            points, descriptors = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
+            return Features(points, nothing, descriptors, nothing, width, height, thumbnail)
         points = np.array([keypoint.pt for keypoint in keypoints], np.float32)
         response = np.array([keypoint.response for keypoint in keypoints], np.float32)
         sizes = np.array([keypoint.size for keypoint in keypoints], np.float32)
         angles = np.array([keypoint.angle for keypoint in keypoints], np.float32)
         # OpenCV keeps every feature that ties with the last; a full order makes the cut the same everywhere
         order = np.lexsort((angles, sizes, points[:, 0], points[:, 1], -response))[: self.max_features]
-        scale = 2.0**halvings
-        points = (points[order] + 0.5) * np.float32(scale) - 0.5  # pixel centres, not corners, are the origin
+        scale = np.array([width / small.shape[1], height / small.shape[0]], np.float32)
+        points = (points[order] + 0.5) * scale - 0.5  # pixel centres, not corners, are the origin
         return Features(
             points=points.astype(np.float32),
-            sizes=sizes[order] * np.float32(scale),
+            sizes=sizes[order] * np.sqrt(scale[0] * scale[1]),
             descriptors=found[order].astype(np.uint8),  # OpenCV's values are whole numbers already
             depth_m=_depth_at(points, depth_m),
             width=width,
             height=height,
+            thumbnail=thumbnail,
         )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from vplog.data import Features
+from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.errors import ResultError
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _ROW_BYTES = 4 * 4 + 128
 """x, y, size, depth as float32, then the descriptor."""
+_THUMBNAIL_BYTES = THUMBNAIL_SIDE**2
 
 
 class FeatureStore:
@@ -23,7 +24,7 @@ class FeatureStore:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._entries: list[tuple[int, int, int, int]] = []
+        self._entries: list[tuple[int, int, int, int, bool]] = []
         self._lock = threading.Lock()
         try:
             self._file = path.open("w+b")
@@ -49,20 +50,22 @@ class FeatureStore:
                 offset = self._file.seek(0, 2)
                 self._file.write(floats.tobytes())
                 self._file.write(features.descriptors.tobytes())
+                if features.thumbnail is not None:
+                    self._file.write(features.thumbnail.tobytes())
                 self._file.flush()
         except OSError as error:
             raise ResultError(
                 f"Cannot store features in {self._path}: {error.strerror}. "
                 f"They need about {_ROW_BYTES * 1200 // 1000} kB per keyframe while the run lasts."
             ) from None
-        self._entries.append((offset, len(features), features.width, features.height))
+        self._entries.append((offset, len(features), features.width, features.height, features.thumbnail is not None))
 
     def __getitem__(self, row: int) -> Features:
         """The features of keyframe `row`."""
-        offset, count, width, height = self._entries[row]
+        offset, count, width, height, small = self._entries[row]
         with self._lock:
             self._file.seek(offset)
-            data = self._file.read(count * _ROW_BYTES)
+            data = self._file.read(count * _ROW_BYTES + small * _THUMBNAIL_BYTES)
         floats = np.frombuffer(data, "<f4", count * 4).reshape(count, 4)
         return Features(
             points=np.ascontiguousarray(floats[:, :2]),
@@ -71,4 +74,7 @@ class FeatureStore:
             depth_m=floats[:, 3],
             width=width,
             height=height,
+            thumbnail=np.frombuffer(data, np.uint8, offset=count * _ROW_BYTES).reshape(THUMBNAIL_SIDE, -1)
+            if small
+            else None,
         )

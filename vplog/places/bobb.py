@@ -18,7 +18,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from vplog.errors import LibraryError
 from vplog.places import library as lib
-from vplog.places import rvp
+from vplog.places import rvp, stored
 from vplog.places.search import BoxIndex
 
 if TYPE_CHECKING:
@@ -76,9 +76,9 @@ class BobbSettings(lib.WordSettings):
 
     def load(self, folder: Path, threads: int) -> BobbState:
         """A library saved by `BobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        record = lib.read_library_record(folder)
+        record = stored.read_library_record(folder)
         state = BobbSettings.read(record["settings"], f"{folder}/library.json").learn(
-            lib.load_references(folder), threads
+            stored.load_references(folder), threads
         )
         if state.hash != record["hash"]:
             raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
@@ -157,7 +157,7 @@ class BobbState:
         corners = rng.uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
         object.__setattr__(self, "_windows", np.concatenate([corners, corners + s.window_share], axis=-1))
         object.__setattr__(self, "_shapes", rvp.box_shapes(s.grid, s.max_box_share, s.aspects))
-        object.__setattr__(self, "hash", lib.content_hash(self.library, s))
+        object.__setattr__(self, "hash", stored.references_hash(self.library.references, s))
 
     _windows: Floats = None  # pyright: ignore[reportAssignmentType]
     _shapes: Int32s = None  # pyright: ignore[reportAssignmentType]
@@ -246,7 +246,7 @@ class BobbState:
         return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
 
     def save(self, folder: Path) -> None:
-        lib.save_library(self.library, self.settings, folder)
+        stored.save_references(self.library.references, self.settings, folder)
 
 
 def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:

@@ -6,32 +6,22 @@ that are its near neighbours and close enough: several words per feature (sectio
 
 from __future__ import annotations
 
-import hashlib
-import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import faiss
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import Field
 
-import vplog
-from vplog.data import Features, Reference
 from vplog.errors import LibraryError
+from vplog.places.stored import strongest
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
-    from vplog.data import Bytes, Float32s, Int32s, Ints
-
-_MAX_FEATURES = 50_000_000
-"""Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
+    from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
 
 
 class WordSettings(Settings):
@@ -90,7 +80,7 @@ class Library:
 
 def build_library(references: Iterable[Reference], settings: WordSettings, threads: int) -> Library:
     """Index the references' strongest features. Raises LibraryError where they have none."""
-    kept = [_strongest(reference, settings.features) for reference in references]
+    kept = [strongest(reference, settings.features) for reference in references]
     if not kept:
         raise LibraryError("A library needs at least one reference image; none was given.")
     start = np.concatenate([[0], np.cumsum([len(reference.features) for reference in kept])]).astype(np.int32)
@@ -101,12 +91,6 @@ def build_library(references: Iterable[Reference], settings: WordSettings, threa
     index = _index(descriptors, settings)
     words = _own_words(index, descriptors, settings, threads)
     return Library(kept, start, descriptors, points, settings, words, index)
-
-
-def _strongest(reference: Reference, count: int) -> Reference:
-    f = reference.features
-    cut = Features(f.points[:count], f.sizes[:count], f.descriptors[:count], f.depth_m[:count], f.width, f.height)
-    return Reference(reference.image, cut, reference.drive, reference.stamp_ns)
 
 
 def _index(descriptors: Bytes, settings: WordSettings) -> Any:
@@ -168,140 +152,3 @@ def l1_distance(descriptors: Bytes, library: Bytes, neighbours: Ints) -> Float32
     b /= np.maximum(b.sum(axis=-1, keepdims=True), 1.0)
     b -= a[:, None]
     return np.abs(b, out=b).sum(axis=-1)
-
-
-def content_hash(library: Library, settings: Settings) -> str:
-    """sha256 over the settings and every feature: what descriptors depend on."""
-    digest = hashlib.sha256(json.dumps(settings.model_dump(mode="json"), sort_keys=True).encode())
-    sizes = np.array([library.size(r) for r in range(len(library))], "<i4")
-    for array in (sizes, library.start.astype("<i4"), library.points.astype("<f4"), library.descriptors):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-_FEATURES = pa.schema(
-    [
-        ("reference", pa.int32()),
-        ("x", pa.float32()),
-        ("y", pa.float32()),
-        ("size", pa.float32()),
-        ("descriptor", pa.binary(128)),
-    ]
-)
-_REFERENCES = pa.schema(
-    [
-        ("drive", pa.string()),
-        ("stamp_ns", pa.int64()),
-        ("width", pa.int32()),
-        ("height", pa.int32()),
-        ("image", pa.binary()),
-    ]
-)
-
-
-def save_library(library: Library, settings: Settings, folder: Path) -> None:
-    """Write references.parquet (images as PNG), features.parquet and library.json, the last one last."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "library.json").unlink(missing_ok=True)
-        features = [reference.features for reference in library.references]
-        owners = np.repeat(np.arange(len(library), dtype=np.int32), np.diff(library.start))
-        pq.write_table(
-            pa.table(
-                {
-                    "reference": owners,
-                    "x": library.points[:, 0],
-                    "y": library.points[:, 1],
-                    "size": np.concatenate([f.sizes for f in features]),
-                    "descriptor": pa.FixedSizeBinaryArray.from_buffers(
-                        pa.binary(128), len(owners), [None, pa.py_buffer(np.ascontiguousarray(library.descriptors))]
-                    ),
-                },
-                schema=_FEATURES,
-            ),
-            folder / "features.parquet",
-            compression="zstd",
-        )
-        pq.write_table(
-            pa.table(
-                {
-                    "drive": [r.drive for r in library.references],
-                    "stamp_ns": [r.stamp_ns for r in library.references],
-                    "width": [f.width for f in features],
-                    "height": [f.height for f in features],
-                    "image": [cv2.imencode(".png", r.image)[1].tobytes() for r in library.references],
-                },
-                schema=_REFERENCES,
-            ),
-            folder / "references.parquet",
-            compression="none",
-        )
-        record = {
-            "vplog": vplog.__version__,
-            "hash": content_hash(library, settings),
-            "references": len(library),
-            "features": int(library.start[-1]),
-            "settings": settings.model_dump(mode="json"),
-        }
-        (folder / "library.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise LibraryError(f"Cannot write the library {folder}: {error.strerror or error}.") from None
-
-
-def read_library_record(folder: Path) -> dict[str, Any]:
-    """library.json of a saved library. Raises LibraryError where the folder is not one."""
-    try:
-        record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise LibraryError(
-            f"{folder} is not a library: it has no library.json. Build one: vplog library LOG -o {folder}"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise LibraryError(f"{folder}/library.json cannot be read: {error}.") from None
-    if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
-        raise LibraryError(f"{folder}/library.json lacks its hash or settings; build the library anew.")
-    return record
-
-
-def load_references(folder: Path) -> list[Reference]:
-    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together."""
-    try:
-        files = pq.ParquetFile(folder / "features.parquet"), pq.ParquetFile(folder / "references.parquet")
-        for file, schema in zip(files, (_FEATURES, _REFERENCES), strict=True):
-            if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
-                raise LibraryError(f"{folder}: the tables are not those of a library; build it anew.")
-        features, references = (file.read() for file in files)
-        if any(column.null_count for table in (features, references) for column in table.columns):
-            raise LibraryError(f"{folder}: the tables have empty cells; build the library anew.")
-        entries = references.to_pylist()
-    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
-        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}. Build the library anew.") from None
-    owners = features["reference"].to_numpy()
-    start = np.searchsorted(owners, np.arange(len(references) + 1))
-    if len(owners) and (owners[0] < 0 or owners[-1] >= len(references) or np.any(np.diff(owners) < 0)):
-        raise LibraryError(f"{folder}: features.parquet names references that references.parquet lacks.")
-    points = np.column_stack([features["x"].to_numpy(), features["y"].to_numpy()]).astype(np.float32)
-    sizes = features["size"].to_numpy()
-    descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
-    result = []
-    for row, entry in enumerate(entries):
-        part = slice(int(start[row]), int(start[row + 1]))
-        width, height = entry["width"], entry["height"]
-        if not (0 < width < 2**15 and 0 < height < 2**15) or not np.all(
-            (points[part] > -1) & (points[part] < [width, height])
-        ):
-            raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
-        image = _decode(entry["image"])
-        if image is None or image.shape != (height, width):
-            raise LibraryError(f"{folder}: the image of reference {row} is damaged; build the library anew.")
-        nothing = np.full(part.stop - part.start, np.nan, np.float32)
-        found = Features(points[part], sizes[part], descriptors[part], nothing, width, height)
-        result.append(Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"]))
-    return result
-
-
-def _decode(data: bytes) -> np.ndarray | None:
-    try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # no bytes at all, or a size that OpenCV refuses
-        return None

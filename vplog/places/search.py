@@ -36,11 +36,12 @@ class BoxIndex:
     def __len__(self) -> int:
         return self._count
 
-    def scores(self, place: BoxPlace, stop: int | None = None) -> Float32s:
+    def scores(self, descriptor: BoxPlace, stop: int | None = None) -> Float32s:
         """(stop,) Eq. (1) of the query against each place: mean best overlap of its boxes, as a share of the image."""
         stop = self._count if stop is None else min(stop, self._count)
-        overlap = _overlap(place.references, place.boxes, self._list_start, self._list_place, self._list_boxes, stop)
-        return (overlap / (place.boxes.shape[0] * place.boxes.shape[1] * self._area)).astype(np.float32)
+        references, boxes = descriptor.references, descriptor.boxes
+        overlap = _overlap(references, boxes, self._list_start, self._list_place, self._list_boxes, stop)
+        return (overlap / (boxes.shape[0] * boxes.shape[1] * self._area)).astype(np.float32)
 
     def query(self, descriptor: BoxPlace, k: int, stop: int | None = None) -> Ranking:
         """The k best places below row `stop` that overlap at all; ties go to the earlier row."""

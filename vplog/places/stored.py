@@ -1,0 +1,179 @@
+"""A reference library on disk: images, features and settings. The same files for every recogniser."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import vplog
+from vplog.data import THUMBNAIL_SIDE, Features, Reference
+from vplog.errors import LibraryError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog.settings import Settings
+
+_MAX_FEATURES = 50_000_000
+"""Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
+
+
+def strongest(reference: Reference, count: int) -> Reference:
+    """The reference with at most its `count` strongest features."""
+    f = reference.features
+    cut = replace(
+        f, points=f.points[:count], sizes=f.sizes[:count], descriptors=f.descriptors[:count], depth_m=f.depth_m[:count]
+    )
+    return replace(reference, features=cut)
+
+
+def references_hash(references: Sequence[Reference], settings: Settings) -> str:
+    """sha256 over the settings, every feature: what descriptors depend on."""
+    digest = hashlib.sha256(json.dumps(settings.model_dump(mode="json"), sort_keys=True).encode())
+    features = [reference.features for reference in references]
+    start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype("<i4")
+    digest.update(np.array([(f.width, f.height) for f in features], "<i4").tobytes())
+    digest.update(start.tobytes())
+    for f in features:
+        digest.update(np.ascontiguousarray(f.points, "<f4").tobytes())
+        digest.update(np.ascontiguousarray(f.descriptors).tobytes())
+    return digest.hexdigest()
+
+
+_FEATURES = pa.schema(
+    [
+        ("reference", pa.int32()),
+        ("x", pa.float32()),
+        ("y", pa.float32()),
+        ("size", pa.float32()),
+        ("descriptor", pa.binary(128)),
+    ]
+)
+_REFERENCES = pa.schema(
+    [
+        ("drive", pa.string()),
+        ("stamp_ns", pa.int64()),
+        ("width", pa.int32()),
+        ("height", pa.int32()),
+        ("image", pa.binary()),
+    ]
+)
+
+
+def save_references(references: Sequence[Reference], settings: Settings, folder: Path) -> None:
+    """Write references.parquet (images as PNG), features.parquet and library.json, the last one last."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "library.json").unlink(missing_ok=True)
+        features = [reference.features for reference in references]
+        owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
+        points = np.concatenate([f.points for f in features])
+        descriptors = np.concatenate([f.descriptors for f in features])
+        pq.write_table(
+            pa.table(
+                {
+                    "reference": owners,
+                    "x": points[:, 0],
+                    "y": points[:, 1],
+                    "size": np.concatenate([f.sizes for f in features]),
+                    "descriptor": pa.FixedSizeBinaryArray.from_buffers(
+                        pa.binary(128), len(owners), [None, pa.py_buffer(np.ascontiguousarray(descriptors))]
+                    ),
+                },
+                schema=_FEATURES,
+            ),
+            folder / "features.parquet",
+            compression="zstd",
+        )
+        pq.write_table(
+            pa.table(
+                {
+                    "drive": [r.drive for r in references],
+                    "stamp_ns": [r.stamp_ns for r in references],
+                    "width": [f.width for f in features],
+                    "height": [f.height for f in features],
+                    "image": [cv2.imencode(".png", r.image)[1].tobytes() for r in references],
+                },
+                schema=_REFERENCES,
+            ),
+            folder / "references.parquet",
+            compression="none",
+        )
+        record = {
+            "vplog": vplog.__version__,
+            "hash": references_hash(references, settings),
+            "references": len(references),
+            "features": len(owners),
+            "settings": settings.model_dump(mode="json"),
+        }
+        (folder / "library.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise LibraryError(f"Cannot write the library {folder}: {error.strerror or error}.") from None
+
+
+def read_library_record(folder: Path) -> dict[str, Any]:
+    """library.json of a saved library. Raises LibraryError where the folder is not one."""
+    try:
+        record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise LibraryError(
+            f"{folder} is not a library: it has no library.json. Build one: vplog library LOG -o {folder}"
+        ) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise LibraryError(f"{folder}/library.json cannot be read: {error}.") from None
+    if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
+        raise LibraryError(f"{folder}/library.json lacks its hash or settings; build the library anew.")
+    return record
+
+
+def load_references(folder: Path) -> list[Reference]:
+    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together."""
+    try:
+        files = pq.ParquetFile(folder / "features.parquet"), pq.ParquetFile(folder / "references.parquet")
+        for file, schema in zip(files, (_FEATURES, _REFERENCES), strict=True):
+            if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
+                raise LibraryError(f"{folder}: the tables are not those of a library; build it anew.")
+        features, references = (file.read() for file in files)
+        if any(column.null_count for table in (features, references) for column in table.columns):
+            raise LibraryError(f"{folder}: the tables have empty cells; build the library anew.")
+        entries = references.to_pylist()
+    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
+        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}. Build the library anew.") from None
+    owners = features["reference"].to_numpy()
+    start = np.searchsorted(owners, np.arange(len(references) + 1))
+    if len(owners) and (owners[0] < 0 or owners[-1] >= len(references) or np.any(np.diff(owners) < 0)):
+        raise LibraryError(f"{folder}: features.parquet names references that references.parquet lacks.")
+    points = np.column_stack([features["x"].to_numpy(), features["y"].to_numpy()]).astype(np.float32)
+    sizes = features["size"].to_numpy()
+    descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
+    result = []
+    for row, entry in enumerate(entries):
+        part = slice(int(start[row]), int(start[row + 1]))
+        width, height = entry["width"], entry["height"]
+        if not (0 < width < 2**15 and 0 < height < 2**15) or not np.all(
+            (points[part] > -1) & (points[part] < [width, height])
+        ):
+            raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
+        image = _decode(entry["image"])
+        if image is None or image.shape != (height, width):
+            raise LibraryError(f"{folder}: the image of reference {row} is damaged; build the library anew.")
+        nothing = np.full(part.stop - part.start, np.nan, np.float32)
+        thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        found = Features(points[part], sizes[part], descriptors[part], nothing, width, height, thumbnail)
+        result.append(Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"]))
+    return result
+
+
+def _decode(data: bytes) -> np.ndarray | None:
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # no bytes at all, or a size that OpenCV refuses
+        return None
