@@ -25,8 +25,9 @@ LAYERS = (
     {"geometry"},
     {"stages", "references"},
     {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},
-    {"extract", "record"},
+    {"extract", "record", "compare_figures"},
     {"pipeline", "evaluation"},
+    {"compare"},
     {"batch"},
     {"cli"},
     {"__main__"},
@@ -34,7 +35,7 @@ LAYERS = (
 """From what depends on nothing to what depends on all. A part sees the layers above its own line, and itself."""
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
-HEAVY = ("cv2", "faiss", "gtsam", "numba", "numpy", "pyarrow", "mcap", "rosbags", "pydantic", "rich")
+HEAVY = ("cv2", "faiss", "gtsam", "numba", "numpy", "pyarrow", "mcap", "rosbags", "pydantic", "rich", "matplotlib")
 
 
 def name_of(file: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import os
 import sys
 from pathlib import Path
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     Verb = Callable[[argparse.Namespace], None]
 
+_MOST = 10**9
+"""Largest count an option may have: far above any drive, and whole in every number type."""
 _DEMO_NEXT = "Look at it: Foxglove or rerun open result.mcap, evo reads trajectory.tum, DuckDB the .parquet files."
 
 
@@ -205,6 +208,61 @@ def _print_evaluation(found: dict[str, Any]) -> None:
         print(f"{when:9} ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m{drift}")
 
 
+def compare(arguments: argparse.Namespace) -> None:
+    """Place recognisers side by side on two drives, or on one that comes back."""
+    from vplog.compare import compare as compare_methods
+    from vplog.compare import split_methods
+    from vplog.evaluate.place_truth import TruthChoice
+
+    truth = TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
+    with _Progress(arguments) as progress:
+        done = compare_methods(
+            arguments.query,
+            arguments.map,
+            split_methods(arguments.methods),
+            truth,
+            _pipeline(arguments),
+            library=arguments.library,
+            library_size=arguments.library_size,
+            library_seed=arguments.library_seed,
+            min_gap=arguments.min_gap,
+            sequence=arguments.sequence,
+            out=arguments.output,
+            topics=_topics(arguments),
+            threads=arguments.threads,
+            progress=progress,
+        )
+    if arguments.json:
+        _print_json(done.record)
+    else:
+        _print_comparison(done.record)
+
+
+def _print_comparison(found: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    print(
+        f"{found['queries']} queries, {found['positives']} with a true match, against {found['map_frames']} frames; "
+        f"library of {found['library']['size']} images"
+    )
+    table = Table(box=None, pad_edge=False)
+    table.add_column("method", overflow="fold")  # what gives way where the terminal is narrow
+    for title in ("R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms"):
+        table.add_column(title, justify="right", no_wrap=True)
+    shares = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1")
+    for name, method in found["methods"].items():
+        costs = [f"{method['bytes_per_image']:g}"]
+        costs += [f"{method[cost]:.2f}" for cost in ("encode_ms", "query_ms")]
+        table.add_row(escape(name), *(f"{method[share]:.3f}" for share in shares), *costs)
+        if "sequence" in method:
+            by_sequence = method["sequence"]
+            table.add_row(f"  L={by_sequence['length']}", *(f"{by_sequence[share]:.3f}" for share in shares))
+    _console(sys.stdout).print(table)
+    for warning in found["warnings"]:
+        _say(f"warning: {warning}")
+
+
 def config(arguments: argparse.Namespace) -> None:
     """Every setting of a pipeline, as YAML that a pipeline file may hold."""
     import yaml
@@ -269,7 +327,8 @@ class _Progress:
 
         self._tasks: dict[str, Any] = {}
         self._bars = Progress(
-            TextColumn("{task.description:<18}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
+            TextColumn("{task.description:<18}", markup=False),
+            BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
             console=_console(sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
         )  # fmt: skip
 
@@ -358,6 +417,8 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=Path, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    sub = add("compare", compare, topics, threads, settings)
+    _add_comparison(sub)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
     sub = add("schemas", schemas)
@@ -368,8 +429,49 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_comparison(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("query", type=Path, metavar="QUERY", help="drive whose frames are looked for")
+    sub.add_argument("map", type=Path, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
+    sub.add_argument(
+        "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
+    )
+    sub.add_argument(
+        "--truth",
+        required=True,
+        metavar="FILE.csv|index|FILE.tum[,MAPFILE.tum]|poses|gps",
+        help="pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS",
+    )
+    sub.add_argument("--tolerance", type=_at_least(0), metavar="N", help="index: frames either side (default: 0)")
+    sub.add_argument("--distance-m", type=_positive, metavar="M", help="poses, gps: same place within (default: 6)")
+    sub.add_argument("--heading-deg", type=_positive, metavar="DEG", help="poses: and turned by less (default: 45)")
+    sub.add_argument(
+        "--min-gap", type=_at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
+    )
+    sub.add_argument("--sequence", type=_at_least_one, metavar="L", help="also match sequences of L frames")
+    sub.add_argument("--library", type=Path, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
+    sub.add_argument("--library-size", type=_at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
+    sub.add_argument("--library-seed", type=_at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
+    sub.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for compare.json, scores and curves")
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def whole_number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"must be {least} or more")
+        if value > _MOST:
+            raise argparse.ArgumentTypeError(f"must be {_MOST} or less")
+        return value
+
+    return whole_number
+
+
 def _at_least_one(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
+    return _at_least(1)(text)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError("must be more than 0")
     return value

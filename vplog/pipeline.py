@@ -20,12 +20,14 @@ from vplog.graph import build, consistency, correct
 from vplog.graph.noise import NoiseSettings, edge_covariance
 from vplog.graph.solve import GncSettings, OptimiserSettings
 from vplog.keyframes import KeyframeSettings, select_keyframes
-from vplog.loops.propose import ProposeSettings, propose
+from vplog.loops.propose import ProposeSettings, candidate_stops, propose
 from vplog.loops.verify import VerifySettings, verify
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
-from vplog.places.library import read_library_record
-from vplog.references import PAPER_SIZE, LibrarySettings, choose
+from vplog.places.coverage import STRONGEST, choose_by_coverage, frames_needed
+from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.places.stored import read_library_record
+from vplog.references import PAPER_SIZE, LibrarySettings, choose, evenly
 from vplog.results import g2o, mcap, run_record, tables, tum
 from vplog.settings import Settings, load_yaml, override
 from vplog.timing import Watch
@@ -59,6 +61,8 @@ class Pipeline(Settings):
     """The reference images that places are described by."""
     places: PlaceSettings = BobbSettings()
     """Place recognition."""
+    sequence: SequenceSettings = SequenceSettings()
+    """Views matched along with their neighbours."""
     propose: ProposeSettings = ProposeSettings()
     """Candidate closures."""
     verify: VerifySettings = VerifySettings()
@@ -142,17 +146,25 @@ def run(
             keyframes, missing = select_keyframes(log.name, log.stamps(), odometry, pipeline.keyframes)
             warnings += missing
         with watch.stage("extract", len(keyframes.stamp_ns)):
-            chosen = set() if library else set(choose(keyframes.stamp_ns, pipeline.library).tolist())
+            later = library is not None or pipeline.library.choose == "coverage"
+            chosen = set() if later else set(choose(keyframes.stamp_ns, pipeline.library).tolist())
             keyframes, references, lost = extract(log, keyframes, chosen, pipeline, store, threads, progress)
             warnings += lost
         if camera.matrix is None:
             warnings.append(_UNCALIBRATED.format(camera=camera.name))
+        if library is None and pipeline.library.choose == "coverage":
+            with watch.stage("choose", len(store)):
+                references = references_by_coverage(log, keyframes, store, pipeline.library, threads)
         with watch.stage("learn", None if library else len(references)):
             state = learn(pipeline, library, references, threads)
         with watch.stage("describe", len(store)):
             descriptors = describe(state, store, threads, progress)
         with watch.stage("propose", len(store)):
-            proposals = propose(keyframes, descriptors, state.index(descriptors), pipeline.propose, threads)
+            stops = candidate_stops(keyframes, pipeline.propose)
+            ranked = rank_places(
+                state.index(descriptors), descriptors, stops, pipeline.propose.asked, pipeline.sequence, threads
+            )
+            proposals = propose(ranked, pipeline.propose)
         with watch.stage("verify", len(proposals.query)):
             closures = verify(
                 proposals, keyframes, camera, store.__getitem__, pipeline.verify, threads,
@@ -253,6 +265,18 @@ def extract(
     return Keyframes(keyframes.drive, keyframes.stamp_ns[kept], keyframes.odom_from_body[kept]), references, warnings
 
 
+def references_by_coverage(
+    log: Log, keyframes: Keyframes, store: FeatureStore, settings: LibrarySettings, threads: int
+) -> list[Reference]:
+    """The keyframes that explain the drive best, by their stored features; their images are read from the log again."""
+    rows = choose_by_coverage(len(store), lambda row: store[row].descriptors, settings, threads)
+    frames = log.frames(keyframes.stamp_ns[rows])
+    return [
+        Reference(encoded.decode().image, store[row], log.name, encoded.stamp_ns)
+        for row, encoded in zip(rows.tolist(), frames, strict=True)
+    ]
+
+
 def learn(pipeline: Pipeline, library: Path | None, references: list[Reference], threads: int) -> PlaceState:
     """The recogniser with a library: the one given, or one of the drive's own images."""
     if library is not None:
@@ -305,24 +329,52 @@ def build_library(
     threads: int = 1,
     progress: Progress = lambda *_: None,
 ) -> PlaceState:
-    """A library of random frames of the logs, an equal share of each. Raises VplogError where that cannot be."""
+    """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
+
+    Raises VplogError where that cannot be.
+    """
     references: list[Reference] = []
-    size = pipeline.library.size or PAPER_SIZE
-    for number, path in enumerate(paths):
-        log = logs.open(path, topics)
-        share = size * (number + 1) // len(paths) - size * number // len(paths)
-        stamps = log.stamps()
-        seeded = pipeline.library.model_copy(update={"size": share, "seed": pipeline.library.seed + number})
-        wanted = stamps[choose(stamps, seeded)]
+    opened = [logs.open(path, topics) for path in paths]
+    by_coverage = pipeline.library.choose == "coverage"
+    wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
+    for log, stamps in zip(opened, wanted, strict=True):
         for done, (stamp_ns, frame, features, _) in enumerate(
-            extract_frames(log.frames(wanted), pipeline.features, threads)
+            extract_frames(log.frames(stamps), pipeline.features, threads)
         ):
-            progress(f"extract {log.name}", done + 1, len(wanted))
+            progress(f"extract {log.name}", done + 1, len(stamps))
             if frame is not None and features is not None:
                 references.append(Reference(frame.image, features, log.name, stamp_ns))
     state = pipeline.places.learn(references, threads)
     state.save(out)
     return state
+
+
+def _shares(opened: Sequence[Log], pipeline: Pipeline) -> list[Ints]:
+    """Stamps of an equal share of references for each log."""
+    size, result = pipeline.library.size or PAPER_SIZE, []
+    for number, log in enumerate(opened):
+        share = size * (number + 1) // len(opened) - size * number // len(opened)
+        seeded = pipeline.library.model_copy(update={"size": share, "seed": pipeline.library.seed + number})
+        result.append(log.stamps()[choose(log.stamps(), seeded)])
+    return result
+
+
+def _stamps_by_coverage(opened: Sequence[Log], pipeline: Pipeline, threads: int, progress: Progress) -> list[Ints]:
+    """Stamps of the references of each log that explain the frames of all best; equally many of each are seen."""
+    each = -(-frames_needed(pipeline.library.size) // len(opened))
+    descriptors, owners, seen_ns = [], [], []
+    for number, log in enumerate(opened):
+        stamps = log.stamps()[evenly(len(log.stamps()), each)]
+        frames = extract_frames(log.frames(stamps), pipeline.features, threads)
+        for done, (stamp_ns, _, features, _) in enumerate(frames):
+            progress(f"look at {log.name}", done + 1, len(stamps))
+            if features is not None:
+                descriptors.append(features.descriptors[:STRONGEST].copy())
+                owners.append(number)
+                seen_ns.append(stamp_ns)
+    rows = choose_by_coverage(len(descriptors), descriptors.__getitem__, pipeline.library, threads)
+    owner, stamp = np.array(owners, np.int64)[rows], np.array(seen_ns, np.int64)[rows]
+    return [stamp[owner == number] for number in range(len(opened))]
 
 
 def _odometry(log: Log) -> Odometry:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,18 +13,18 @@ from vplog.loops.propose import ProposeSettings, candidate_stops, propose
 
 from .scene import keyframes, pose
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
-class ByDistance:
-    """An index over numbers: the nearest rows first."""
+    from vplog.data import Int32s, Ints
 
-    def __init__(self, values: list[float]) -> None:
-        self.values = np.array(values)
 
-    def query(self, descriptor: object, k: int, stop: int | None = None) -> Ranking:
-        assert isinstance(descriptor, float)
-        score = 1.0 / (1.0 + np.abs(self.values[:stop] - descriptor))
-        rows = np.argsort(-score, kind="stable")[:k]
-        return Ranking(rows.astype(np.int32), score[rows].astype(np.float32))
+def by_distance(values: list[float], stops: Ints, k: int) -> Iterator[tuple[Ranking, Int32s]]:
+    """Rankings over numbers, the nearest earlier ones first; the support of a row is the row."""
+    for value, stop in zip(values, stops, strict=True):
+        score = 1.0 / (1.0 + np.abs(np.array(values)[:stop] - value))
+        rows = np.argsort(-score, kind="stable")[:k].astype(np.int32)
+        yield Ranking(rows, score[rows].astype(np.float32)), rows
 
 
 def circle(count: int, radius_m: float) -> list[np.ndarray]:
@@ -73,10 +74,12 @@ def test_a_drive_that_never_moves_still_has_candidates_by_rows() -> None:
 def test_the_second_lap_finds_the_first() -> None:
     poses = circle(200, 30.0)
     values = [float(i % 100) for i in range(200)]
-    found = propose(keyframes(poses), values, ByDistance(values), ProposeSettings(per_query=4), threads=2)
+    chosen = ProposeSettings(per_query=4)
+    found = propose(by_distance(values, candidate_stops(keyframes(poses), chosen), chosen.asked), chosen)
     best = found.rank == 0
     second = best & (found.query >= 135)
     np.testing.assert_array_equal(found.query[second] - found.match[second], 100)
+    np.testing.assert_array_equal(found.support, found.match)
     order = np.lexsort([found.rank, found.query])
     np.testing.assert_array_equal(order, np.arange(len(order)))
     for query in np.unique(found.query):
@@ -86,12 +89,10 @@ def test_the_second_lap_finds_the_first() -> None:
         assert (np.diff(found.score[found.query == query]) <= 0).all()
 
 
-def test_threads_change_nothing_and_no_candidates_are_fine() -> None:
-    values = [float(i % 60) for i in range(150)]
-    drive = keyframes(circle(150, 10.0))
-    one, four = (propose(drive, values, ByDistance(values), ProposeSettings(), threads=n) for n in (1, 4))
-    for name in ("query", "match", "rank", "score", "support"):
-        assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
-    none = propose(keyframes([]), [], ByDistance([]), ProposeSettings())
-    assert len(none.query) == len(none.score) == 0
-    assert none.match.dtype == np.int32
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_no_candidates_are_fine(count: int) -> None:
+    nothing = Ranking(np.zeros(0, np.int32), np.zeros(0, np.float32))
+    none = propose([(nothing, nothing.rows)] * count, ProposeSettings())
+    assert len(none.query) == len(none.score) == len(none.support) == 0
+    assert none.match.dtype == none.support.dtype == np.int32
+    assert none.score.dtype == np.float32

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,10 +11,9 @@ from pydantic import Field
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable
 
-    from vplog.data import Float32s, Int32s, Ints, Keyframes
-    from vplog.stages import PlaceIndex
+    from vplog.data import Float32s, Int32s, Ints, Keyframes, Ranking
 
 
 class ProposeSettings(Settings):
@@ -36,6 +34,11 @@ class ProposeSettings(Settings):
     """And at least this many metres of path earlier; 0 leaves it to the other gaps."""
     suppress: int = Field(default=1, ge=0)
     """Candidates within this many keyframes of a better one of the same query are left out: they show what it shows."""
+
+    @property
+    def asked(self) -> int:
+        """Rows to ask of a recogniser: each one kept may suppress 2 x suppress others."""
+        return self.per_query * (2 * self.suppress + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,33 +76,22 @@ def candidate_stops(keyframes: Keyframes, settings: ProposeSettings) -> Ints:
     return np.maximum(np.minimum(np.minimum(by_rows, by_time), by_path), 0).astype(np.int64)
 
 
-def propose(
-    keyframes: Keyframes,
-    descriptors: Sequence[object],
-    index: PlaceIndex,
-    settings: ProposeSettings,
-    threads: int = 1,
-) -> Proposals:
-    """The best earlier places of every keyframe, by `index` over the same keyframes' `descriptors`."""
-    stops = candidate_stops(keyframes, settings)
-    # each one kept may suppress 2 x suppress others
-    asked = settings.per_query * (2 * settings.suppress + 1)
+def propose(rankings: Iterable[tuple[Ranking, Int32s]], settings: ProposeSettings) -> Proposals:
+    """Candidates from every keyframe's ranking of the rows below its stop, in order, with the support of each row.
 
-    def rank(row: int) -> tuple[Int32s, Float32s]:
-        ranking = index.query(descriptors[row], asked, int(stops[row]))
+    A ranking holds `settings.asked` rows, or fewer where no more are worth a look.
+    """
+    found = []
+    for ranking, support in rankings:
         kept = _suppress(ranking.rows, settings.suppress, settings.per_query)
-        return ranking.rows[kept], ranking.score[kept]
-
-    queries = np.flatnonzero(stops > 0)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        found = list(pool.map(rank, queries.tolist()))
-    counts = np.array([len(rows) for rows, _ in found], np.int64)
+        found.append((ranking.rows[kept], ranking.score[kept], support[kept]))
+    counts = np.array([len(rows) for rows, _, _ in found], np.int64)
     return Proposals(
-        query=np.repeat(queries, counts).astype(np.int32),
-        match=np.concatenate([rows for rows, _ in found] or [[]]).astype(np.int32),
+        query=np.repeat(np.arange(len(found)), counts).astype(np.int32),
+        match=np.concatenate([rows for rows, _, _ in found] or [[]]).astype(np.int32),
         rank=np.concatenate([np.arange(n) for n in counts] or [[]]).astype(np.int32),
-        score=np.concatenate([score for _, score in found] or [[]]).astype(np.float32),
-        support=np.zeros(int(counts.sum()), np.int32),
+        score=np.concatenate([score for _, score, _ in found] or [[]]).astype(np.float32),
+        support=np.concatenate([support for _, _, support in found] or [[]]).astype(np.int32),
     )
 
 

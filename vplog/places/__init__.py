@@ -7,6 +7,14 @@ from typing import Annotated
 from pydantic import Field
 
 from vplog.places.bobb import BobbSettings
+from vplog.places.bovf import BovfSettings
+from vplog.places.fabmap import FabmapSettings
+from vplog.places.gist import GistSettings
+from vplog.places.thumbnail import ThumbnailSettings
+from vplog.places.vlad import VladSettings
 
-PlaceSettings = Annotated[BobbSettings, Field()]
-"""Every recogniser, told apart by `kind`. A second one makes this a discriminated union."""
+PlaceSettings = Annotated[
+    BobbSettings | BovfSettings | FabmapSettings | GistSettings | ThumbnailSettings | VladSettings,
+    Field(discriminator="kind"),
+]
+"""Every recogniser, told apart by `kind`."""

@@ -1,0 +1,180 @@
+"""True pairs: each rule against the same rule on every pair of rows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vplog import geometry
+from vplog.data import Trajectory
+from vplog.errors import TruthError
+from vplog.evaluate import pairs
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def table_of(found: pairs.Pairs, rows: int) -> np.ndarray:
+    """(Q, M) bool."""
+    table = np.zeros((len(found), rows), bool)
+    for q in range(len(found)):
+        table[q, found.rows(q)] = True
+    return table
+
+
+def check_form(found: pairs.Pairs) -> None:
+    """Runs increase, hold a row at least, and do not touch."""
+    assert (found.first < found.stop).all()
+    for q in range(len(found)):
+        runs = slice(found.start[q], found.start[q + 1])
+        assert (found.first[runs][1:] > found.stop[runs][:-1]).all()
+
+
+def poses(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Headings over the whole circle in a square of 20 m."""
+    omega = np.zeros((count, 3))
+    omega[:, 2] = rng.uniform(-np.pi, np.pi, count)
+    return geometry.pose(geometry.so3_exp(omega), rng.uniform(0, 20, (count, 3)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS, st.integers(0, 4))
+def test_by_number(seed: int, tolerance: int) -> None:
+    """Some frames are lost on either side, so that rows are not numbers."""
+    rng = np.random.default_rng(seed)
+    query, match = (np.flatnonzero(rng.random(15) < 0.7) for _ in range(2))
+    found = pairs.index_pairs(query, match, tolerance)
+    check_form(found)
+    np.testing.assert_array_equal(table_of(found, len(match)), np.abs(query[:, None] - match) <= tolerance)
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS)
+def test_by_list(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = rng.random((12, 14)) < 0.3
+    listed = rng.permutation(np.argwhere(true))
+    query, match = np.flatnonzero(rng.random(12) < 0.8), np.flatnonzero(rng.random(14) < 0.8)
+    found = pairs.listed_pairs(np.concatenate([listed, listed[:3]]), query, match)
+    check_form(found)
+    np.testing.assert_array_equal(table_of(found, len(match)), true[np.ix_(query, match)])
+    assert found.count == true[np.ix_(query, match)].sum()
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS, st.floats(0.5, 30), st.floats(1, 200))
+def test_by_pose(seed: int, distance_m: float, heading_deg: float) -> None:
+    rng = np.random.default_rng(seed)
+    query, match = poses(rng, 12), poses(rng, 17)
+    relative = geometry.between(query[:, None], match[None])
+    apart, turned = np.linalg.norm(relative[..., :3, 3], axis=-1), np.degrees(geometry.angle(relative))
+    found = pairs.pose_pairs(query, match, distance_m, heading_deg)
+    check_form(found)
+    np.testing.assert_array_equal(table_of(found, 17), (apart <= distance_m) & (turned <= heading_deg))
+
+
+def test_half_a_turn_allows_every_heading() -> None:
+    rng = np.random.default_rng(5)
+    query, match = poses(rng, 30), poses(rng, 30)
+    query[0] = match[0] @ geometry.pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    assert pairs.pose_pairs(query, match, 100.0, 180.0).count == 900
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.floats(0.5, 30))
+def test_by_position(seed: int, distance_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    query, match = rng.uniform(0, 20, (12, 2)), rng.uniform(0, 20, (17, 2))
+    apart = np.linalg.norm(query[:, None] - match[None], axis=-1)
+    np.testing.assert_array_equal(table_of(pairs.position_pairs(query, match, distance_m), 17), apart <= distance_m)
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS)
+def test_pairs_below_stops(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = rng.random((12, 14)) < 0.5
+    stops = rng.integers(0, 15, 12)
+    kept = pairs.listed_pairs(np.argwhere(true), np.arange(12), np.arange(14)).below(stops)
+    check_form(kept)
+    wanted = true & (np.arange(14) < stops[:, None])
+    np.testing.assert_array_equal(table_of(kept, 14), wanted)
+    np.testing.assert_array_equal(kept.positive, wanted.any(1))
+
+
+def test_standing_still_takes_no_memory() -> None:
+    """20 000 frames at one place: 400 million pairs in 20 000 runs."""
+    found = pairs.index_pairs(np.arange(20_000), np.arange(20_000), 20_000)
+    assert found.count == 20_000**2
+    assert found.start.nbytes + found.first.nbytes + found.stop.nbytes < 1_000_000
+
+
+def test_truth_between_poses_and_beyond_them() -> None:
+    seconds = np.array([0, 1, 2, 10, 11])
+    steps = geometry.pose(
+        np.broadcast_to(np.eye(3), (5, 3, 3)), np.column_stack([seconds, seconds, seconds]).astype(float)
+    )
+    at = np.array([-1, 0, 0.5, 2, 6, 10.25, 11, 12])
+    found, known = pairs.poses_at(Trajectory(seconds * 10**9, steps), (at * 1e9).astype(np.int64))
+    assert known.tolist() == [False, True, True, True, False, True, True, False]
+    np.testing.assert_allclose(found[known, 0, 3], at[known])
+    assert np.isnan(found[~known]).all()
+    places, known_too = pairs.positions_at(
+        seconds * 10**9 + 10**18, seconds[:, None].astype(float), (at * 1e9).astype(np.int64) + 10**18
+    )
+    assert known_too.tolist() == known.tolist()
+    np.testing.assert_allclose(places[known, 0], at[known])
+
+
+def test_no_sample_knows_nothing() -> None:
+    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    assert not pairs.poses_at(nothing, np.arange(3))[1].any()
+    assert not pairs.positions_at(nothing.stamp_ns, np.zeros((0, 2)), np.arange(3))[1].any()
+
+
+def test_a_table_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text("\ufeffquery, match\r\n\n0,4\n2,0\n 1 , 3 \n2,0\n", encoding="utf-8")
+    assert pairs.read_pairs(path, 3, 5).tolist() == [[0, 4], [2, 0], [1, 3], [2, 0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("0,1\n", ":1 is not the header"),
+        ("query;match\n0;1\n", ":1 is not the header"),
+        ("query,match\n0,1\n2\n", ":3 is not two frame numbers"),
+        ("query,match\n\n1.5,1\n", ":3 is not two frame numbers"),
+        ("query,match\n-1,1\n", ":2 is not two frame numbers"),
+        ("query,match\n²,1\n", ":2 is not two frame numbers"),
+        ("query,match\n1,99999999999999999999\n", ":2 is not two frame numbers"),
+        ("query,match\n3,1\n", ":2: 3 is not a frame of the query, whose 3 frames"),
+        ("query,match\n1,5\n", ":2: 5 is not a frame of the map, whose 5 frames"),
+        ("query,match\n", "holds no pair"),
+        ("", "holds no pair"),
+        ("query,match\n" + "0" * 5000, ":2 is longer than"),
+    ],
+)
+def test_what_does_not_fit_is_named_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(TruthError) as error:
+        pairs.read_pairs(path, 3, 5)
+    assert said in str(error.value)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_table_that_is_no_text_or_is_missing(tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    with pytest.raises(TruthError, match="Cannot read"):
+        pairs.read_pairs(path, 3, 5)
+    path.write_bytes(b"\xff\xfe\x00\x81" * 10)
+    with pytest.raises(TruthError, match="is not text"):
+        pairs.read_pairs(path, 3, 5)

@@ -1,0 +1,120 @@
+"""Truth by name, on logs that are no more than stamps, odometry and fixes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pytest
+
+from vplog import geometry, logs
+from vplog.data import Gps, Odometry, Trajectory
+from vplog.errors import TruthError
+from vplog.evaluate.place_truth import TruthChoice, open_truth
+from vplog.results.tum import write_tum
+
+from .data import data
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Floats, Ints
+    from vplog.stages import Log
+
+METRES_A_DEGREE = 6_378_137.0 * np.pi / 180.0
+"""Of longitude at the equator."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What truth needs of a log."""
+
+    name: str
+    stamp_ns: Ints
+    poses: Floats | None = None
+    fixes: Floats | None = None
+    """(T, 2) m east and north of the equator at longitude 0, at the frames' stamps."""
+
+    def stamps(self) -> Ints:
+        return self.stamp_ns
+
+    def odometry(self) -> Odometry | None:
+        return None if self.poses is None else Odometry(self.stamp_ns, self.poses, None)
+
+    def gps(self) -> Gps | None:
+        if self.fixes is None:
+            return None
+        degrees = self.fixes / METRES_A_DEGREE
+        height = np.random.default_rng(0).normal(0, 50, len(degrees))  # satellites tell heights badly
+        return Gps(self.stamp_ns, degrees[:, 1], degrees[:, 0], height, np.zeros((len(degrees), 3, 3)))
+
+
+def straight(name: str, start_s: float, start_m: float, **more: Any) -> Recorded:
+    """Ten frames, a second and 2 m apart."""
+    stamp_ns = ((start_s + np.arange(10)) * 1e9).astype(np.int64)
+    east = np.asarray(start_m + 2.0 * np.arange(10), np.float64)
+    poses = geometry.pose(np.broadcast_to(np.eye(3), (10, 3, 3)), np.column_stack([east, 0 * east, 0 * east]))
+    return Recorded(name, stamp_ns, poses=poses, **more)
+
+
+def near(radius_m: float, start_m: float) -> list[list[int]]:
+    east = 2.0 * np.arange(10)
+    return [np.flatnonzero(np.abs(start_m + east - x) <= radius_m).tolist() for x in east]
+
+
+def found_rows(choice: TruthChoice, query: Recorded, other: Recorded) -> list[list[int]]:
+    truth = open_truth(choice, cast("Log", query), cast("Log", other))
+    pairs = truth.pairs(truth.query_frames, truth.map_frames)
+    return [pairs.rows(q).tolist() for q in range(len(pairs))]
+
+
+def test_odometry_of_both_drives() -> None:
+    query, other = straight("a", 0, 0), straight("b", 100, 6)
+    assert found_rows(TruthChoice("poses", distance_m=3.0), query, other) == near(3.0, 6.0)
+
+
+def test_one_or_two_tum_files(tmp_path: Path) -> None:
+    query, other = straight("a", 0, 0), straight("b", 100, 6)
+    files = []
+    for log in (query, other):
+        files.append(tmp_path / f"{log.name}.tum")
+        write_tum(files[-1], Trajectory(log.stamp_ns, cast("Any", log.poses)))
+    both = tmp_path / "both.tum"
+    both.write_text(files[0].read_text() + files[1].read_text())
+    for source in (f"{files[0]},{files[1]}", str(both)):
+        assert found_rows(TruthChoice(source, distance_m=3.0), query, other) == near(3.0, 6.0)
+    with pytest.raises(TruthError, match="covers none of the 10 frames of the map b"):
+        found_rows(TruthChoice(str(files[0])), query, other)
+
+
+def test_fixes_of_both_drives_share_one_plane() -> None:
+    """The second drive starts 6 m east of the first one; heights differ and do not matter."""
+    east = np.column_stack([2.0 * np.arange(10), np.zeros(10)])
+    query, other = straight("a", 0, 0, fixes=east), straight("b", 100, 0, fixes=east + np.array([6.0, 0.0]))
+    assert found_rows(TruthChoice("gps", distance_m=3.0), query, other) == near(3.0, 6.0)
+
+
+def test_the_defaults_are_6_m_and_45_degrees() -> None:
+    query, other = straight("a", 0, 0), straight("b", 100, 6)
+    assert found_rows(TruthChoice("poses"), query, other) == near(6.0, 6.0)
+    for turn_deg, some in ((44.0, True), (46.0, False)):
+        turned = geometry.pose(geometry.so3_exp(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
+        seen = found_rows(TruthChoice("poses"), query, Recorded("b", other.stamp_ns, cast("Any", other.poses) @ turned))
+        assert any(seen) == some
+
+
+def test_a_heading_is_not_for_fixes() -> None:
+    log = straight("a", 0, 0)
+    with pytest.raises(TruthError, match="takes no --heading-deg: it is for poses and a TUM file"):
+        open_truth(TruthChoice("gps", heading_deg=3.0), cast("Log", log), cast("Log", log))
+
+
+def test_real_loops() -> None:
+    """41 of 850 frames come back to one at least 50 older, by the drive's own truth."""
+    truth_file = data("drives/kitti00.groundtruth.tum")
+    log = logs.open(data("drives/kitti00"))
+    truth = open_truth(TruthChoice(str(truth_file)), log, log)
+    assert len(truth.query_frames) == 850
+    older = truth.query_frames - 50 + 1
+    assert truth.pairs(truth.query_frames, truth.map_frames).below(older).positive.sum() == 41

@@ -1,0 +1,214 @@
+"""Which rows of a map show the place of a query: from a list of pairs, by number, by pose, by position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.errors import TruthError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Floats, Int32s, Ints, Trajectory
+
+    Bools = NDArray[np.bool_]
+
+_MAX_GAP_S = 2.0
+"""s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""
+_LINE_LIMIT = 256
+"""Characters; two frame numbers take about 15, and a file without line ends is not read whole."""
+_CSV_FORMAT = "A truth table has the header line `query,match`, then one pair of frame numbers a line, counted from 0."
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """The true pairs of Q queries and M map rows, as runs of neighbouring rows.
+
+    A revisit lasts, so runs stay few: two drives that stand still for 20 000 frames are one run a query, not
+    400 million pairs.
+    """
+
+    start: Ints
+    """(Q + 1,) query q has the runs start[q]..start[q + 1]."""
+    first: Int32s
+    """(R,) first map row of a run; runs of a query increase and do not touch."""
+    stop: Int32s
+    """(R,) the row after its last."""
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    @property
+    def positive(self) -> Bools:
+        """(Q,) queries that have a true row."""
+        return np.diff(self.start) > 0
+
+    @property
+    def count(self) -> int:
+        """Pairs in all."""
+        return int((self.stop - self.first).sum(dtype=np.int64))
+
+    def rows(self, query: int) -> Int32s:
+        """The true rows of one query, increasing."""
+        runs = slice(self.start[query], self.start[query + 1])
+        parts = [np.arange(a, b, dtype=np.int32) for a, b in zip(self.first[runs], self.stop[runs], strict=True)]
+        return np.concatenate(parts) if parts else np.zeros(0, np.int32)
+
+    def below(self, stops: Ints) -> Pairs:
+        """The pairs whose row is below the query's stop, (Q,): those that are candidates at all."""
+        owner = np.repeat(np.arange(len(self)), np.diff(self.start))
+        stop = np.minimum(self.stop, stops[owner]).astype(np.int32)
+        kept = self.first < stop
+        counts = np.bincount(owner[kept], minlength=len(self))
+        return Pairs(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), self.first[kept], stop[kept])
+
+
+def index_pairs(query: Ints, match: Ints, tolerance: int) -> Pairs:
+    """Frame i of one walk shows the place of frame i of the other, give or take `tolerance` frames.
+
+    `query` (Q,) and `match` (M,) are the frames' numbers in their walks, increasing.
+    """
+    first = np.searchsorted(match, query - tolerance, side="left")
+    stop = np.searchsorted(match, query + tolerance, side="right")
+    some = first < stop
+    start = np.concatenate([[0], np.cumsum(some)]).astype(np.int64)
+    return Pairs(start, first[some].astype(np.int32), stop[some].astype(np.int32))
+
+
+def read_pairs(path: Path, queries: int, matches: int) -> Ints:
+    """(P, 2) pairs of a table `query,match`: frame numbers below `queries` and `matches`, counted from 0.
+
+    Blank lines are skipped. Raises TruthError with the number of the first line that does not fit.
+    """
+    pairs: list[tuple[int, int]] = []
+    try:
+        with path.open(encoding="utf-8-sig") as lines:
+            header, number = None, 0
+            while line := lines.readline(_LINE_LIMIT):
+                number += 1
+                if len(line) >= _LINE_LIMIT:
+                    raise TruthError(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {_CSV_FORMAT}")
+                fields = [field.strip() for field in line.split(",")]
+                if fields == [""]:
+                    continue
+                if header is None:
+                    header = fields
+                    if header != ["query", "match"]:
+                        raise TruthError(f"{path}:{number} is not the header. {_CSV_FORMAT}")
+                    continue
+                pairs.append(_pair(fields, (queries, matches), f"{path}:{number}"))
+    except OSError as error:
+        raise TruthError(f"Cannot read {path}: {error.strerror}. {_CSV_FORMAT}") from None
+    except UnicodeDecodeError:
+        raise TruthError(f"{path} is not text. {_CSV_FORMAT}") from None
+    if not pairs:
+        raise TruthError(f"{path} holds no pair. {_CSV_FORMAT}")
+    return np.array(pairs, np.int64)
+
+
+def _pair(fields: list[str], counts: tuple[int, int], where: str) -> tuple[int, int]:
+    if len(fields) != 2 or not all(field.isascii() and field.isdigit() and len(field) < 10 for field in fields):
+        raise TruthError(f"{where} is not two frame numbers. {_CSV_FORMAT}")
+    query, match = int(fields[0]), int(fields[1])
+    for value, count, name in ((query, counts[0], "query"), (match, counts[1], "map")):
+        if value >= count:
+            raise TruthError(f"{where}: {value} is not a frame of the {name}, whose {count} frames count from 0.")
+    return query, match
+
+
+def listed_pairs(listed: Ints, query: Ints, match: Ints) -> Pairs:
+    """The pairs of a list (P, 2) of frame numbers, as rows of `query` (Q,) and `match` (M,), increasing numbers.
+
+    Pairs of frames that are not among these are left out.
+    """
+    listed = np.unique(listed[np.isin(listed[:, 0], query) & np.isin(listed[:, 1], match)], axis=0)
+    rows = np.searchsorted(match, listed[:, 1]).astype(np.int32)
+    ends = np.searchsorted(listed[:, 0], query, side="right")
+    begins = np.searchsorted(listed[:, 0], query, side="left")
+    return _runs(rows[begin:end] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True))
+
+
+def pose_pairs(query: Floats, match: Floats, distance_m: float, heading_deg: float) -> Pairs:
+    """Poses (Q, 4, 4) and (M, 4, 4) in one frame that are within a distance and a rotation of each other."""
+    # the trace of a rotation is 1 + 2 cos(angle); the margin is for rounding at 180 degrees, which allows all
+    least_trace = 1.0 + 2.0 * np.cos(np.radians(min(heading_deg, 180.0))) - 1e-9
+    rotations = np.ascontiguousarray(match[:, :3, :3]).reshape(-1, 9)
+    near = _near(query[:, :3, 3], match[:, :3, 3], distance_m)
+    turned = np.ascontiguousarray(query[:, :3, :3]).reshape(-1, 9)
+    return _runs(rows[rotations[rows] @ turned[q] >= least_trace] for q, rows in enumerate(near))
+
+
+def position_pairs(query: Floats, match: Floats, distance_m: float) -> Pairs:
+    """Positions (Q, D) and (M, D) in one frame that are within a distance of each other."""
+    return _runs(_near(query, match, distance_m))
+
+
+def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
+    """The truth at the stamps, (N, 4, 4), and (N,) where it is known: at a pose of it, or between two near in time."""
+    left, right, known = _around(truth.stamp_ns, at_ns)
+    poses = np.full((len(at_ns), 4, 4), np.nan)
+    poses[known & (left == right)] = truth.world_from_body[right[known & (left == right)]]
+    between = known & (left != right)
+    if between.any():
+        poses[between] = geometry.interpolate_at(truth.stamp_ns, truth.world_from_body, at_ns[between])
+    return poses, known
+
+
+def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats, Bools]:
+    """Positions (T, D) at increasing stamps (T,), seen at other stamps: (N, D), and (N,) where known, as `poses_at`."""
+    _, _, known = _around(stamp_ns, at_ns)
+    result = np.full((len(at_ns), positions.shape[1]), np.nan)
+    if known.any():
+        seconds = (stamp_ns - stamp_ns[0]) / 1e9  # float64 holds the ns of a drive, not those since 1970
+        at = (at_ns[known] - stamp_ns[0]) / 1e9
+        result[known] = np.column_stack([np.interp(at, seconds, axis) for axis in positions.T])
+    return result, known
+
+
+def _around(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
+    """Rows of the samples before and after each stamp, one and the same where it is hit, and where that is known."""
+    if not len(stamp_ns):
+        nothing = np.zeros(len(at_ns), np.int64)
+        return nothing, nothing, np.zeros(len(at_ns), bool)
+    right = np.minimum(np.searchsorted(stamp_ns, at_ns), len(stamp_ns) - 1)
+    hit = stamp_ns[right] == at_ns
+    left = np.where(hit, right, np.maximum(right - 1, 0))
+    inside = (stamp_ns[left] < at_ns) & (at_ns < stamp_ns[right])
+    return left, right, hit | (inside & (stamp_ns[right] - stamp_ns[left] <= _MAX_GAP_S * 1e9))
+
+
+def _near(query: Floats, match: Floats, distance_m: float) -> Iterable[Int32s]:
+    """For each query the increasing rows of `match` within the distance; sorted along the longest axis: not Q x M."""
+    axis = int(np.ptp(match, axis=0).argmax()) if len(match) else 0
+    order = np.argsort(match[:, axis], kind="stable")
+    along = match[order, axis]
+    first = np.searchsorted(along, query[:, axis] - distance_m, side="left")
+    stop = np.searchsorted(along, query[:, axis] + distance_m, side="right")
+    for position, begin, end in zip(query, first.tolist(), stop.tolist(), strict=True):
+        rows = order[begin:end]
+        rows = rows[((match[rows] - position) ** 2).sum(1) <= distance_m**2]
+        yield np.sort(rows).astype(np.int32)
+
+
+def _runs(rows_of_each: Iterable[Int32s]) -> Pairs:
+    """Pairs from the increasing rows of each query."""
+    counts, first, stop = [0], [], []
+    for rows in rows_of_each:
+        breaks = np.flatnonzero(np.diff(rows) > 1)
+        if len(rows):
+            first.append(rows[np.concatenate([[0], breaks + 1])])
+            stop.append(rows[np.concatenate([breaks, [len(rows) - 1]])] + 1)
+        counts.append(len(breaks) + 1 if len(rows) else 0)
+    nothing = [np.zeros(0, np.int32)]
+    return Pairs(
+        np.cumsum(counts).astype(np.int64),
+        np.concatenate(first or nothing).astype(np.int32),
+        np.concatenate(stop or nothing).astype(np.int32),
+    )

@@ -1,0 +1,185 @@
+"""How well places are found again: ranks of the true rows, and precision over recall of every query's best answer.
+
+Rows that score the same are in no order: each figure is its mean over all orders of such rows, so none depends on how
+rows are numbered. Candidates without a score (NaN) come last, and are in no order either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.errors import TruthError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Float32s, Floats, Int32s, Ints
+    from vplog.evaluate.pairs import Pairs
+
+    Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Ranks:
+    """What the scores say of each of Q queries."""
+
+    candidates: Ints
+    """(Q,) rows that could be an answer."""
+    top_row: Int32s
+    """(Q,) the row that scores most, the earliest of several; -1 without an answer."""
+    top_score: Float32s
+    """(Q,) its score; NaN without an answer: where there is no candidate, or none with a score."""
+    top_true: Floats
+    """(Q,) share of the rows with that score that are true, 0..1."""
+    positive: Bools
+    """(Q,) queries with a true row among their candidates."""
+    better: Ints
+    """(Q,) candidates that score more than the query's best true row; 0 where it has none, as below."""
+    tied_false: Ints
+    """(Q,) other candidates, not true, that score as much."""
+    tied_true: Ints
+    """(Q,) true rows that score as much, itself included."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Precision over recall of the best answers of all queries, most certain first."""
+
+    threshold: Floats
+    """(T,) falling: the different scores of the answers."""
+    precision: Floats
+    """(T,) answers with at least that score that are true, as a share of these answers."""
+    recall: Floats
+    """(T,) the same as a share of the positives."""
+
+
+@dataclass(frozen=True)
+class RetrievalScore:
+    """The figures of one method."""
+
+    r_at_1: float
+    """Share of the positives whose best answer is true."""
+    r_at_5: float
+    """Share of the positives with a true row among the best 5."""
+    r_at_10: float
+    anr: float
+    """Average normalised rank, %: see `average_normalised_rank`."""
+    ap: float
+    """Area below precision over recall."""
+    recall_at_p100: float
+    """Recall of the most answers, most certain first, that are all true."""
+    f1: float
+    """Largest harmonic mean of precision and recall on the curve."""
+
+
+def rank_queries(scores: Float32s, truth: Pairs, stops: Ints) -> Ranks:
+    """Rank the rows below `stops[q]`, (Q,), of each query by `scores` (Q, M), one row of the matrix at a time.
+
+    Raises ValueError where the shapes do not fit.
+    """
+    if len(scores) != len(truth) or len(scores) != len(stops):
+        raise ValueError(f"{len(scores)} rows of scores, {len(truth)} queries with truth, {len(stops)} stops")
+    Q = len(scores)
+    truth = truth.below(stops)
+    top_row, top_score = np.full(Q, -1, np.int32), np.full(Q, np.nan, np.float32)
+    top_true = np.zeros(Q)
+    better, tied_false, tied_true = (np.zeros(Q, np.int64) for _ in range(3))
+    for q in range(Q):
+        score = np.asarray(scores[q, : stops[q]])
+        score = np.where(np.isnan(score), -np.inf, score)
+        true = score[truth.rows(q)]
+        if len(score) and score.max() > -np.inf:
+            best = score.max()
+            top_row[q], top_score[q] = score.argmax(), best
+            top_true[q] = np.count_nonzero(true == best) / np.count_nonzero(score == best)
+        if len(true):
+            best = true.max()
+            better[q] = np.count_nonzero(score > best)
+            tied_true[q] = np.count_nonzero(true == best)
+            tied_false[q] = np.count_nonzero(score == best) - tied_true[q]
+    return Ranks(
+        np.asarray(stops, np.int64), top_row, top_score, top_true, truth.positive, better, tied_false, tied_true
+    )
+
+
+def recall_at(ranks: Ranks, k: int) -> float:
+    """R@k: share of the positives with a true row among their k best. Raises TruthError without positives."""
+    positive = _positives(ranks)
+    slots = k - ranks.better[positive]
+    false, tied = ranks.tied_false[positive], ranks.tied_false[positive] + ranks.tied_true[positive]
+    missed = np.ones(len(slots))  # chance that the rows drawn for the open slots are all false
+    for drawn in range(k):
+        chance = np.maximum(false - drawn, 0) / np.maximum(tied - drawn, 1)
+        missed *= np.where(drawn < slots, chance, 1.0)
+    return float((1.0 - missed).mean())
+
+
+def average_normalised_rank(ranks: Ranks) -> float:
+    """ANR in %: the rank of the best true row, counted from 0, over the number of candidates; mean of the positives.
+
+    0 where every query finds a true row first; about 50 by chance for queries with one true row.
+    Raises TruthError without positives.
+    """
+    positive = _positives(ranks)
+    # the first of t among t + f rows in random order comes after f / (t + 1) others
+    ahead = ranks.better[positive] + ranks.tied_false[positive] / (ranks.tied_true[positive] + 1)
+    return float(100.0 * (ahead / ranks.candidates[positive]).mean())
+
+
+def precision_recall(ranks: Ranks) -> Curve:
+    """Every query answers with its best row, if it has one; recall is taken over the positives.
+
+    The answer of a query without a true row is wrong, wherever it stands. Raises TruthError without positives.
+    """
+    positives = int(_positives(ranks).sum())
+    answered = np.flatnonzero(~np.isnan(ranks.top_score))
+    score, true = ranks.top_score[answered].astype(np.float64), ranks.top_true[answered]
+    order = np.argsort(-score, kind="stable")
+    score, found = score[order], np.cumsum(true[order])
+    last_of_equal = np.flatnonzero(np.append(score[1:] != score[:-1], True)[: len(score)])  # no threshold parts equals
+    found = found[last_of_equal]
+    return Curve(score[last_of_equal], found / (last_of_equal + 1), found / positives)
+
+
+def average_precision(curve: Curve) -> float:
+    """Area below the steps of the curve; 0 without a true answer."""
+    return float((np.diff(curve.recall, prepend=0.0) * curve.precision).sum())
+
+
+def recall_at_full_precision(curve: Curve) -> float:
+    """Recall of the longest beginning of the curve at precision 1; 0 where the most certain answer is wrong."""
+    full = curve.recall[curve.precision == 1.0]
+    return float(full.max()) if len(full) else 0.0
+
+
+def best_f1(curve: Curve) -> float:
+    """Largest 2 p r / (p + r) on the curve."""
+    total = curve.precision + curve.recall
+    f1 = 2.0 * curve.precision * curve.recall / np.where(total > 0, total, 1.0)
+    return float(f1.max()) if len(f1) else 0.0
+
+
+def score_retrieval(ranks: Ranks) -> RetrievalScore:
+    """Every figure of one method. Raises TruthError without positives."""
+    curve = precision_recall(ranks)
+    return RetrievalScore(
+        r_at_1=recall_at(ranks, 1),
+        r_at_5=recall_at(ranks, 5),
+        r_at_10=recall_at(ranks, 10),
+        anr=average_normalised_rank(ranks),
+        ap=average_precision(curve),
+        recall_at_p100=recall_at_full_precision(curve),
+        f1=best_f1(curve),
+    )
+
+
+def _positives(ranks: Ranks) -> Bools:
+    if not ranks.positive.any():
+        raise TruthError(
+            f"None of the {len(ranks.positive)} queries has a true match among its candidates, so nothing can be "
+            "found. Check that the truth is that of these drives, or allow more with its tolerance or distance."
+        )
+    return ranks.positive

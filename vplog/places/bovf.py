@@ -1,0 +1,213 @@
+"""Bag of visual features: Sivic & Zisserman, Video Google, ICCV 2003, with RootSIFT.
+
+An image is its visual words and how often each occurs. Two images compare by the cosine of their tf-idf vectors
+(section 4), which an inverted file computes for a whole map at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numba
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+
+from vplog.errors import LibraryError
+from vplog.places import stored
+from vplog.places.dense import best_rows
+from vplog.places.relearn import keep_references, relearn
+from vplog.places.vocabulary import Vocabulary, learn_vocabulary
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Bytes, Features, Float32s, Ranking, Reference
+
+_WORD_BYTES, _PLACE_BYTES = 3, 4
+"""In a table: a word's number in two bytes and its count in one; where a place's list begins in four."""
+_MAX_COUNT = 255
+"""Largest count of a byte; a word that occurs more often in one image is no better known for it."""
+_PLACE = pa.list_(
+    pa.field(
+        "item",
+        pa.struct([pa.field("word", pa.uint16(), nullable=False), pa.field("count", pa.uint8(), nullable=False)]),
+        nullable=False,
+    )
+)
+
+
+class BovfSettings(Settings):
+    """Bag of visual features: tf-idf, cosine, inverted file."""
+
+    kind: Literal["bovf"] = "bovf"
+    """Which recogniser."""
+    features: int = Field(default=800, ge=1)
+    """Strongest features of an image that are used."""
+    words: int = Field(default=16_000, ge=1, le=65_536)
+    """Visual words, of the order of the paper's 16 000; fewer where the references have too few features."""
+    max_bytes: int | None = Field(default=None, ge=_PLACE_BYTES + _WORD_BYTES)
+    """Bytes a place may take in a table: only its words of highest tf-idf that fit are kept. None keeps all."""
+    damp_bursts: bool = True
+    """Whether a word counts by the root of how often it occurs: Jegou et al., On the burstiness of visual elements,
+    CVPR 2009, section 4.1. A fence is then not a place."""
+    seed: int = Field(default=0, ge=0)
+    """Of the first centres of k-means."""
+
+    def learn(self, references: Iterable[Reference], threads: int) -> BovfState:
+        """Words and their idf from the references. Raises LibraryError where they are fewer than two or featureless."""
+        kept = keep_references(references, self.features)
+        if len(kept) < 2:
+            raise LibraryError(
+                "bovf weighs a word by how few of the references have it, so it needs at least two; one was given."
+            )
+        descriptors = np.concatenate([reference.features.descriptors for reference in kept])
+        vocabulary = learn_vocabulary(descriptors, self.words, self.seed, threads)
+        holders = np.zeros(len(vocabulary), np.int64)
+        for reference in kept:
+            holders[np.unique(vocabulary.quantise(reference.features.descriptors))] += 1
+        # section 4.1: log N / n_i; the approximate search may leave a word to no reference, which is as rare as one
+        idf = np.log(len(kept) / np.maximum(holders, 1)).astype(np.float32)
+        return BovfState(self, kept, vocabulary, idf)
+
+    def load(self, folder: Path, threads: int) -> BovfState:
+        """A library saved by `BovfState.save`. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(BovfSettings, folder, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Words:
+    """The descriptor: words of one image."""
+
+    words: NDArray[np.uint16]
+    """(K,) increasing."""
+    counts: Bytes
+    """(K,) how often each occurs, at most 255."""
+
+
+@dataclass(frozen=True, eq=False)
+class BovfState:
+    """Words with their weights. Shared freely between threads."""
+
+    settings: BovfSettings
+    references: list[Reference]
+    vocabulary: Vocabulary
+    idf: Float32s
+    """(V,)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
+
+    hash: str = ""
+
+    @property
+    def _most_words(self) -> int:
+        s = self.settings
+        fit = s.features if s.max_bytes is None else (s.max_bytes - _PLACE_BYTES) // _WORD_BYTES
+        return min(fit, s.features, len(self.vocabulary))
+
+    @property
+    def bits(self) -> int:
+        """Size of the largest place: as many words as there may be. Images with fewer features take less."""
+        return 8 * (_PLACE_BYTES + _WORD_BYTES * self._most_words)
+
+    @property
+    def arrow_type(self) -> pa.DataType:
+        return _PLACE
+
+    def describe(self, features: Features) -> Words:
+        """Words with their counts; those of all references weigh nothing and are left out."""
+        found = self.vocabulary.quantise(features.descriptors[: self.settings.features])
+        words, counts = np.unique(found, return_counts=True)
+        counts = np.minimum(counts, _MAX_COUNT).astype(np.uint8)
+        weight = _tf_idf(words, counts, self)
+        best = np.lexsort((words, -weight))[: self._most_words]
+        kept = np.sort(best[weight[best] > 0])
+        return Words(words[kept].astype(np.uint16), counts[kept])
+
+    def index(self, descriptors: Sequence[Words]) -> WordIndex:
+        return WordIndex(descriptors, self)
+
+    def to_arrow(self, descriptors: Sequence[Words]) -> pa.Array:
+        start = np.concatenate([[0], np.cumsum([len(place.words) for place in descriptors])]).astype(np.int32)
+        words = np.concatenate([np.zeros(0, np.uint16), *(place.words for place in descriptors)])
+        counts = np.concatenate([np.zeros(0, np.uint8), *(place.counts for place in descriptors)])
+        items = pa.StructArray.from_arrays([pa.array(words), pa.array(counts)], fields=list(_PLACE.value_type))
+        return pa.ListArray.from_arrays(pa.array(start), items, type=_PLACE)
+
+    def from_arrow(self, column: pa.Array) -> list[Words]:
+        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
+        if not column.type.equals(_PLACE):
+            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {_PLACE}.")
+        items = column.flatten()
+        parts = [items.field("word"), items.field("count")]
+        if column.null_count or items.null_count or any(part.null_count for part in parts):
+            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        words, counts = (part.to_numpy() for part in parts)
+        if len(words) and words.max() >= len(self.vocabulary):
+            raise LibraryError("The descriptors name words that this library does not have.")
+        stop = np.cumsum(column.value_lengths().to_numpy())
+        start = stop - column.value_lengths().to_numpy()
+        rising = np.diff(words.astype(np.int32), prepend=-1) > 0
+        rising[start[start < len(words)]] = True  # a place's first word follows none
+        if not np.all(rising) or not np.all(counts):
+            raise LibraryError("The descriptors name a word twice, out of order or zero times; write them anew.")
+        return [Words(words[a:b], counts[a:b]) for a, b in zip(start, stop, strict=True)]
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.references, self.settings, folder)
+
+
+class WordIndex:
+    """Inverted file: for each word, the places that have it with their weight. Rows are in the order given."""
+
+    def __init__(self, places: Sequence[Words], state: BovfState) -> None:
+        self._count, self._state = len(places), state
+        owners = np.repeat(np.arange(len(places), dtype=np.int32), [len(place.words) for place in places])
+        words = np.concatenate([np.zeros(0, np.uint16), *(place.words for place in places)])
+        weights = np.concatenate([np.zeros(0, np.float32), *(_weights(place, state) for place in places)])
+        order = np.argsort(words, kind="stable")
+        self._list_start = np.searchsorted(words[order], np.arange(len(state.idf) + 1)).astype(np.int64)
+        self._list_place, self._list_weight = owners[order], weights[order]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def scores(self, descriptor: Words, stop: int | None = None) -> Float32s:
+        """(stop,) cosine of the tf-idf vectors of the query and each place, 0 where they share no word."""
+        stop = self._count if stop is None else min(stop, self._count)
+        weights = _weights(descriptor, self._state)
+        return _products(descriptor.words, weights, self._list_start, self._list_place, self._list_weight, stop)
+
+    def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
+        """The k best places below row `stop` that share a word; ties go to the earlier row."""
+        return best_rows(self.scores(descriptor, stop), k)
+
+
+def _tf_idf(words: NDArray, counts: Bytes, state: BovfState) -> Float32s:
+    """(K,) section 4.1. The paper's tf divides by the number of features, which the cosine cancels."""
+    counted = counts.astype(np.float32)
+    return (np.sqrt(counted) if state.settings.damp_bursts else counted) * state.idf[words]
+
+
+def _weights(place: Words, state: BovfState) -> Float32s:
+    """(K,) tf-idf of unit length."""
+    weights = _tf_idf(place.words, place.counts, state)
+    return weights / max(np.sqrt(np.square(weights).sum()), np.float32(1e-9))
+
+
+@numba.njit(cache=True, nogil=True)
+def _products(words, weights, list_start, list_place, list_weight, stop):
+    """(stop,) float32: sum over the query's words of its weight times the place's, in the order of the words."""
+    result = np.zeros(stop, np.float32)
+    for k in range(words.shape[0]):
+        for e in range(list_start[words[k]], list_start[words[k] + 1]):
+            if list_place[e] >= stop:
+                break
+            result[list_place[e]] += weights[k] * list_weight[e]
+    return result

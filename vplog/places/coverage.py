@@ -1,0 +1,331 @@
+"""How well reference images explain a drive: to choose them by, and to say of a finished run.
+
+A reference explains a frame as far as the frame's features are found on it. Which frames explain which is measured
+once, by near descriptors of few strong features; references are then chosen greedily, which for a sum like this comes
+within 1 - 1/e of the best choice there is (Nemhauser, Wolsey & Fisher 1978, section 4).
+
+A finished run asks more: near descriptors are found on any picture of trees. There, matches count that keep their
+arrangement, beyond as many as ever do so when the same matches are paired up anew. The level of chance is thus the
+image pair's own, and asks nothing of other places: one room seen all the time is explained, a forest by another forest
+is not.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import faiss
+import numba
+import numpy as np
+
+from vplog.places.library import l1_distance
+from vplog.references import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints
+    from vplog.places.library import Library, Words
+
+STRONGEST = 200
+"""Features of a frame that the choice looks at: a quarter of what describes a place tells who explains whom."""
+_CANDIDATES_A_REFERENCE = 4
+"""Candidates for each reference asked for: neighbours a quarter of the references' distance apart hardly differ."""
+_LEAST_CANDIDATES = 256
+"""Candidates where fewer references than 64 are asked for, as far as there are frames."""
+_FRAMES_A_CANDIDATE = 2
+"""Frames to be explained for each candidate, so that half of them are no candidates themselves."""
+_NEIGHBOURS = 10
+"""Nearest features looked at for each feature: the default of a library's own words."""
+_MAX_L1 = 0.4
+"""L1 distance of two descriptors of unit length that are the same (Tanaka et al. 2014, section III-B)."""
+_ENOUGH = 0.5
+"""Of what a frame's best candidate explains, the share that will do. By R@1 and ANR of the other walk of Gardens Point,
+20 and 50 references, half is better than the plain sum of shares, its root, or fixed caps of 4 and 8 %."""
+
+_SHOWN = 200
+"""Frames that the figure of a run is measured on, evenly along it: one standard error is 3.5 % at most."""
+_MEASURED = 400
+"""Strongest features of a frame that are translated: half of what describes a place, for half of the time."""
+_BEST = 4
+"""References with most matches that are looked at: the paper's J."""
+_NEAR = 0.2
+"""Two matches are neighbours within this share of the image's sides: a view shifts and scales little across it."""
+_AGREE = 0.03
+"""Neighbours that move together differ in their displacement by less than this share of the image's sides."""
+_PAIRINGS = 8
+"""Times that the matches are paired up anew to learn what chance does."""
+EXPLAINED = 0.01
+"""Share of a frame's features, beyond chance, from which on it counts as explained: four of 400. Frames of another site
+or light have a median of 0 and .003 to .013 at the 90th percentile; frames of the library's own drive a median of .010
+(Gardens Point at night, every eighth frame a reference) to .30 (7-Scenes), of the same walk a few metres beside .010 to
+.024."""
+POOR = 1 / 3
+"""Share of explained frames below which a run is warned. Libraries of 15 to 100 references of the drive explain .52 to
+1.0 of the frames, of the same walk in the same light .51 to .77, of the other light .05 to .11, of another site 0 to
+.09. BoBB, day walk in day walk with 60 references, has R@1 .67 by a library of either, .35 of the night, .21 to .26 of
+elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanations:
+    """Which of C candidates explain each of F frames, and how well: a sparse (F, C) matrix by rows."""
+
+    start: Ints
+    """(F + 1,)."""
+    candidate: Int32s
+    """Increasing within a frame; never the frame itself."""
+    share: Float32s
+    """Of the frame's features that are found on the candidate, 0..1."""
+    candidates: int
+    """C."""
+
+
+def choose_by_coverage(
+    count: int, descriptors_of: Callable[[int], Bytes], settings: LibrarySettings, threads: int
+) -> Ints:
+    """Rows, increasing, of the frames among `count` that explain all frames best.
+
+    `descriptors_of` gives the (M, 128) descriptors of a row, strongest first. Rows of several drives are chosen from
+    alike: one that no other drive explains gets references of its own. Long drives are looked at in even steps, so
+    that the cost depends on the size asked for alone.
+    """
+    if count == 0:
+        return np.zeros(0, np.int64)
+    frames = evenly(count, frames_needed(settings.size))
+    candidates = evenly(len(frames), _candidates(settings.size))
+    strong = [np.array(descriptors_of(int(row))[:STRONGEST]) for row in frames]
+    found = explanations(strong, candidates, threads)
+    most, least = (PAPER_SIZE, LEAST_SIZE) if settings.size is None else (settings.size, settings.size)
+    chosen = greedy_cover(found, min(most, len(candidates)))
+    if settings.size is None:
+        chosen = chosen[: max(_enough(found, chosen, settings.least_gain), least)]
+    others = np.setdiff1d(np.arange(len(candidates)), chosen)  # where nothing explains more, what is missing, evenly
+    chosen = np.concatenate([chosen, others[evenly(len(others), max(least - len(chosen), 0))]])
+    return np.sort(frames[candidates[chosen]])
+
+
+def frames_needed(size: int | None) -> int:
+    """How many frames, evenly along the drives, a choice of `size` references looks at."""
+    return _FRAMES_A_CANDIDATE * _candidates(size)
+
+
+def _candidates(size: int | None) -> int:
+    return max(_LEAST_CANDIDATES, _CANDIDATES_A_REFERENCE * (size or 0))
+
+
+def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -> Explanations:
+    """Which candidates, rows of `descriptors` (F of (M, 128) each), explain each of the rows."""
+    owners = np.repeat(np.arange(len(candidates)), [len(descriptors[row]) for row in candidates])
+    pool = np.concatenate([descriptors[row] for row in candidates])
+    number = np.full(len(descriptors), -1)
+    number[candidates] = np.arange(len(candidates))
+    if len(pool) == 0:
+        nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)
+        return Explanations(np.zeros(len(descriptors) + 1, np.int64), *nothing, len(candidates))
+    # the graph of vplog/places/library.py, with its default settings
+    index: Any = faiss.index_factory(pool.shape[1], "HNSW16_SQ8_direct")
+    index.train(pool[:1].astype(np.float32))
+    index.hnsw.efConstruction, index.hnsw.efSearch = 40, 16
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)  # the order of insertion decides the graph
+    try:
+        index.add(pool.astype(np.float32))
+    finally:
+        faiss.omp_set_num_threads(before)
+
+    def explained_by(row: int) -> tuple[Ints, Float32s]:
+        found = descriptors[row]
+        if len(found) == 0:
+            return np.zeros(0, np.int64), np.zeros(0, np.float32)
+        faiss.omp_set_num_threads(1)
+        near = index.search(found.astype(np.float32), _NEIGHBOURS)[1]
+        same = (l1_distance(found, pool, near) < _MAX_L1) & (near >= 0)
+        of = np.where(same, owners[near], -1)
+        of[of == number[row]] = -1
+        of.sort(axis=1)
+        first = np.concatenate([np.ones((len(of), 1), bool), of[:, 1:] != of[:, :-1]], axis=1)  # once a feature
+        who, times = np.unique(of[first & (of >= 0)], return_counts=True)
+        return who, (times / len(found)).astype(np.float32)
+
+    with ThreadPoolExecutor(threads) as workers:
+        rows = list(workers.map(explained_by, range(len(descriptors))))
+    start = np.concatenate([[0], np.cumsum([len(who) for who, _ in rows])])
+    return Explanations(
+        start,
+        np.concatenate([who for who, _ in rows]).astype(np.int32),
+        np.concatenate([share for _, share in rows]),
+        len(candidates),
+    )
+
+
+def greedy_cover(found: Explanations, size: int) -> Ints:
+    """At most `size` candidates, the one that adds most first; fewer where none adds anything.
+
+    What is made as large as can be is the sum over the frames of what their best reference is worth to them, see
+    `_worth`. Ties go to the first.
+    """
+    worth = _worth(found)
+    order = np.argsort(found.candidate, kind="stable")
+    by_start = np.searchsorted(found.candidate[order], np.arange(found.candidates + 1))
+    owner = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
+    return _greedy(found.start, found.candidate, worth, by_start, owner[order], worth[order], size)
+
+
+def _worth(found: Explanations) -> Floats:
+    """0..1, of each candidate to each frame: 1 where it explains half as much as the frame's best candidate does.
+
+    Relative to the frame's best, so that a bare wall counts as much as a facade; capped, so that the frames of one
+    place share a reference instead of each asking for its neighbour.
+    """
+    owner = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
+    best = np.zeros(len(found.start) - 1)
+    np.maximum.at(best, owner, found.share)
+    return np.minimum(found.share / (_ENOUGH * best[owner]), 1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _greedy(start, candidate, worth, by_start, by_frame, by_worth, size):
+    F, C = start.shape[0] - 1, by_start.shape[0] - 1
+    best, gain = np.zeros(F), np.zeros(C)
+    for c in range(C):
+        gain[c] = by_worth[by_start[c] : by_start[c + 1]].sum()
+    chosen = np.empty(size, np.int64)
+    for n in range(size):
+        c = np.argmax(gain)
+        if gain[c] <= 1e-9:  # what is left is rounding
+            return chosen[:n]
+        chosen[n] = c
+        for e in range(by_start[c], by_start[c + 1]):
+            f = by_frame[e]
+            if by_worth[e] > best[f]:
+                for other in range(start[f], start[f + 1]):  # what others add to this frame is less now
+                    gain[candidate[other]] -= max(worth[other] - best[f], 0.0) - max(worth[other] - by_worth[e], 0.0)
+                best[f] = by_worth[e]
+        gain[c] = -1.0
+    return chosen
+
+
+def _enough(found: Explanations, chosen: Ints, least_gain: float) -> int:
+    """How many of the chosen are needed: the last of them still adds `least_gain` of what is explained."""
+    turn = np.full(found.candidates, -1)
+    turn[chosen] = np.arange(len(chosen))
+    worth, turns = _worth(found), turn[found.candidate]
+    total = np.zeros(len(chosen))
+    for begin, end in pairwise(found.start.tolist()):
+        mine = turns[begin:end] >= 0
+        series = np.zeros(len(chosen))
+        series[turns[begin:end][mine]] = worth[begin:end][mine]
+        total += np.maximum.accumulate(series)
+    gain = np.diff(total, prepend=0.0)
+    poor = np.flatnonzero(gain < least_gain * total)
+    return int(poor[0]) if len(poor) else len(chosen)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How far a library explains a drive."""
+
+    explained: float
+    """Share of the frames looked at that are explained, 0..1."""
+    median: float
+    """Of the frames' shares of features that their best reference explains beyond chance."""
+    frames: int
+    """Frames looked at."""
+
+
+def measure_coverage(
+    count: int, features_of: Callable[[int], Features], stamp_ns: Ints, drive: str, library: Library, threads: int
+) -> Coverage:
+    """How far the library explains a drive of `count` frames: at most 200 of them, evenly. Own images do not count."""
+    itself = {reference.stamp_ns: row for row, reference in enumerate(library.references) if reference.drive == drive}
+
+    def share(row: int) -> float:
+        faiss.omp_set_num_threads(1)
+        features = features_of(row)
+        words = library.translate(features.descriptors[:_MEASURED])
+        size = features.width, features.height
+        return explained_share(words, features.points[:_MEASURED], size, library, itself.get(int(stamp_ns[row]), -1))
+
+    with ThreadPoolExecutor(threads) as workers:
+        shares = np.array(list(workers.map(share, evenly(count, _SHOWN).tolist())))
+    return Coverage(float((shares >= EXPLAINED).mean()), float(np.median(shares)), len(shares))
+
+
+def explained_share(
+    words: Words, points: Float32s, size: tuple[int, int], library: Library, leave_out: int = -1
+) -> float:
+    """Share 0..1 of an image's features that the reference explaining it best explains, beyond chance.
+
+    `words` of M features at `points` (M, 2) px of an image of `size` (width, height) px. A match is counted where
+    another one near it in the image moves the same way; from that is taken the largest count of the same matches
+    paired up anew. Reference `leave_out` does not count: the image itself.
+    """
+    if len(points) == 0:
+        return 0.0
+    sizes = np.array([library.size(row) for row in range(len(library))], np.float64)
+    owner = np.searchsorted(library.start, words.values, side="right") - 1
+    feature = np.repeat(np.arange(len(points)), np.diff(words.start))
+    keep = owner != leave_out
+    owner, feature, values = owner[keep], feature[keep], words.values[keep]
+    counts = np.bincount(np.unique(owner * len(points) + feature) // len(points), minlength=len(library))
+    best = 0.0
+    for reference in np.argsort(-counts, kind="stable")[:_BEST]:
+        of = owner == reference
+        here = (points[feature[of]] + 0.5) / np.array(size)
+        there = (library.points[values[of]] + 0.5) / sizes[reference]
+        best = max(best, _beyond_chance(here, there, feature[of], values[of]))
+    return best / len(points)
+
+
+@numba.njit(cache=True, nogil=True)
+def _beyond_chance(here, there, feature, value):
+    """Features whose matches keep their arrangement, less the most that do with the matches shifted on; at least 0."""
+    m = feature.shape[0]
+    if m < 2:
+        return 0
+    pairings, chance = min(_PAIRINGS, m - 1), 0
+    for n in range(pairings):
+        chance = max(chance, _arranged(here, there, feature, value, (n + 1) * m // (pairings + 1)))
+    return max(_arranged(here, there, feature, value, 0) - chance, 0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _arranged(here, there, feature, value, shift):
+    """Features with a match that another match near it agrees with; match a is paired with the place of a + shift."""
+    m = feature.shape[0]
+    count, last = 0, -1
+    for a in range(m):
+        if feature[a] == last:
+            continue
+        ta = (a + shift) % m
+        for b in range(m):
+            tb = (b + shift) % m
+            if feature[a] == feature[b] or value[ta] == value[tb]:
+                continue
+            x, y = here[a, 0] - here[b, 0], here[a, 1] - here[b, 1]
+            if abs(x) > _NEAR or abs(y) > _NEAR or abs(x) + abs(y) < 1e-3:  # one point in two orientations is no two
+                continue
+            dx, dy = there[ta, 0] - there[tb, 0] - x, there[ta, 1] - there[tb, 1] - y
+            if dx * dx + dy * dy < _AGREE * _AGREE:
+                count, last = count + 1, feature[a]
+                break
+    return count
+
+
+def coverage_warning(coverage: Coverage, frames: int, given: bool, size: int) -> str | None:
+    """One line on what to do where the library explains too little of a drive of `frames` frames; None where it does.
+
+    `given` says that the library was not made from the drive; `size` is its L.
+    """
+    if coverage.explained >= POOR:
+        return None
+    says = f"The library explains {100 * coverage.explained:.0f} % of the {frames} keyframes, so few returns are found."
+    if given:
+        return f"{says} Build one from this drive, or one in the same light: vplog library LOG -o LIB."
+    if 2 * size <= frames // 2:
+        return f"{says} Take a larger one: --set library.size={2 * size}."
+    return f"{says} The views share too little: more keyframes may help, --set keyframes.distance_m lower."

@@ -1,0 +1,163 @@
+"""GIST: Oliva & Torralba, Modeling the shape of the scene, IJCV 42(3), 2001, with the filters of their published code.
+
+The energy of a bank of Gabor filters over the prefiltered image, averaged over a coarse grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numba
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+
+from vplog.data import THUMBNAIL_SIDE
+from vplog.places import stored
+from vplog.places.dense import VectorIndex, thumbnail_of, vectors_from_arrow, vectors_to_arrow
+from vplog.places.relearn import keep_references, relearn
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Bytes, Features, Float32s, Reference
+
+_PREFILTER_PAD, _PREFILTER_CYCLES, _LEAST_CONTRAST = 5, 4, 0.2
+"""px mirrored around the image, cycles an image where the low-pass falls to half, and what is added to the contrast."""
+_PAD = 32
+"""px mirrored around the prefiltered image, so that the filters do not see it wrap around."""
+_HIGHEST, _OCTAVE = 0.3, 1.85
+"""Centre of the finest scale in cycles a px, and how many times lower each next one is."""
+_RADIAL, _ANGULAR = 3.5, 16.0
+"""Falloff of a filter along frequency, and along angle for 32 orientations; fewer orientations are wider."""
+
+
+class GistSettings(Settings):
+    """The spatial envelope of the whole image. It learns nothing: the references only go into the library."""
+
+    kind: Literal["gist"] = "gist"
+    """Which recogniser."""
+    scales: int = Field(default=4, ge=1, le=8)
+    """Scales of the Gabor filters."""
+    orientations: int = Field(default=8, ge=1, le=32)
+    """Orientations of the Gabor filters at each scale."""
+    blocks: Literal[1, 2, 4, 8] = 4
+    """Blocks along each side of the image in which a filter's energy is averaged."""
+
+    def learn(self, references: Iterable[Reference], threads: int) -> GistState:
+        """Nothing to learn. Raises LibraryError where there is no reference."""
+        return GistState(self, keep_references(references))
+
+    def load(self, folder: Path, threads: int) -> GistState:
+        """A library saved by `GistState.save`. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(GistSettings, folder, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class GistState:
+    """The filters. Shared freely between threads."""
+
+    settings: GistSettings
+    references: list[Reference]
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        object.__setattr__(self, "hash", stored.references_hash(self.references, s))
+        object.__setattr__(self, "_low_pass", _low_pass(THUMBNAIL_SIDE + 2 * _PREFILTER_PAD))
+        object.__setattr__(self, "_filters", gabor_filters(THUMBNAIL_SIDE + 2 * _PAD, s.scales, s.orientations))
+
+    hash: str = ""
+    _low_pass: Float32s = None  # pyright: ignore[reportAssignmentType]
+    _filters: Float32s = None  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def _length(self) -> int:
+        s = self.settings
+        return s.scales * s.orientations * s.blocks**2
+
+    @property
+    def bits(self) -> int:
+        """Two bytes a filter and block."""
+        return 16 * self._length
+
+    @property
+    def arrow_type(self) -> pa.FixedSizeListType:
+        return pa.list_(pa.float16(), self._length)
+
+    def describe(self, features: Features) -> NDArray[np.float16]:
+        """(D,) mean energy by scale, orientation, then block, row by row. Needs the thumbnail."""
+        flat = np.pad(self._prefilter(thumbnail_of(features)), _PAD, "symmetric")
+        spectrum = np.fft.fft2(flat)
+        inside = slice(_PAD, _PAD + THUMBNAIL_SIDE)
+        n = self.settings.blocks
+        side = THUMBNAIL_SIDE // n
+        energy = [
+            np.abs(np.fft.ifft2(spectrum * each)[inside, inside]).reshape(n, side, n, side).mean(axis=(1, 3))
+            for each in self._filters
+        ]
+        return np.array(energy, np.float16).reshape(-1)
+
+    def _prefilter(self, image: Bytes) -> Float32s:
+        """Log intensities without their low frequencies, over the local contrast: shadows and exposure matter less."""
+        padded = np.pad(np.log1p(image.astype(np.float32)), _PREFILTER_PAD, "symmetric")
+        high = padded - self._blur(padded)
+        contrast = np.sqrt(np.abs(self._blur(high * high)))
+        inside = slice(_PREFILTER_PAD, _PREFILTER_PAD + THUMBNAIL_SIDE)
+        return (high / (np.float32(_LEAST_CONTRAST) + contrast))[inside, inside]
+
+    def _blur(self, image: Float32s) -> Float32s:
+        return np.fft.ifft2(np.fft.fft2(image) * self._low_pass).real.astype(np.float32)
+
+    def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
+        return VectorIndex(np.array(descriptors, np.float32).reshape(-1, self._length), _nearness)
+
+    def to_arrow(self, descriptors: Sequence[NDArray[np.float16]]) -> pa.Array:
+        return vectors_to_arrow(descriptors, self.arrow_type)
+
+    def from_arrow(self, column: pa.Array) -> list[NDArray[np.float16]]:
+        """The places of a table's column. Raises LibraryError where it is of another kind or length."""
+        return vectors_from_arrow(column, self.arrow_type)
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.references, self.settings, folder)
+
+
+def _low_pass(side: int) -> Float32s:
+    """(side, side) Gaussian in the Fourier domain, one half at 4 cycles an image."""
+    cycles = np.fft.fftfreq(side) * side
+    squared = cycles[:, None] ** 2 + cycles[None] ** 2
+    return np.exp(-np.log(2) * squared / _PREFILTER_CYCLES**2).astype(np.float32)
+
+
+def gabor_filters(side: int, scales: int, orientations: int) -> Float32s:
+    """(scales * orientations, side, side) in the Fourier domain, finest scale first: a bump around one frequency."""
+    y, x = np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side), indexing="ij")
+    frequency, angle = np.hypot(x, y), np.arctan2(y, x)
+    falloff = _ANGULAR * (orientations / 32) ** 2
+    filters = []
+    for scale in range(scales):
+        centre = _HIGHEST / _OCTAVE**scale
+        radial = _RADIAL * (frequency / centre - 1) ** 2
+        for orientation in range(orientations):
+            turn = angle + np.pi * orientation / orientations
+            turn = (turn + np.pi) % (2 * np.pi) - np.pi
+            filters.append(np.exp(-radial - 2 * np.pi * falloff * turn**2))
+    return np.array(filters, np.float32)
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc"})
+def _nearness(vectors, query):
+    """(N,) float32: 1 / (1 + L2 distance) of (N, D) to (D,)."""
+    result = np.zeros(vectors.shape[0], np.float32)
+    for row in range(vectors.shape[0]):
+        total = 0.0
+        for d in range(vectors.shape[1]):
+            difference = np.float64(vectors[row, d]) - np.float64(query[d])
+            total += difference * difference
+        result[row] = 1 / (1 + np.sqrt(total))
+    return result

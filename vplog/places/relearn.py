@@ -1,0 +1,35 @@
+"""What comparators share between `learn`, `save` and `load`: a saved library is its references, learned again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import LibraryError
+from vplog.places import stored
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from vplog.data import Reference
+
+
+def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:
+    """The references, with their strongest features alone where a number is given. Raises LibraryError for none."""
+    kept = [reference if features is None else stored.strongest(reference, features) for reference in references]
+    if not kept:
+        raise LibraryError("A library needs at least one reference image; none was given.")
+    return kept
+
+
+def relearn(settings: Any, folder: Path, threads: int) -> Any:
+    """State of a folder written by `stored.save_references`, whose own settings count; `settings` is their class.
+
+    Raises LibraryError where the folder is damaged or gives another hash.
+    """
+    record = stored.read_library_record(folder)
+    made = settings.read(record["settings"], f"{folder}/library.json")
+    state = made.learn(stored.load_references(folder), threads)
+    if state.hash != record["hash"]:
+        raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
+    return state

@@ -1,0 +1,103 @@
+"""Patch-normalised thumbnails, compared by absolute differences: SeqSLAM's images.
+
+Milford & Wyeth, SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights, ICRA 2012.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numba
+import numpy as np
+import pyarrow as pa
+
+from vplog.data import THUMBNAIL_SIDE
+from vplog.places import stored
+from vplog.places.dense import VectorIndex, thumbnail_of, vectors_from_arrow, vectors_to_arrow
+from vplog.places.relearn import keep_references, relearn
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from vplog.data import Bytes, Features, Reference
+
+_WIDTH, _HEIGHT, _PATCH = 64, 32, 8
+"""px, the paper's table I."""
+_STEPS = 32
+"""Of a byte per standard deviation, so that it holds four to either side."""
+_LEAST_DEVIATION = 1.0
+"""Grey levels; a patch that varies less is the camera's noise, which must not be blown up to the size of a texture."""
+
+
+class ThumbnailSettings(Settings):
+    """SeqSLAM's image comparison. It learns nothing: the references only go into the library."""
+
+    kind: Literal["thumbnail"] = "thumbnail"
+    """Which recogniser."""
+
+    def learn(self, references: Iterable[Reference], threads: int) -> ThumbnailState:
+        """Nothing to learn. Raises LibraryError where there is no reference."""
+        return ThumbnailState(self, keep_references(references))
+
+    def load(self, folder: Path, threads: int) -> ThumbnailState:
+        """A library saved by `ThumbnailState.save`. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(ThumbnailSettings, folder, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class ThumbnailState:
+    """Nothing but what to save. Shared freely between threads."""
+
+    settings: ThumbnailSettings
+    references: list[Reference]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
+
+    hash: str = ""
+
+    @property
+    def bits(self) -> int:
+        """A byte a pixel."""
+        return 8 * _WIDTH * _HEIGHT
+
+    @property
+    def arrow_type(self) -> pa.FixedSizeListType:
+        return pa.list_(pa.uint8(), _WIDTH * _HEIGHT)
+
+    def describe(self, features: Features) -> Bytes:
+        """(2048,) uint8 row by row: deviations from the patch's mean in units of its own. Needs the thumbnail."""
+        image = thumbnail_of(features)
+        small = image.reshape(_HEIGHT, THUMBNAIL_SIDE // _HEIGHT, _WIDTH, THUMBNAIL_SIDE // _WIDTH).mean(axis=(1, 3))
+        patches = small.reshape(_HEIGHT // _PATCH, _PATCH, _WIDTH // _PATCH, _PATCH)
+        mean, deviation = patches.mean(axis=(1, 3), keepdims=True), patches.std(axis=(1, 3), keepdims=True)
+        normal = (patches - mean) / np.maximum(deviation, _LEAST_DEVIATION)
+        return np.clip(np.rint(128 + _STEPS * normal), 0, 255).astype(np.uint8).reshape(-1)
+
+    def index(self, descriptors: Sequence[Bytes]) -> VectorIndex:
+        return VectorIndex(np.array(descriptors, np.uint8).reshape(-1, _WIDTH * _HEIGHT), _likeness)
+
+    def to_arrow(self, descriptors: Sequence[Bytes]) -> pa.Array:
+        return vectors_to_arrow(descriptors, self.arrow_type)
+
+    def from_arrow(self, column: pa.Array) -> list[Bytes]:
+        """The places of a table's column. Raises LibraryError where it is of another kind."""
+        return vectors_from_arrow(column, self.arrow_type)
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.references, self.settings, folder)
+
+
+@numba.njit(cache=True, nogil=True)
+def _likeness(images, query):
+    """(N,) float32: 1 less the mean absolute difference (N, P) to (P,), as a share of a byte's range."""
+    result = np.zeros(images.shape[0], np.float32)
+    for row in range(images.shape[0]):
+        total = np.int32(0)
+        for p in range(images.shape[1]):
+            total += abs(np.int32(images[row, p]) - np.int32(query[p]))
+        result[row] = 1 - total / (255 * images.shape[1])
+    return result

@@ -1,0 +1,181 @@
+"""VLAD: Jegou et al., Aggregating local descriptors into a compact image representation, CVPR 2010.
+
+With RootSIFT, intra-normalisation (Arandjelovic & Zisserman, All about VLAD, CVPR 2013) and PCA whitening (Jegou &
+Chum, Negative evidences and co-occurrences in image retrieval, ECCV 2012).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numba
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+
+from vplog.errors import LibraryError
+from vplog.places import stored
+from vplog.places.dense import VectorIndex, vectors_from_arrow, vectors_to_arrow
+from vplog.places.relearn import keep_references, relearn
+from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Features, Float32s, Reference
+
+_MAX_PCA_REFERENCES = 2000
+"""Images that the PCA looks at, spread evenly over the references: its time grows with their cube, 1 s for these."""
+
+
+class VladSettings(Settings):
+    """Vector of locally aggregated descriptors, whitened by PCA."""
+
+    kind: Literal["vlad"] = "vlad"
+    """Which recogniser."""
+    features: int = Field(default=800, ge=1)
+    """Strongest features of an image that are used."""
+    centres: int = Field(default=64, ge=1, le=4096)
+    """k-means centres, as most of the papers; fewer where the references have too few features."""
+    dimensions: int | None = Field(default=128, ge=1)
+    """Directions of the PCA that are kept, at most one fewer than there are references. None keeps the whole vector of
+    128 values a centre as it is: 16 kB, and on new drives better than a PCA of few references."""
+    shrinkage: float = Field(default=1.0, ge=0)
+    """Multiple of the mean variance added to each direction's before whitening: few references tell it badly."""
+    seed: int = Field(default=0, ge=0)
+    """Of the first centres of k-means."""
+
+    def learn(self, references: Iterable[Reference], threads: int) -> VladState:
+        """Centres and PCA from the references. Raises LibraryError where they are fewer than two or featureless."""
+        kept = keep_references(references, self.features)
+        if len(kept) < 2:
+            raise LibraryError("vlad learns in what its references differ, so it needs at least two; one was given.")
+        descriptors = np.concatenate([reference.features.descriptors for reference in kept])
+        vocabulary = learn_vocabulary(descriptors, self.centres, self.seed, threads)
+        if self.dimensions is None:
+            return VladState(self, kept, vocabulary, None)
+        rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MAX_PCA_REFERENCES)).astype(np.int64))
+        with ThreadPoolExecutor(threads) as pool:
+            raw = np.array(list(pool.map(lambda row: aggregate(kept[row].features, self.features, vocabulary), rows)))
+        return VladState(self, kept, vocabulary, Whitening.learn(raw, self.dimensions, self.shrinkage))
+
+    def load(self, folder: Path, threads: int) -> VladState:
+        """A library saved by `VladState.save`. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(VladSettings, folder, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class VladState:
+    """Centres and a whitening projection. Shared freely between threads."""
+
+    settings: VladSettings
+    references: list[Reference]
+    vocabulary: Vocabulary
+    whitening: Whitening | None
+    """None keeps vectors as they are."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
+
+    hash: str = ""
+
+    @property
+    def _length(self) -> int:
+        return self.vocabulary.centres.size if self.whitening is None else len(self.whitening.projection)
+
+    @property
+    def bits(self) -> int:
+        """Two bytes a dimension."""
+        return 16 * self._length
+
+    @property
+    def arrow_type(self) -> pa.FixedSizeListType:
+        return pa.list_(pa.float16(), self._length)
+
+    def describe(self, features: Features) -> NDArray[np.float16]:
+        """(D,) of unit length; all zero for an image without features."""
+        raw = aggregate(features, self.settings.features, self.vocabulary)
+        if self.whitening is None or not raw.any():
+            return raw[: self._length].astype(np.float16)
+        return self.whitening.apply(raw).astype(np.float16)
+
+    def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
+        return VectorIndex(np.array(descriptors, np.float32).reshape(-1, self._length), _products)
+
+    def to_arrow(self, descriptors: Sequence[NDArray[np.float16]]) -> pa.Array:
+        return vectors_to_arrow(descriptors, self.arrow_type)
+
+    def from_arrow(self, column: pa.Array) -> list[NDArray[np.float16]]:
+        """The places of a table's column. Raises LibraryError where it is of another kind or length."""
+        return vectors_from_arrow(column, self.arrow_type)
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.references, self.settings, folder)
+
+
+def aggregate(features: Features, count: int, vocabulary: Vocabulary) -> Float32s:
+    """(V * 128,) float32 of unit length: for each centre, the sum of what its features differ from it by.
+
+    Jegou et al. 2010, section 3; each centre's part at unit length (Arandjelovic & Zisserman 2013, section 3.2).
+    """
+    words = vocabulary.quantise(features.descriptors[:count])
+    difference = root_sift(features.descriptors[:count]) - vocabulary.centres[words]
+    order = np.argsort(words, kind="stable")
+    first = np.flatnonzero(np.diff(words[order], prepend=-1))
+    parts = np.zeros_like(vocabulary.centres)
+    parts[words[order[first]]] = np.add.reduceat(difference[order], first)
+    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), np.float32(1e-9))
+    return _unit(parts.reshape(-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Projection on the directions in which references differ most, to like variance in each."""
+
+    mean: Float32s
+    """(V,)."""
+    projection: Float32s
+    """(D, V)."""
+
+    @classmethod
+    def learn(cls, raw: Float32s, dimensions: int, shrinkage: float) -> Whitening:
+        """From (L, V) vectors, by the eigenvectors of their (L, L) products."""
+        mean = raw.mean(axis=0)
+        centred = (raw - mean).astype(np.float64)
+        variance, sides = np.linalg.eigh(centred @ centred.T / len(raw))
+        variance = np.maximum(variance, 0)
+        kept = np.argsort(-variance, kind="stable")[: min(dimensions, len(raw) - 1)]
+        directions = sides[:, kept].T @ centred
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+        # an eigenvector's sign is a matter of the machine: let its largest entry be positive
+        largest = np.argmax(np.abs(directions), axis=1)
+        directions *= np.sign(directions[np.arange(len(kept)), largest])[:, None]
+        weight = 1 / np.sqrt(np.maximum(variance[kept] + shrinkage * variance.mean(), 1e-12))
+        return cls(mean.astype(np.float32), (directions * weight[:, None]).astype(np.float32))
+
+    def apply(self, raw: Float32s) -> Float32s:
+        """(D,) of unit length of (V,)."""
+        return _unit(_products(self.projection, raw - self.mean))
+
+
+def _unit(vector: Float32s) -> Float32s:
+    return vector / np.maximum(np.linalg.norm(vector), np.float32(1e-9))
+
+
+# no BLAS: its threads would compete with ours. Between halves, multiples of 2^-24, float64 sums are exact in any order
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc"})
+def _products(vectors, query):
+    """(N,) float32 products of (N, D) and (D,); of unit vectors, their cosines."""
+    result = np.zeros(vectors.shape[0], np.float32)
+    for row in range(vectors.shape[0]):
+        total = 0.0
+        for d in range(vectors.shape[1]):
+            total += np.float64(vectors[row, d]) * np.float64(query[d])
+        result[row] = total
+    return result
