@@ -94,7 +94,7 @@ def started(*arguments: object, **options: Any) -> subprocess.Popen[str]:
 def test_help_names_every_verb_and_explains_it(verb: Verb) -> None:
     said = verb("--help")
     assert said.code == 0
-    for name in ("info", "library", "run", "evaluate", "demo", "schemas", "config"):
+    for name in ("info", "library", "run", "evaluate", "compare", "demo", "schemas", "config"):
         assert name in said.out
         of_verb = verb(name, "--help")
         assert of_verb.code == 0
@@ -174,7 +174,7 @@ def test_evaluate_and_config_in_words(verb: Verb, drive: Drive, finished: Path, 
 
 def test_set_changes_one_setting_and_keeps_the_method(verb: Verb) -> None:
     default = verb("config", "--json").json
-    for name, value in (("places.boxes", 3), ("solve.max_iterations", 7), ("features.max_features", 99)):
+    for name, value in (("places.references", 3), ("solve.max_iterations", 7), ("features.max_features", 99)):
         stage, setting = name.split(".")
         changed = verb("config", "--set", f"{name}={value}", "--json").json
         assert changed == {**default, stage: {**default[stage], setting: value}}
@@ -372,7 +372,7 @@ def test_a_library_that_cannot_be_used_is_one_line(
         table.write_bytes(table.read_bytes()[:-100])
     elif damage == "empty table":
         (library / "references.parquet").write_bytes(b"")
-    changed = ("--set", "places.boxes=3") if damage == "other settings" else ()
+    changed = ("--set", "places.references=3") if damage == "other settings" else ()
     error = verb("run", drive.log, "-o", tmp_path / "run", "--library", library, *QUICK, *changed).error
     assert str(library) in error
     assert not (tmp_path / "run" / ".features").exists()

@@ -67,7 +67,7 @@ def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Drive
     assert {"python", "numpy", "gtsam", "pyarrow"} <= record["versions"].keys()
     assert "unknown" not in record["versions"].values()
     stages = record["stages"]
-    assert list(stages) == ["read", "extract", "learn", "describe", "propose", "verify", "solve", "write"]
+    assert list(stages) == ["read", "extract", "learn", "cover", "describe", "propose", "verify", "solve", "write"]
     for stage in stages.values():
         assert stage["seconds"] >= 0
         assert stage["peak_memory_mb"] > 10
@@ -246,7 +246,9 @@ def test_a_library_of_another_drive_is_used_and_named(drive: Drive, tmp_path: Pa
     known = json.loads((tmp_path / "library" / "library.json").read_text())
     assert known["references"] == 5
     record = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", threads=4).record
-    assert record["library"] == {"hash": known["hash"], "from": str(tmp_path / "library")}
+    about = record["library"]
+    assert (about["hash"], about["from"], about["references"]) == (known["hash"], str(tmp_path / "library"), 5)
+    assert about["coverage"]["explained"] > 0.5
     assert state.hash == known["hash"]
     assert not (tmp_path / "run" / "library").exists()
     for name in TABLES:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 COUNTS = st.integers(1, 3000)
 SIZES = st.one_of(st.none(), st.integers(1, 400))
+QUICK = ("library.choose=coverage", "features.max_features=250", "features.max_megapixels=0.06")
+"""Fewer features, so that the drive is looked at soon."""
 
 
 @given(COUNTS, SIZES, st.sampled_from(["random", "spread"]))
@@ -70,7 +72,9 @@ def test_an_unknown_way_is_refused_with_the_choices() -> None:
 
 def test_a_run_keeps_the_images_that_its_features_chose(drive: Drive, tmp_path: Path) -> None:
     """The images are read from the log a second time: each must be the one at its reference's stamp."""
-    done = run(drive.log, tmp_path, load_pipeline("default", ["library.choose=coverage", "library.size=9"]), threads=2)
+    done = run(
+        drive.log, tmp_path, load_pipeline("default", [*QUICK, "library.size=9", "propose.per_query=1"]), threads=2
+    )
     references = load_references(tmp_path / "library")
     stamps = np.array([reference.stamp_ns for reference in references])
     assert len(stamps) == 9
@@ -81,7 +85,7 @@ def test_a_run_keeps_the_images_that_its_features_chose(drive: Drive, tmp_path: 
 
 
 def test_what_one_drive_explains_the_other_need_not(drive: Drive, tmp_path: Path) -> None:
-    pipeline = load_pipeline("default", ["library.choose=coverage", "library.size=12"])
+    pipeline = load_pipeline("default", [*QUICK, "library.size=12"])
     build_library([drive.log, drive.log], tmp_path / "twice", pipeline, threads=2)
     stamps = [reference.stamp_ns for reference in load_references(tmp_path / "twice")]
     assert len(stamps) == 12

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.retrieval import Ranks
     from vplog.pipeline import Pipeline
-    from vplog.stages import Extractor, Log, PlaceIndex, PlaceState
+    from vplog.stages import Extractor, Log, PlaceIndex, PlaceState, Recogniser
 
     Progress = Callable[[str, int, int], None]
 
@@ -161,9 +161,7 @@ def evaluate_method(
     it, so the bytes counted are all that is used. Scores are kept in a file of the folder `scratch`, or in memory.
     Raises TruthError without a true pair, and whatever the method raises.
     """
-    began = time.process_time()
-    state = settings.learn(references, threads)
-    learn_s = time.process_time() - began
+    state, learn_s = _learn(settings, references, threads)
     places, mining_ms = describe_walk(state, map_walk, threads, lambda *at: progress("describe map", *at))
     column = state.to_arrow(places)
     places = state.from_arrow(column)
@@ -195,6 +193,13 @@ def evaluate_method(
     by_sequence = retrieval.rank_queries(lines, truth, stops)
     figures["sequence"] = {**sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
     return MethodResult(state, scores, ranks, figures, by_sequence)
+
+
+def _learn(recogniser: Recogniser, references: Sequence[Reference], threads: int) -> tuple[PlaceState, float]:
+    """What it learned, and the CPU s that all threads took."""
+    began = time.process_time()
+    state = recogniser.learn(references, threads)
+    return state, time.process_time() - began
 
 
 def describe_walk(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,9 +24,11 @@ from vplog.loops.propose import ProposeSettings, candidate_stops, propose
 from vplog.loops.verify import VerifySettings, verify
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
-from vplog.places.coverage import STRONGEST, choose_by_coverage, frames_needed
+from vplog.places.coverage import STRONGEST, choose_by_coverage, coverage_warning, frames_needed, measure_coverage
+from vplog.places.library import WordSettings
+from vplog.places.library import build_library as index_words
 from vplog.places.sequence import SequenceSettings, rank_places
-from vplog.places.stored import read_library_record
+from vplog.places.stored import load_references, read_library_record
 from vplog.references import PAPER_SIZE, LibrarySettings, choose, evenly
 from vplog.results import g2o, mcap, run_record, tables, tum
 from vplog.settings import Settings, load_yaml, override
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from vplog.data import Camera, Ints, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.loops.propose import Proposals
+    from vplog.places.coverage import Coverage
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]
@@ -149,22 +153,20 @@ def run(
             later = library is not None or pipeline.library.choose == "coverage"
             chosen = set() if later else set(choose(keyframes.stamp_ns, pipeline.library).tolist())
             keyframes, references, lost = extract(log, keyframes, chosen, pipeline, store, threads, progress)
-            warnings += lost
-        if camera.matrix is None:
-            warnings.append(_UNCALIBRATED.format(camera=camera.name))
+            warnings += lost + ([_UNCALIBRATED.format(camera=camera.name)] if camera.matrix is None else [])
         if library is None and pipeline.library.choose == "coverage":
             with watch.stage("choose", len(store)):
                 references = references_by_coverage(log, keyframes, store, pipeline.library, threads)
         with watch.stage("learn", None if library else len(references)):
             state = learn(pipeline, library, references, threads)
+        with watch.stage("cover"):
+            known = load_references(library) if library else references
+            coverage, doubt = cover(log, keyframes, known, library is not None, store, threads)
+            warnings += doubt
         with watch.stage("describe", len(store)):
             descriptors = describe(state, store, threads, progress)
         with watch.stage("propose", len(store)):
-            stops = candidate_stops(keyframes, pipeline.propose)
-            ranked = rank_places(
-                state.index(descriptors), descriptors, stops, pipeline.propose.asked, pipeline.sequence, threads
-            )
-            proposals = propose(ranked, pipeline.propose)
+            proposals = find_candidates(state, descriptors, keyframes, pipeline, threads)
         with watch.stage("verify", len(proposals.query)):
             closures = verify(
                 proposals, keyframes, camera, store.__getitem__, pipeline.verify, threads,
@@ -189,7 +191,12 @@ def run(
             **record.head(pipeline, path, threads),
             "finished": True,
             "inputs": hashes.result(),
-            "library": {"hash": state.hash, "from": str(library) if library else "the drive's own keyframes"},
+            "library": {
+                "hash": state.hash,
+                "from": str(library) if library else "the drive's own keyframes",
+                "references": len(known),
+                "coverage": asdict(coverage),
+            },
             "descriptor_bits": state.bits,
             "counts": record.counts(log, odometry, keyframes, closures),
             "noise": noise_source,
@@ -284,6 +291,16 @@ def learn(pipeline: Pipeline, library: Path | None, references: list[Reference],
     return pipeline.places.learn(references, threads)
 
 
+def cover(
+    log: Log, keyframes: Keyframes, references: list[Reference], given: bool, store: FeatureStore, threads: int
+) -> tuple[Coverage, list[str]]:
+    """How far the references explain the drive, and what to do where that is little."""
+    library = index_words(references, WordSettings(), threads)
+    coverage = measure_coverage(len(store), store.__getitem__, keyframes.stamp_ns, log.name, library, threads)
+    doubt = coverage_warning(coverage, len(store), given, len(library))
+    return coverage, [doubt] if doubt else []
+
+
 def describe(state: PlaceState, store: FeatureStore, threads: int, progress: Progress) -> Sequence[Any]:
     """A descriptor for every keyframe, in order."""
     result = []
@@ -293,6 +310,15 @@ def describe(state: PlaceState, store: FeatureStore, threads: int, progress: Pro
             result.append(descriptor)
             progress("describe", len(result), len(store))
     return result
+
+
+def find_candidates(
+    state: PlaceState, descriptors: Sequence[Any], keyframes: Keyframes, pipeline: Pipeline, threads: int
+) -> Proposals:
+    """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
+    index, stops = state.index(descriptors), candidate_stops(keyframes, pipeline.propose)
+    ranked = rank_places(index, descriptors, stops, pipeline.propose.asked, pipeline.sequence, threads)
+    return propose(ranked, pipeline.propose)
 
 
 def judge(closures: Closures, graph: PoseGraph, solution: Solution, rows: Ints) -> Closures:

@@ -10,7 +10,7 @@ from .pictures import SMALL, reference
 
 if TYPE_CHECKING:
     from vplog.data import Reference
-    from vplog.places.bobb import BobbState
+    from vplog.places.bobb_paper import PaperBobbState
 
 
 @pytest.fixture(scope="session")
@@ -19,5 +19,5 @@ def references() -> list[Reference]:
 
 
 @pytest.fixture(scope="session")
-def state(references: list[Reference]) -> BobbState:
+def state(references: list[Reference]) -> PaperBobbState:
     return SMALL.learn(references, 2)

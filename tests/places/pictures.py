@@ -9,9 +9,9 @@ import numpy as np
 
 from vplog.data import Features, Reference
 from vplog.features.sift import SiftSettings
-from vplog.places.bobb import BobbSettings
+from vplog.places.bobb_paper import PaperBobbSettings
 
-SMALL = BobbSettings(partitions=20, features=250)
+SMALL = PaperBobbSettings(partitions=20, features=250)
 """The paper's method with fewer partitions and features, so that tests are quick."""
 
 
@@ -33,6 +33,7 @@ def texture(seed: int) -> np.ndarray:
     return _panorama(seed // 20)[:, left : left + 320].copy()
 
 
+@lru_cache
 def reference(seed: int) -> Reference:
     image = texture(seed)
     return Reference(image, SiftSettings(max_features=400)(image), f"drive {seed % 3}", 10**18 + seed)

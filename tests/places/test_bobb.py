@@ -1,228 +1,212 @@
-"""The recogniser's state: the same whatever the threads, on disk and in tables, and it finds what it has seen."""
+"""Each step against a slow one of plain Python, and a recogniser that finds what it has seen in 120 bytes."""
 
 from __future__ import annotations
 
-import math
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from vplog.data import Features
-from vplog.errors import LibraryError, SettingsError
-from vplog.places import rvp
-from vplog.places.bobb import BobbSettings, BobbState, Place
+from vplog.places import expected_votes
+from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, _rarity
+from vplog.places.code_search import CodeIndex
+from vplog.places.matches import WeighedMatchSettings, _itself, _weigh, large_enough
 
-from .literal import all_boxes
-from .pictures import SMALL, noisy, nothing, reference
+from .pictures import noisy, nothing, reference
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Reference
 
-
-def _equal(a: Place, b: Place) -> bool:
-    return np.array_equal(a.references, b.references) and np.array_equal(a.boxes, b.boxes)
+TINY = BobbSettings(references=4, features=250)
 
 
 @pytest.fixture(scope="module")
-def queries(references: list[Reference]) -> list[Features]:
-    seen = [noisy(r.features, seed) for seed, r in enumerate(references)]
-    return [*seen, reference(50).features, nothing()]
+def learned(references: list[Reference]) -> BobbState:
+    return TINY.learn(references, 2)
 
 
-@pytest.fixture(scope="module")
-def places(state: BobbState, queries: list[Features]) -> list[Place]:
-    return [state.describe(features) for features in queries]
+def test_a_place_of_the_defaults_is_stored_in_120_bytes(references: list[Reference]) -> None:
+    state = BobbSettings().learn(references, 1)
+    column = state.to_arrow([state.describe(r.features) for r in references])
+    assert state.bits == 960
+    leaves = [column.field(i).flatten() for i in range(column.type.num_fields)]
+    assert sum(len(leaf) * leaf.type.bit_width // 8 for leaf in leaves) == 120 * len(references)
 
 
-def test_describing_from_many_threads_changes_nothing(
-    state: BobbState, queries: list[Features], places: list[Place]
-) -> None:
-    with ThreadPoolExecutor(4) as pool:
-        again = list(pool.map(state.describe, queries * 2))
-    assert all(map(_equal, again, places * 2))
+def test_every_view_finds_itself_through_other_references(learned: BobbState, references: list[Reference]) -> None:
+    """The map's views are references themselves: none is explained by its own image, and each is found again."""
+    places = [learned.describe(r.features) for r in references]
+    for row, place in enumerate(places):
+        assert row not in place.references.tolist()
+    index = learned.index(places)
+    found = [index.query(learned.describe(noisy(r.features, 9)), 1).rows[0] for r in references]
+    # a noisy copy does see its own image, which its map place may not use: neighbours share half the view at most
+    assert np.mean(np.abs(np.array(found) - np.arange(len(found))) <= 1) > 0.8
+    again = [index.query(place, 1) for place in places]
+    assert [r.rows[0] for r in again] == list(range(len(places)))
 
 
-def test_learning_with_many_threads_changes_nothing(state: BobbState, references: list[Reference]) -> None:
-    words = state.library.words
-    for threads in (1, 4):
-        other = SMALL.learn(references, threads)
-        assert other.hash == state.hash
-        np.testing.assert_array_equal(other.library.words.start, words.start)
-        np.testing.assert_array_equal(other.library.words.values, words.values)
-        for a, b in zip(other.patterns, state.patterns, strict=True):
-            for name in a.__dataclass_fields__:
-                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-def test_a_saved_library_describes_the_same(
-    state: BobbState, queries: list[Features], places: list[Place], tmp_path: Path
-) -> None:
-    state.save(tmp_path / "a" / "library")
-    loaded = BobbSettings().load(tmp_path / "a" / "library", 2)  # the folder's settings count, not these
-    assert loaded.settings == SMALL
-    assert loaded.hash == state.hash
-    assert all(map(_equal, map(loaded.describe, queries), places))
-    loaded.save(tmp_path / "b")
-    for name in ("library.json", "features.parquet", "references.parquet"):
-        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / "library" / name).read_bytes()
-
-
-def test_seeds_give_other_windows_and_partitions(references: list[Reference]) -> None:
-    a, b = (
-        BobbSettings(partitions=5, features=100, references=2, seed=seed).learn(references[:3], 1) for seed in (0, 1)
-    )
-    assert a.hash != b.hash
-    assert not np.array_equal(a._windows, b._windows)
-    assert not np.array_equal(a.patterns[0].x_cuts, b.patterns[0].x_cuts)
-    assert not np.array_equal(a.patterns[0].x_cuts, a.patterns[1].x_cuts)
-
-
-def test_the_hash_tells_libraries_apart(state: BobbState, references: list[Reference]) -> None:
-    assert SMALL.learn(references[::-1], 1).hash != state.hash
-    assert SMALL.learn(references[:-1], 1).hash != state.hash
-
-
-@pytest.mark.parametrize(
-    "change", [{}, {"grid": 13, "boxes": 2}, {"references": 2, "max_box_share": 0.3, "aspects": (1.0,), "grid": 9}]
-)
-def test_bits_of_a_place(references: list[Reference], change: dict[str, Any]) -> None:
-    settings = BobbSettings(**{"partitions": 1, "features": 20, "grid": 20, **change})
-    state = settings.learn(references[:7], 1)
-    boxes = len(all_boxes(settings.grid, rvp.box_shapes(settings.grid, settings.max_box_share, settings.aspects))) + 1
-    sets = math.factorial(7) // math.factorial(settings.references) // math.factorial(7 - settings.references)
-    per_box = next(bits for bits in range(64) if 2**bits >= boxes)
-    per_set = next(bits for bits in range(64) if 2**bits >= sets)
-    assert state.bits == per_set + settings.references * settings.boxes * per_box
-
-
-def test_the_papers_references_take_22_bits(references: list[Reference]) -> None:
-    """Section V: log2 C(100, 4) is told in 22 bits."""
-    many = [references[row % 12] for row in range(100)]
-    state = BobbSettings(partitions=1, features=3).learn(many, 1)
-    per_box = math.ceil(math.log2(rvp.count_boxes(64, rvp.box_shapes(64, 0.1, state.settings.aspects))))
-    assert state.bits == 22 + 16 * per_box
-
-
-def test_boxes_are_small_and_where_references_are(places: list[Place]) -> None:
-    found = 0
-    for place in places:
-        assert place.boxes.shape == (4, 4, 4)
-        x0, y0, x1, y1 = np.moveaxis(place.boxes.astype(int), -1, 0)
-        assert ((x0 <= x1) & (y0 <= y1)).all()
-        assert place.boxes.max() <= SMALL.grid
-        assert ((x1 - x0) * (y1 - y0) <= SMALL.max_box_share * SMALL.grid**2).all()
-        assert not place.boxes[place.references < 0].any()
-        chosen = place.references[place.references >= 0]
-        assert len(set(chosen.tolist())) == len(chosen)
-        found += (x1 > x0).sum()
-    assert found > 100
-
-
-def test_an_image_without_features_is_like_nothing(state: BobbState, places: list[Place]) -> None:
-    empty = places[-1]
-    assert (empty.references == -1).all()
-    assert not empty.boxes.any()
-    index = state.index(places)
-    assert not index.scores(empty).any()
+def test_an_image_without_features_shares_nothing(learned: BobbState, references: list[Reference]) -> None:
+    empty = learned.describe(nothing())
+    assert (empty.references == NOBODY).all()
+    assert (empty.boxes == NOWHERE).all()
+    index = learned.index([learned.describe(references[0].features), empty])
     assert len(index.query(empty, 5).rows) == 0
-    assert all(index.scores(place)[-1] == 0 for place in places)
+    assert index.scores(learned.describe(references[0].features))[1] == 0
 
 
-def test_fewer_references_than_asked_for(state: BobbState, references: list[Reference]) -> None:
-    f = references[2].features
-    one = Features(f.points[:1], f.sizes[:1], f.descriptors[:1], f.depth_m[:1], f.width, f.height)
-    place = state.describe(one)
-    assert 2 in place.references  # and its neighbours perhaps
-    assert place.references[-1] == -1
-    assert not place.boxes[place.references == -1].any()
-
-
-def test_the_reference_itself_explains_an_image_best(places: list[Place]) -> None:
-    assert [int(place.references[0]) for place in places[:12]] == list(range(12))
-
-
-def test_a_place_is_most_like_itself(
-    state: BobbState, references: list[Reference], queries: list[Features], places: list[Place]
+def test_references_stand_by_falling_weight_and_the_best_has_255(
+    learned: BobbState, references: list[Reference]
 ) -> None:
-    index = state.index([state.describe(r.features) for r in references])
-    for row, r in enumerate(references):
-        assert index.query(state.describe(r.features), 1).rows.tolist() == [row]
-    for row in range(12):  # and so are its noisy views
-        assert index.query(places[row], 1).rows.tolist() == [row]
+    for seed in range(12, 18):
+        place = learned.describe(reference(seed).features)
+        weights = place.weights.astype(int)
+        assert weights[0] in (0, 255)
+        assert (np.diff(weights) <= 0).all()
+        used = place.references != NOBODY
+        assert (weights[used] > 0).all()
+        assert (weights[~used] == 0).all()
 
 
-def test_places_survive_a_parquet_file(state: BobbState, places: list[Place], tmp_path: Path) -> None:
-    pq.write_table(pa.table({"place": state.to_arrow(places)}), tmp_path / "d.parquet")
-    column = pq.read_table(tmp_path / "d.parquet")["place"].combine_chunks()
-    assert column.type == state.arrow_type
-    back = state.from_arrow(column)
-    assert all(map(_equal, back, places))
-    assert all(map(_equal, state.from_arrow(column.slice(3, 5)), places[3:8]))
-    np.testing.assert_array_equal(state.index(back).scores(places[4]), state.index(places).scores(places[4]))
+def test_grain_is_not_used() -> None:
+    features = reference(3).features
+    least = 0.02 * np.sqrt(320 * 200)
+    kept = large_enough(features, WeighedMatchSettings(least_size=0.02, features=1000))
+    assert (kept.sizes >= least).all()
+    assert len(kept) == (features.sizes >= least).sum() < len(features)
 
 
-def test_no_places_at_all(state: BobbState, places: list[Place]) -> None:
-    assert state.from_arrow(state.to_arrow([])) == []
-    index = state.index([])
-    assert len(index) == 0
-    assert len(index.query(places[0], 3).rows) == 0
+def test_popular_references_count_less() -> None:
+    explained = np.array([[0.7, 0.2, 0.1], [0.6, 0.4, 0.0]])
+    rare = _rarity(explained, 0.5)
+    assert rare[0] < rare[1] < rare[2]
+    np.testing.assert_array_equal(_rarity(explained, 0.0), 1.0)
 
 
-def test_columns_of_other_libraries_are_refused(state: BobbState, places: list[Place]) -> None:
-    good = state.to_arrow(places)
-    for column in (pa.array([1, 2]), good.field("references"), good.cast(pa.struct([("a", pa.int32())]), safe=False)):
-        with pytest.raises(LibraryError, match="do not fit"):
-            state.from_arrow(column)
-    boxes = places[0].boxes
-    for wrong in (12, -2, 2**31 - 1):
-        with pytest.raises(LibraryError, match="references that this library does not have"):
-            state.from_arrow(state.to_arrow([Place(np.array([0, 1, wrong, -1], np.int32), boxes)]))
-    with pytest.raises(LibraryError, match="beyond the grid"):
-        state.from_arrow(state.to_arrow([Place(places[0].references, np.full((4, 4, 4), 65, np.uint8))]))
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), itself=st.booleans())
+def test_weights_are_those_of_the_definition(seed: int, itself: bool) -> None:
+    rng = np.random.default_rng(seed)
+    owner = np.sort(rng.integers(0, 5, 40)).astype(np.int32)
+    distance = np.sort(rng.integers(0, 50, (6, 8)), axis=1).astype(np.float32)
+    entry = np.array([rng.choice(40, 8, replace=False) for _ in range(6)])
+    left_out = int(owner[entry[0, 0]]) if itself else -1
+    feature, library, weight = _weigh(distance, entry, owner, 5, left_out, 0.8)
+    expected = {}
+    for f in range(6):
+        pairs = [(d, e) for d, e in zip(distance[f], entry[f], strict=True) if owner[e] != left_out]
+        last = pairs[-1][0] if pairs else 0.0
+        nearest = {}
+        for d, e in pairs:
+            w = 1 - float(d) / (0.8 * float(last)) if last > 0 else 0.0
+            if owner[e] not in nearest and w > 0:
+                nearest[owner[e]] = (e, w)
+        for e, w in nearest.values():
+            expected[f, e] = w / np.sqrt(len(nearest))
+    assert set(zip(feature.tolist(), library.tolist(), strict=True)) == set(expected)
+    for f, e, w in zip(feature, library, weight, strict=True):
+        assert w == pytest.approx(expected[f, e], rel=1e-5)
 
 
-def test_columns_with_empty_rows_are_refused(state: BobbState, places: list[Place]) -> None:
-    rows = state.to_arrow(places).to_pylist()
-    for damage in (
-        None,
-        {"references": None, "boxes": rows[0]["boxes"]},
-        {"references": rows[0]["references"], "boxes": None},
-        {"references": [0, None, 1, 2], "boxes": rows[0]["boxes"]},
-    ):
-        with pytest.raises(LibraryError):
-            state.from_arrow(pa.array([*rows, damage], state.arrow_type))
+def test_an_image_is_itself_where_most_features_are_equal() -> None:
+    owner = np.array([0, 0, 1, 1], np.int32)
+    entry = np.array([[2, 0], [3, 1], [0, 2]])
+    assert _itself(np.array([[0, 5], [0, 5], [0, 5]], np.float32), entry, owner, 2) == 1
+    assert _itself(np.array([[0, 5], [1, 5], [1, 5]], np.float32), entry, owner, 2) == -1
 
 
-def test_too_small_a_library_is_refused(references: list[Reference]) -> None:
-    with pytest.raises(LibraryError, match=r"3 reference images, but places\.references is 4"):
-        SMALL.learn(references[:3], 1)
+@pytest.mark.parametrize("patches", [1, 5, 16, 32])
+def test_the_closed_form_is_the_average_over_random_partitions(patches: int) -> None:
+    """Two points share a patch of a random partition as often as the kernel says (Alg. 3 lines 6-13)."""
+    borders = np.sort(np.random.default_rng(patches).random((20_000, patches - 1)), axis=1)
+    middle = (np.arange(16) + 0.5) / 16
+    patch = (borders[:, None, :] < middle[None, :, None]).sum(axis=2)
+    together = (patch == patch[:, 8:9]).mean(axis=0)
+    np.testing.assert_allclose(together, expected_votes.box_sums(16, patches, 1)[8], atol=0.015)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"grid": 256},
-        {"grid": 3},  # a tenth of nine cells is none
-        {"columns": 257},
-        {"rows": 0},
-        {"references": 0},
-        {"boxes": 0},
-        {"partitions": 0},
-        {"window_share": 1.1},
-        {"max_box_share": 0.0},
-        {"aspects": []},
-        {"aspects": [-1.0]},
-        {"features": 0},
-        {"neighbours": 0},
-        {"seed": -1},
-    ],
-)
-def test_settings_that_cannot_work(change: dict[str, Any]) -> None:
-    with pytest.raises(SettingsError):
-        BobbSettings.read(change, "test")
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_boxes_are_those_with_most_votes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    here, there = rng.random((30, 2), np.float32), rng.random((30, 2), np.float32)
+    weight = rng.random(30, np.float32)
+    windows = expected_votes.even_windows(2, 0.6)
+    along_x, along_y = expected_votes.box_sums(8, 8, 3), expected_votes.box_sums(6, 4, 2)
+    boxes = expected_votes.best_boxes(here, there, weight, windows, along_y, along_x, 255)
+    for window, box in zip(windows, boxes, strict=True):
+        votes = np.zeros((6, 8))
+        for (x, y), (u, v), w in zip(here, there, weight, strict=True):
+            if window[0] <= x <= window[2] and window[1] <= y <= window[3]:
+                column, row = (np.arange(8) + 0.5) / 8, (np.arange(6) + 0.5) / 6
+                at = (int(u * 8) + 0.5) / 8, (int(v * 6) + 0.5) / 6
+                votes += w * ((1 - np.abs(row - at[1])) ** 3)[:, None] * (1 - np.abs(column - at[0])) ** 7
+        sums = [votes[y : y + 2, x : x + 3].sum() for y in range(5) for x in range(6)]
+        if max(sums) > 0:
+            assert sums[box] == pytest.approx(max(sums))
+        else:
+            assert box == 255
+
+
+def test_matches_that_move_alike_count_more_than_a_stray() -> None:
+    here = np.array([[0.1, 0.1], [0.3, 0.2], [0.5, 0.6], [0.8, 0.3]], np.float32)
+    there = here + np.array([0.05, 0.0], np.float32)
+    there[3] = [0.1, 0.9]
+    ones = np.ones(4, np.float32)
+    agreed = expected_votes.agreement(here, there, ones, 0.07, 0.3)
+    np.testing.assert_allclose(agreed[:3], 0.3 + 0.7 * (1 - np.exp(-2)), rtol=1e-4)
+    assert agreed[3] == pytest.approx(0.3)
+    np.testing.assert_array_equal(expected_votes.agreement(here, there, ones, 0.07, 1.0), ones)
+
+
+def test_overlaps_are_those_of_rectangles() -> None:
+    table = expected_votes.overlaps(5, 4, 3, 2)
+    for a in range(20):
+        for b in range(20):
+            field_a, field_b = np.zeros((5, 7), bool), np.zeros((5, 7), bool)
+            field_a[a // 5 : a // 5 + 2, a % 5 : a % 5 + 3] = True
+            field_b[b // 5 : b // 5 + 2, b % 5 : b % 5 + 3] = True
+            assert table[a, b] == (field_a & field_b).sum()
+    assert not table[20:].any()
+    assert not table[:, 20:].any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), pairing=st.sampled_from(["best", "same", "both"]), stop=st.integers(0, 14))
+def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
+    rng = np.random.default_rng(seed)
+    count, J, windows, L = 12, 3, 4, 6
+    references = np.array([rng.choice(L, J, replace=False) for _ in range(count)], np.uint16)
+    references[rng.random((count, J)) < 0.2] = NOBODY
+    weights = rng.integers(1, 256, (count, J)).astype(np.uint8)
+    weights[references == NOBODY] = 0
+    boxes = rng.integers(0, 20, (count, J, windows)).astype(np.uint8)
+    boxes[rng.random(boxes.shape) < 0.1] = NOWHERE
+    table = expected_votes.overlaps(5, 4, 3, 2)
+    index = CodeIndex(references, weights, boxes, table, L, pairing)  # pyright: ignore[reportArgumentType]
+    query = type("Place", (), {"references": references[0], "weights": weights[0], "boxes": boxes[0]})()
+    unit = weights / np.maximum(np.linalg.norm(weights.astype(float), axis=1, keepdims=True), 1)
+    scores = index.scores(query, stop)
+    assert len(scores) == min(stop, count)
+    for m in range(len(scores)):
+        total = 0.0
+        for j in range(J):
+            for k in range(J):
+                if references[0, j] == references[m, k] != NOBODY:
+                    cells = table[boxes[0, j][:, None], boxes[m, k][None]] / 6
+                    best, same = cells.max(axis=1).mean(), np.diag(cells).mean()
+                    alike = {"best": best, "same": same, "both": (best + same) / 2}[pairing]
+                    total += unit[0, j] * unit[m, k] * alike
+        assert scores[m] == pytest.approx(total, abs=1e-6)
+    ranking = index.query(query, 5, stop)
+    order = np.lexsort((np.arange(len(scores)), -scores))
+    order = order[scores[order] > 0][:5]
+    np.testing.assert_array_equal(ranking.rows, order)
+
+
+@pytest.mark.parametrize("wrong", [{"columns": 40}, {"box_columns": 17}, {"pairing": "worst"}, {"references": 0}])
+def test_settings_that_fit_no_byte_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=r"(?i)byte|larger|input should"):
+        BobbSettings(**wrong)  # pyright: ignore[reportArgumentType]

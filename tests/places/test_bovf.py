@@ -11,15 +11,10 @@ import pytest
 from vplog.errors import LibraryError
 from vplog.places.bovf import BovfSettings, BovfState, Words
 
-from . import comparator
-
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Reference
 
 SMALL = BovfSettings(words=300, features=250)
-CUT = BovfSettings(words=300, features=250, max_bytes=64)
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +22,9 @@ def learned(references: list[Reference]) -> BovfState:
     return SMALL.learn(references, 2)
 
 
-@pytest.mark.parametrize("settings", [SMALL, CUT])
-def test_threads_folders_and_tables(settings: BovfSettings, references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_threads_folders_and_tables(settings, references, tmp_path)
-
-
-@pytest.mark.parametrize("settings", [SMALL, CUT])
-def test_search(settings: BovfSettings, references: list[Reference]) -> None:
-    comparator.check_search(settings, references)
-
-
-def test_bad_input(references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_bad_input(SMALL, references, tmp_path)
+def test_one_reference_is_too_few(references: list[Reference]) -> None:
     with pytest.raises(LibraryError, match="at least two"):
         SMALL.learn(references[:1], 1)
-
-
-def test_images_without_features(references: list[Reference]) -> None:
-    comparator.check_features_only(SMALL, references)
 
 
 @pytest.mark.parametrize("damped", [False, True])

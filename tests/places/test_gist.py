@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 
 from vplog.data import THUMBNAIL_SIDE, Features
-from vplog.errors import LibraryError
 from vplog.places.gist import GistSettings, gabor_filters
 
-from . import comparator
 from .pictures import nothing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Reference
 
 SETTINGS = GistSettings()
@@ -25,20 +21,6 @@ SETTINGS = GistSettings()
 
 def _of(image: np.ndarray) -> Features:
     return replace(nothing(), thumbnail=np.clip(image, 0, 255).astype(np.uint8))
-
-
-def test_threads_folders_and_tables(references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_threads_folders_and_tables(GistSettings(blocks=2), references, tmp_path)
-
-
-def test_search(references: list[Reference]) -> None:
-    comparator.check_search(SETTINGS, references)
-
-
-def test_bad_input(references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_bad_input(SETTINGS, references, tmp_path)
-    with pytest.raises(LibraryError, match="whole images"):
-        SETTINGS.learn(references[:1], 1).describe(nothing())
 
 
 @pytest.mark.parametrize("orientation", [0, 3, 6])

@@ -15,7 +15,7 @@ import pytest
 from vplog.errors import LibraryError, SettingsError
 from vplog.places import library as lib
 from vplog.places import stored
-from vplog.places.bobb import BobbSettings
+from vplog.places.bobb_paper import PaperBobbSettings
 
 from .pictures import SMALL, noisy, nothing, reference, texture
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Reference
-    from vplog.places.bobb import BobbState
+    from vplog.places.bobb_paper import PaperBobbState
 
 
 def _lists(words: lib.Words) -> list[list[int]]:
@@ -37,7 +37,7 @@ def _l1(descriptors: np.ndarray, library: np.ndarray) -> np.ndarray:
     return np.array([np.abs(b - row).sum(1) for row in a])
 
 
-def test_words_are_near_and_most_of_those_that_exist(state: BobbState, references: list[Reference]) -> None:
+def test_words_are_near_and_most_of_those_that_exist(state: PaperBobbState, references: list[Reference]) -> None:
     library = state.library
     descriptors = np.concatenate([noisy(r.features, 1, 8.0).descriptors[:25] for r in references[:4]])
     words = _lists(library.translate(descriptors))
@@ -55,7 +55,7 @@ def test_words_are_near_and_most_of_those_that_exist(state: BobbState, reference
     assert found / true > 0.9
 
 
-def test_features_of_another_kind_have_no_words(state: BobbState) -> None:
+def test_features_of_another_kind_have_no_words(state: PaperBobbState) -> None:
     flat = np.full((3, 128), 45, np.uint8)
     assert state.library.translate(flat).start.tolist() == [0, 0, 0, 0]
     zeros = np.zeros((2, 128), np.uint8)
@@ -63,7 +63,7 @@ def test_features_of_another_kind_have_no_words(state: BobbState) -> None:
     assert state.library.translate(nothing().descriptors).start.tolist() == [0]
 
 
-def test_own_words_hold_the_feature_itself(state: BobbState) -> None:
+def test_own_words_hold_the_feature_itself(state: PaperBobbState) -> None:
     for feature, each in enumerate(_lists(state.library.words)):
         assert feature in each
         assert each == sorted(set(each))
@@ -79,7 +79,7 @@ def test_repeated_features_are_words_of_each_other() -> None:
     assert all(feature in words[feature] for feature in range(100))
 
 
-def test_words_do_not_depend_on_batches_or_threads(state: BobbState, references: list[Reference]) -> None:
+def test_words_do_not_depend_on_batches_or_threads(state: PaperBobbState, references: list[Reference]) -> None:
     library = state.library
     images = [noisy(r.features, 2).descriptors for r in references]
     whole = _lists(library.translate(np.concatenate(images)))
@@ -113,14 +113,14 @@ def saved(tmp_path: Path, references: list[Reference]) -> Path:
 
 def _refused(folder: Path) -> str:
     with pytest.raises((LibraryError, SettingsError)) as error:
-        BobbSettings().load(folder, 1)
+        PaperBobbSettings().load(folder, 1)
     message = str(error.value)
     assert "\n" not in message
     return message
 
 
 def test_a_reference_without_features_survives_the_disk(saved: Path) -> None:
-    loaded = BobbSettings().load(saved, 1)
+    loaded = PaperBobbSettings().load(saved, 1)
     assert len(loaded.library) == 5
     assert loaded.library.start[-1] == loaded.library.start[-2]
     np.testing.assert_array_equal(loaded.library.references[4].image, texture(5))
@@ -221,7 +221,7 @@ def test_flipped_bytes_are_refused_or_harmless(saved: Path) -> None:
     assert refused > 25
 
 
-def test_a_library_that_cannot_be_written(state: BobbState, tmp_path: Path) -> None:
+def test_a_library_that_cannot_be_written(state: PaperBobbState, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(LibraryError, match="Cannot write the library"):
         state.save(tmp_path / "file")

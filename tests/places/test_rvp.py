@@ -11,15 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vplog.places import bobb, rvp
-from vplog.places.bobb import BobbSettings
+from vplog.places import bobb_paper as bobb
+from vplog.places import rvp
+from vplog.places.bobb_paper import PaperBobbSettings
 
 from .literal import Picture, all_boxes, box_sum, cell_sums, dominant_sum, voting_image
 from .pictures import SMALL, noisy
 
 if TYPE_CHECKING:
     from vplog.data import Int32s, Reference
-    from vplog.places.bobb import BobbState
+    from vplog.places.bobb_paper import PaperBobbState
     from vplog.places.library import Words
 
 
@@ -87,9 +88,9 @@ def test_votes_and_box_agree_with_the_literal_algorithm() -> None:
     assert min(voted, bound) > 60  # the cases are worth the name
 
 
-def test_described_boxes_agree_with_the_literal_algorithm(state: BobbState, references: list[Reference]) -> None:
+def test_described_boxes_agree_with_the_literal_algorithm(state: PaperBobbState, references: list[Reference]) -> None:
     """End to end: library words, random windows, the reference's own partitions, the box that is kept."""
-    tiny = BobbSettings(partitions=3, columns=8, rows=4, features=80, references=2, boxes=2, grid=12)
+    tiny = PaperBobbSettings(partitions=3, columns=8, rows=4, features=80, references=2, boxes=2, grid=12)
     learned = tiny.learn(references[:4], 1)
     features = noisy(references[1].features, 5)
     place = learned.describe(features)
@@ -166,7 +167,7 @@ def test_no_votes_no_box() -> None:
     assert not rvp.dominant_box(np.zeros((8, 8)), np.array([[2, 2]], np.int32)).any()
 
 
-def test_windows_lie_in_the_image_and_have_their_share(state: BobbState) -> None:
+def test_windows_lie_in_the_image_and_have_their_share(state: PaperBobbState) -> None:
     windows = np.array(state._windows)
     assert windows.min() >= 0
     assert windows.max() <= 1

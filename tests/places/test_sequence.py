@@ -48,7 +48,7 @@ def walks(rng: np.random.Generator, query: np.ndarray, count: int, noise: float 
     return (np.exp(-((apart / 1.5) ** 2)) + rng.normal(0, noise, (len(query), count))).astype(np.float32)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     st.integers(1, 40), st.integers(1, 30), st.sampled_from([3, 5, 11]), st.integers(0, 2**32 - 1), st.booleans(),
     st.sampled_from([(1.0, 1.0), (0.5, 2.0), (0.9, 1.1), (1.3, 1.3)]),

@@ -6,35 +6,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 
 from vplog.data import THUMBNAIL_SIDE
-from vplog.errors import LibraryError
 from vplog.places.thumbnail import ThumbnailSettings
 
-from . import comparator
 from .pictures import nothing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Reference
 
 SETTINGS = ThumbnailSettings()
-
-
-def test_threads_folders_and_tables(references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_threads_folders_and_tables(SETTINGS, references, tmp_path)
-
-
-def test_search(references: list[Reference]) -> None:
-    comparator.check_search(SETTINGS, references)
-
-
-def test_bad_input(references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_bad_input(SETTINGS, references, tmp_path)
-    with pytest.raises(LibraryError, match="whole images"):
-        SETTINGS.learn(references[:1], 1).describe(nothing())
 
 
 def test_patches_have_mean_zero_and_deviation_one(references: list[Reference]) -> None:

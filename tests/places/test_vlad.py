@@ -12,30 +12,16 @@ from vplog.errors import LibraryError
 from vplog.places.vlad import VladSettings, Whitening, aggregate
 from vplog.places.vocabulary import learn_vocabulary, root_sift
 
-from . import comparator
 from .pictures import nothing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Reference
 
 SMALL = VladSettings(centres=8, features=250)
 WHOLE = VladSettings(centres=8, features=250, dimensions=None)
 
 
-@pytest.mark.parametrize("settings", [SMALL, WHOLE])
-def test_threads_folders_and_tables(settings: VladSettings, references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_threads_folders_and_tables(settings, references, tmp_path)
-
-
-@pytest.mark.parametrize("settings", [SMALL, WHOLE])
-def test_search(settings: VladSettings, references: list[Reference]) -> None:
-    comparator.check_search(settings, references)
-
-
-def test_bad_input(references: list[Reference], tmp_path: Path) -> None:
-    comparator.check_bad_input(SMALL, references, tmp_path)
+def test_bad_input(references: list[Reference]) -> None:
     with pytest.raises(LibraryError, match="at least two"):
         SMALL.learn(references[:1], 1)
     state = SMALL.learn(references, 1)
@@ -44,11 +30,6 @@ def test_bad_input(references: list[Reference], tmp_path: Path) -> None:
         state.from_arrow(state.to_arrow([broken]))
     with pytest.raises(LibraryError, match="do not fit"):
         state.from_arrow(pa.array([[1.0]], pa.list_(pa.float16(), 1)))
-
-
-@pytest.mark.parametrize("settings", [SMALL, WHOLE])
-def test_images_without_features(settings: VladSettings, references: list[Reference]) -> None:
-    comparator.check_features_only(settings, references)
 
 
 def test_a_vector_is_the_residuals_centre_by_centre(references: list[Reference]) -> None:

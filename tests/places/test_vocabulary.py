@@ -42,7 +42,7 @@ def test_the_seed_draws_other_words() -> None:
     assert not np.array_equal(a.centres, b.centres)
 
 
-@pytest.mark.parametrize(("words", "share"), [(300, 1.0), (2000, 0.99)])
+@pytest.mark.parametrize(("words", "share"), [(300, 1.0), (1100, 0.99)])
 def test_a_feature_has_the_word_of_the_nearest_centre(words: int, share: float) -> None:
     descriptors = _blobs(words, 1)
     vocabulary = Vocabulary(root_sift(descriptors))

@@ -10,6 +10,7 @@ import numpy as np
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import TruthError
+from vplog.evaluate.pairs import poses_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,8 +25,6 @@ ANGLE_DEG = 45.0
 """Degrees; a forward camera of 90 degrees still shares half its view."""
 _OPPOSITE_DEG = 90.0
 """Degrees; beyond it a forward camera looks the other way."""
-_MAX_GAP_S = 2.0
-"""s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def score_closures(
     close a loop with the rows below `stop[i]`, (N,): it is a revisit when one of these is true to it.
     Raises TruthError where no keyframe has a truth.
     """
-    poses, known = _poses_at(truth, keyframes.stamp_ns)
+    poses, known = poses_at(truth, keyframes.stamp_ns)
     if not known.any():
         raise TruthError(
             f"The truth covers none of the {len(known)} keyframes. Give the truth of this drive, in the log's clock."
@@ -101,22 +100,6 @@ def score_closures(
         average_precision_by_inliers=by_inliers[0],
         recall_at_full_precision_by_inliers=by_inliers[1],
     )
-
-
-def _poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
-    """The truth at the stamps, (N, 4, 4), and (N,) where it is known: at a pose of it, or between two near in time."""
-    stamps = truth.stamp_ns
-    poses = np.full((len(at_ns), 4, 4), np.nan)
-    if not len(stamps):
-        return poses, np.zeros(len(at_ns), bool)
-    right = np.minimum(np.searchsorted(stamps, at_ns), len(stamps) - 1)
-    hit = stamps[right] == at_ns
-    left = np.maximum(right - 1, 0)
-    between = (stamps[left] < at_ns) & (at_ns < stamps[right]) & (stamps[right] - stamps[left] <= _MAX_GAP_S * 1e9)
-    poses[hit] = truth.world_from_body[right[hit]]
-    if between.any():
-        poses[between] = geometry.interpolate_at(stamps, truth.world_from_body, at_ns[between])
-    return poses, hit | between
 
 
 def _revisits(poses: Floats, known: Bools, stop: Ints, radius_m: float, angle_deg: float) -> Bools:

@@ -23,10 +23,12 @@ class SiftSettings(Settings):
 
     kind: Literal["sift"] = "sift"
     """Which extractor."""
-    max_features: int = Field(default=1200, ge=1)
-    """Features kept of an image, by response; 800 describe a place, verification takes them all."""
-    contrast_threshold: float = Field(default=0.04, ge=0)
-    """Weakest extremum kept, OpenCV's and Lowe's default."""
+    max_features: int = Field(default=2000, ge=1)
+    """Features kept of an image, by response: enough that 800 of them are large enough to describe a place, while
+    verification takes the 1000 strongest."""
+    contrast_threshold: float = Field(default=0.02, ge=0)
+    """Weakest extremum kept, half of Lowe's: `max_features` bounds a picture rich in contrast, and at night or in fog
+    the weak ones are all there is."""
     max_megapixels: float = Field(default=0.52, ge=0.001)
     """Larger images are reduced to this, half of full HD (960 x 540) as it is; points stay in px of the full image."""
 

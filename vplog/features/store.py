@@ -56,7 +56,7 @@ class FeatureStore:
         except OSError as error:
             raise ResultError(
                 f"Cannot store features in {self._path}: {error.strerror}. "
-                f"They need about {_ROW_BYTES * 1200 // 1000} kB per keyframe while the run lasts."
+                f"They need about {_ROW_BYTES * 2000 // 1000} kB per keyframe while the run lasts."
             ) from None
         self._entries.append((offset, len(features), features.width, features.height, features.thumbnail is not None))
 

@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vplog.places.bobb import BobbSettings
+from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.bovf import BovfSettings
 from vplog.places.fabmap import FabmapSettings
 from vplog.places.gist import GistSettings
@@ -14,7 +15,7 @@ from vplog.places.thumbnail import ThumbnailSettings
 from vplog.places.vlad import VladSettings
 
 PlaceSettings = Annotated[
-    BobbSettings | BovfSettings | FabmapSettings | GistSettings | ThumbnailSettings | VladSettings,
+    BobbSettings | PaperBobbSettings | BovfSettings | FabmapSettings | GistSettings | ThumbnailSettings | VladSettings,
     Field(discriminator="kind"),
 ]
 """Every recogniser, told apart by `kind`."""

@@ -1,231 +1,248 @@
-"""Bag of bounding boxes: Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014.
+"""Bag of bounding boxes, after Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014.
 
-An image is explained by the J references that share most of its features (section III-A) and, on each of them, by
-I boxes: each where the features of one window of the image are found again (section III-B, Algorithm 3).
+The paper's three steps: the references that explain an image (section III-A), boxes on each of them where the features
+of a window are found again (section III-B), places alike where their boxes overlap on the same references (Eq. 1).
+`bobb_paper.py` is the paper to the letter. This one departs from it where that recognises better; each departure is a
+setting: matches weighed by relative distance (`reach`), RootSIFT (`root_sift`), no grain (`least_size`), matches that
+agree in their motion (`agreement`, `agreement_floor`), popular references counting less (`popularity`), weights of the
+references in the score, even windows (`windows_along`), the expected vote in closed form (`expected_votes.py`), boxes
+of one shape that a byte holds (`columns`, `rows`), and a window compared with its own as well as with the best
+(`pairing`).
 """
 
 from __future__ import annotations
 
-import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
 import numba
 import numpy as np
 import pyarrow as pa
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, model_validator
 
 from vplog.errors import LibraryError
-from vplog.places import library as lib
-from vplog.places import rvp, stored
-from vplog.places.search import BoxIndex
+from vplog.places import expected_votes, stored
+from vplog.places.code_search import CodeIndex
+from vplog.places.matches import Matches, WeighedMatchSettings, index_references
+from vplog.places.relearn import relearn
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Reference
+    from vplog.data import Bytes, Features, Floats, Reference
+    from vplog.places.code_search import Uint16s
+    from vplog.places.matches import Matcher
+
+NOBODY = 65_535
+"""The number of no reference, where fewer than J share anything."""
+NOWHERE = 255
+"""The number of no box, where nothing of a window is found."""
 
 
-class BobbSettings(lib.WordSettings):
-    """Bag of bounding boxes with the paper's numbers (section IV)."""
+class BobbSettings(WeighedMatchSettings):
+    """Bag of bounding boxes, improved: J references of 2 + 1 + I bytes each."""
 
     kind: Literal["bobb"] = "bobb"
     """Which recogniser."""
-    references: int = Field(default=4, ge=1)
-    """J: reference images that explain an image."""
-    boxes: int = Field(default=4, ge=1)
-    """I: boxes mined on each of them."""
-    partitions: int = Field(default=200, ge=1)
-    """K: random partitions of a reference."""
-    columns: int = Field(default=32, ge=1, le=256)
-    """M: patches of a partition along the image's width."""
-    rows: int = Field(default=16, ge=1, le=256)
-    """N: patches of a partition along the image's height."""
+    references: int = Field(default=10, ge=1, le=1000)
+    """J: reference images that explain an image. With nine boxes each takes 12 bytes, so ten stay below 128."""
+    candidates: int = Field(default=3, ge=1)
+    """Times J: references whose matches are checked for agreement before the best J are taken."""
+    agreement: float = Field(default=0.07, gt=0)
+    """Matches of an image pair agree when their displacements differ by about this share of the image: a view some
+    metres off moves near things by that much more than far ones."""
+    agreement_floor: float = Field(default=0.3, ge=0, le=1)
+    """Share of its weight that a match keeps when no other agrees; 1 switches agreement off."""
+    popularity: float = Field(default=0.5, ge=0)
+    """References that explain many others count less, by this power of how much they explain; 0 switches it off."""
+    windows_along: int = Field(default=3, ge=1, le=16)
+    """Windows along each side; I is their square."""
     window_share: float = Field(default=0.4, gt=0, le=1)
-    """Side of a window (subimage) as a share of the image's; the paper leaves it open."""
-    grid: int = Field(default=64, ge=1, le=255)
-    """Boxes begin and end on a grid of this many cells along each side, at most 255: one byte a coordinate."""
-    max_box_share: float = Field(default=0.1, gt=0, le=1)
-    """Largest share of the reference a box may cover."""
-    aspects: tuple[PositiveFloat, ...] = Field(default=(0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0), min_length=1)
-    """Width to height of the boxes tried, in units of the image's own; votes never shrink a box, so all are largest."""
-    seed: int = Field(default=0, ge=0)
-    """Of the windows and the partitions."""
+    """Side of a window as a share of the image's: three of them overlap by a quarter of a window."""
+    columns: int = Field(default=16, ge=1, le=255)
+    """Cells of the voting grid along the width; 16 x 12 leave few enough positions for a byte."""
+    rows: int = Field(default=12, ge=1, le=255)
+    """Cells of the voting grid along the height."""
+    patches_x: int = Field(default=32, ge=1)
+    """M: patches of a random partition along the width; the closed form is the average over all of them."""
+    patches_y: int = Field(default=16, ge=1)
+    """N: patches of a random partition along the height."""
+    box_columns: int = Field(default=6, ge=1)
+    """Width of a box in cells. 6 x 3 of 16 x 12 is the largest box within the paper's tenth of the reference."""
+    box_rows: int = Field(default=3, ge=1)
+    """Height of a box in cells."""
+    pairing: Literal["best", "same", "both"] = "both"
+    """Boxes of two places compared on one reference: each with the best of the other's (Eq. 1), with that of the same
+    window, or the mean of the two: the same window tells a place seen from the same spot, the best a nearer view."""
 
     @model_validator(mode="after")
-    def _has_boxes(self) -> Self:
-        if self.grid**2 * self.max_box_share < 1:
+    def _fits_a_byte(self) -> Self:
+        if self.box_columns > self.columns or self.box_rows > self.rows:
             raise ValueError(
-                f"max_box_share {self.max_box_share} of a grid of {self.grid} x {self.grid} is less than one cell"
+                f"a box of {self.box_columns} x {self.box_rows} is larger than the grid of {self.columns} x {self.rows}"
             )
+        if self.box_columns * self.box_rows > 255:
+            raise ValueError(f"a box of {self.box_columns} x {self.box_rows} cells overlaps by more than a byte holds")
+        boxes = (self.columns - self.box_columns + 1) * (self.rows - self.box_rows + 1)
+        if boxes > NOWHERE:
+            raise ValueError(f"{boxes} positions of a box do not fit a byte; use fewer columns or rows")
         return self
 
+    @property
+    def boxes(self) -> int:
+        """I: boxes on each reference."""
+        return self.windows_along**2
+
     def learn(self, references: Iterable[Reference], threads: int) -> BobbState:
-        """Index the references and partition them. Raises LibraryError where they are too few or have no features."""
-        library = lib.build_library(references, self, threads)
-        if len(library) < self.references:
-            raise LibraryError(
-                f"The library has {len(library)} reference images, but places.references is {self.references}. "
-                "Add images, or set places.references lower."
-            )
-        with ThreadPoolExecutor(threads) as pool:
-            patterns = list(pool.map(lambda row: _prepare(library, row, self), range(len(library))))
-        return BobbState(self, library, patterns)
+        """Index the references, and how popular they are. Raises LibraryError where they have no features."""
+        matcher = index_references(references, self)
+        if len(matcher) >= NOBODY:
+            raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
+        with ThreadPoolExecutor(threads, initializer=_one_thread) as pool:
+            explained = list(pool.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
+        return BobbState(self, matcher, _rarity(np.array(explained), self.popularity))
 
     def load(self, folder: Path, threads: int) -> BobbState:
         """A library saved by `BobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        record = stored.read_library_record(folder)
-        state = BobbSettings.read(record["settings"], f"{folder}/library.json").learn(
-            stored.load_references(folder), threads
-        )
-        if state.hash != record["hash"]:
-            raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
-        return state
+        return relearn(BobbSettings, folder, threads)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pattern:
-    """One reference, ready for discovery."""
+def _one_thread() -> None:
+    import faiss
 
-    words: Int32s
-    """(U,) its words, increasing."""
-    posting_start: Int32s
-    posting: Int32s
-    patches: np.ndarray
-    totals: Int32s
-    x_cuts: Int32s
-    y_cuts: Int32s
-    grid_x: Int32s
-    grid_y: Int32s
+    faiss.omp_set_num_threads(1)
 
 
-def _prepare(library: lib.Library, row: int, settings: BobbSettings) -> _Pattern:
-    """Histograms of all patches of all partitions of one reference (Alg. 3 lines 6-9), as postings and totals."""
-    first, last = library.start[row], library.start[row + 1]
-    starts = library.words.start[first : last + 1]
-    values = library.words.values[starts[0] : starts[-1]]
-    owners = np.repeat(np.arange(last - first, dtype=np.int32), np.diff(starts))
-    order = np.argsort(values, kind="stable")
-    words, counts = np.unique(values, return_counts=True)
-    width, height = library.size(row)
-    cuts = rvp.draw_partitions(
-        width,
-        height,
-        settings.partitions,
-        settings.columns,
-        settings.rows,
-        np.random.default_rng([settings.seed, 1, row]),
-    )
-    patches = rvp.patches_of(library.points[first:last], cuts.x_cuts, cuts.y_cuts)
-    return _Pattern(
-        words=words.astype(np.int32),
-        posting_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
-        posting=owners[order],
-        patches=patches,
-        totals=rvp.patch_totals(patches, np.diff(starts), settings.columns * settings.rows),
-        x_cuts=cuts.x_cuts,
-        y_cuts=cuts.y_cuts,
-        grid_x=rvp.grid_cuts(width, settings.grid),
-        grid_y=rvp.grid_cuts(height, settings.grid),
-    )
+@numba.njit(cache=True, nogil=True)
+def _sums(start, weight):
+    """(L,) total weight of each reference's matches, in the order they stand."""
+    result = np.zeros(start.shape[0] - 1)
+    for r in range(result.shape[0]):
+        for e in range(start[r], start[r + 1]):
+            result[r] += weight[e]
+    return result
+
+
+def _explained(matches: Matches) -> Floats:
+    """(L,) shares of an image's matches by reference."""
+    total = _sums(matches.start, matches.weight)
+    return total / max(total.sum(), 1e-9)
+
+
+def _rarity(explained: Floats, power: float) -> Floats:
+    """(L,) weight of each reference: its part in explaining the other references, against an even part, inverted.
+
+    Fig. 9 of the paper: the most frequent reference is chosen ten times as often as half of the others. A part is
+    not taken for less than a twentieth of an even one, which few images cannot tell from none.
+    """
+    part = explained.mean(axis=0) * len(explained)
+    return 1.0 / np.maximum(part, 0.05) ** power
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """The descriptor: J references and I boxes on each."""
+    """The descriptor: J references with a weight each and I boxes on it, 12 bytes a reference with nine boxes."""
 
-    references: Int32s
-    """(J,) best first, -1 where fewer references share anything."""
+    references: Uint16s
+    """(J,) best first, NOBODY where fewer share anything."""
+    weights: Bytes
+    """(J,) how much each explains, in 255ths of the most."""
     boxes: Bytes
-    """(J, I, 4) x0 y0 x1 y1 in cells of the grid, all zero where nothing was found."""
+    """(J, I) number of the box that each window is found in, NOWHERE where it is not."""
 
 
 @dataclass(frozen=True, eq=False)
 class BobbState:
-    """A library, indexed and partitioned. Shared freely between threads."""
+    """A library, indexed. Shared freely between threads."""
 
     settings: BobbSettings
-    library: lib.Library
-    patterns: list[_Pattern]
+    matcher: Matcher
+    rarity: Floats
+    """(L,) weight of each reference."""
+    hash: str = field(init=False)
 
     def __post_init__(self) -> None:
         s = self.settings
-        rng = np.random.default_rng([s.seed, 0])
-        # Alg. 1 line 4 draws windows at random; one draw serves all images, so that no image's noise can change it
-        corners = rng.uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
-        object.__setattr__(self, "_windows", np.concatenate([corners, corners + s.window_share], axis=-1))
-        object.__setattr__(self, "_shapes", rvp.box_shapes(s.grid, s.max_box_share, s.aspects))
-        object.__setattr__(self, "hash", stored.references_hash(self.library.references, s))
+        object.__setattr__(self, "hash", stored.references_hash(self.matcher.references, s))
+        object.__setattr__(self, "_windows", expected_votes.even_windows(s.windows_along, s.window_share))
+        object.__setattr__(self, "_along_x", expected_votes.box_sums(s.columns, s.patches_x, s.box_columns))
+        object.__setattr__(self, "_along_y", expected_votes.box_sums(s.rows, s.patches_y, s.box_rows))
 
-    _windows: Floats = None  # pyright: ignore[reportAssignmentType]
-    _shapes: Int32s = None  # pyright: ignore[reportAssignmentType]
-    hash: str = ""
+    _windows: Floats = field(init=False)
+    _along_x: Floats = field(init=False)
+    _along_y: Floats = field(init=False)
 
     @property
     def bits(self) -> int:
-        """ceil(log2 C(L, J)) for the set of references and, for each of the I x J boxes, which of all boxes it is."""
-        s = self.settings
-        per_box = math.ceil(math.log2(rvp.count_boxes(s.grid, self._shapes)))
-        return math.ceil(math.log2(math.comb(len(self.library), s.references))) + s.references * s.boxes * per_box
+        """Of the references, their weights and boxes, as stored."""
+        return 8 * self.settings.references * (2 + 1 + self.settings.boxes)
 
     @property
     def arrow_type(self) -> pa.DataType:
         s = self.settings
         return pa.struct(
             [
-                pa.field("references", pa.list_(pa.int32(), s.references)),
-                pa.field("boxes", pa.list_(pa.uint8(), s.references * s.boxes * 4)),
+                pa.field("references", pa.list_(pa.uint16(), s.references)),
+                pa.field("weights", pa.list_(pa.uint8(), s.references)),
+                pa.field("boxes", pa.list_(pa.uint8(), s.references * s.boxes)),
             ]
         )
 
     def describe(self, features: Features) -> Place:
         """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
         s = self.settings
-        points = features.points[: s.features]
-        words = self.library.translate(features.descriptors[: s.features])
-        chosen = self._retrieve(words)
-        references = np.full(s.references, -1, np.int32)
-        boxes = np.zeros((s.references, s.boxes, 4), np.uint8)
-        for j, reference in enumerate(chosen):
-            references[j] = reference
-            for i in range(s.boxes):
-                cells = self.votes(words, points, (features.width, features.height), reference, self._windows[j, i])
-                boxes[j, i] = rvp.dominant_box(cells, self._shapes)
-        return Place(references, boxes)
+        references = np.full(s.references, NOBODY, np.uint16)
+        weights = np.zeros(s.references, np.uint8)
+        boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
+        matches = self.matcher.match(features)
+        for j, (reference, share, agreed) in enumerate(self._retrieve(matches)):
+            part = slice(matches.start[reference], matches.start[reference + 1])
+            references[j], weights[j] = reference, max(round(255 * share), 1)
+            boxes[j] = expected_votes.best_boxes(
+                matches.here[part], matches.there[part], agreed, self._windows, self._along_y, self._along_x, NOWHERE
+            )
+        return Place(references, weights, boxes)
 
-    def _retrieve(self, words: lib.Words) -> Int32s:
-        """At most J references, those that share words with most features first (Alg. 1 line 2)."""
-        matches = _count_matches(words.start, words.values, self.library.start)
-        order = np.lexsort((np.arange(len(matches)), -matches))[: self.settings.references]
-        return order[matches[order] > 0].astype(np.int32)
+    def _retrieve(self, matches: Matches) -> list[tuple[int, float, np.ndarray]]:
+        """At most J references that explain most (Alg. 1 line 2), each's share of the best one's, and weights.
 
-    def votes(
-        self, words: lib.Words, points: Float32s, size: tuple[int, int], reference: int, window: Floats
-    ) -> Floats:
-        """(G, G) votes that the features inside a window (x0 y0 x1 y1, shares of the image) give a reference."""
-        pattern = self.patterns[reference]
-        inside = _inside(points, size, window)
-        H, H_size = _histogram(words.start, words.values, inside, pattern.words)
-        return rvp.vote(
-            H, H_size, pattern.posting_start, pattern.posting, pattern.patches, pattern.totals,
-            pattern.x_cuts, pattern.y_cuts, pattern.grid_x, pattern.grid_y,
-        )  # fmt: skip
-
-    def index(self, descriptors: Sequence[Place]) -> BoxIndex:
+        The first 3 J by the sum of weights are looked at again, with matches that agree in their motion counting more.
+        """
         s = self.settings
-        references = np.array([place.references for place in descriptors], np.int32).reshape(-1, s.references)
-        boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1, s.references, s.boxes, 4)
-        return BoxIndex(references, boxes, len(self.library), s.grid)
+        total = _sums(matches.start, matches.weight) * self.rarity
+        found = []
+        for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
+            if total[reference] <= 0.0:
+                break
+            part = slice(matches.start[reference], matches.start[reference + 1])
+            agreed = expected_votes.agreement(
+                matches.here[part], matches.there[part], matches.weight[part], s.agreement, s.agreement_floor
+            )
+            found.append((reference, float(agreed.sum(dtype=np.float64) * self.rarity[reference]), agreed))
+        found.sort(key=lambda one: -one[1])
+        return [(reference, weight / found[0][1], agreed) for reference, weight, agreed in found[: s.references]]
+
+    def index(self, descriptors: Sequence[Place]) -> CodeIndex:
+        s = self.settings
+        overlap = expected_votes.overlaps(
+            s.columns - s.box_columns + 1, s.rows - s.box_rows + 1, s.box_columns, s.box_rows
+        )
+        return CodeIndex(*self._arrays(descriptors), overlap, len(self.matcher), s.pairing)
+
+    def _arrays(self, descriptors: Sequence[Place]) -> tuple[Uint16s, Bytes, Bytes]:
+        s = self.settings
+        return (
+            np.array([place.references for place in descriptors], np.uint16).reshape(-1, s.references),
+            np.array([place.weights for place in descriptors], np.uint8).reshape(-1, s.references),
+            np.array([place.boxes for place in descriptors], np.uint8).reshape(-1, s.references, s.boxes),
+        )
 
     def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
-        s = self.settings
-        references = np.array([place.references for place in descriptors], np.int32).reshape(-1)
-        boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1)
         columns = [
-            pa.FixedSizeListArray.from_arrays(pa.array(references), s.references),
-            pa.FixedSizeListArray.from_arrays(pa.array(boxes), s.references * s.boxes * 4),
+            pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), part.type.list_size)
+            for values, part in zip(self._arrays(descriptors), self.arrow_type, strict=True)
         ]
         return pa.StructArray.from_arrays(columns, fields=list(self.arrow_type))
 
@@ -234,53 +251,21 @@ class BobbState:
         s = self.settings
         if not column.type.equals(self.arrow_type):
             raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
-        lists = column.field("references"), column.field("boxes")
+        lists = [column.field(part.name) for part in self.arrow_type]
         if column.null_count or any(part.null_count or part.flatten().null_count for part in lists):
             raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
-        references = lists[0].flatten().to_numpy().reshape(-1, s.references)
-        boxes = lists[1].flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
-        if len(references) and (references.max() >= len(self.library) or references.min() < -1):
+        references, weights, boxes = (part.flatten().to_numpy() for part in lists)
+        if np.any((references >= len(self.matcher)) & (references != NOBODY)):
             raise LibraryError("The descriptors name references that this library does not have.")
-        if len(boxes) and boxes.max() > s.grid:
-            raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
-        return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
+        positions = (s.columns - s.box_columns + 1) * (s.rows - s.box_rows + 1)
+        if np.any((boxes >= positions) & (boxes != NOWHERE)):
+            raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")
+        parts = (
+            references.reshape(-1, s.references),
+            weights.reshape(-1, s.references),
+            boxes.reshape(-1, s.references, s.boxes),
+        )
+        return [Place(r, w, b) for r, w, b in zip(*parts, strict=True)]
 
     def save(self, folder: Path) -> None:
-        stored.save_references(self.library.references, self.settings, folder)
-
-
-def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:
-    width, height = size
-    x, y = (points[:, 0] + 0.5) / width, (points[:, 1] + 0.5) / height
-    return (x >= window[0]) & (x < window[2]) & (y >= window[1]) & (y < window[3])
-
-
-@numba.njit(cache=True, nogil=True)
-def _count_matches(start, words, reference_start):
-    """(L,) int32: features with a word among each reference's features; a feature counts once a reference."""
-    L = reference_start.shape[0] - 1
-    matches = np.zeros(L, np.int32)
-    for f in range(start.shape[0] - 1):
-        last = -1
-        for e in range(start[f], start[f + 1]):
-            reference = np.searchsorted(reference_start, words[e], side="right") - 1
-            if reference != last:  # words increase, so those of one reference stand together
-                matches[reference] += 1
-                last = reference
-    return matches
-
-
-@numba.njit(cache=True, nogil=True)
-def _histogram(start, words, inside, known):
-    """(U,) int32 counts of the reference's words among the features inside, and the count of all their words."""
-    H = np.zeros(known.shape[0], np.int32)
-    size = 0
-    for f in range(start.shape[0] - 1):
-        if not inside[f]:
-            continue
-        size += start[f + 1] - start[f]
-        for e in range(start[f], start[f + 1]):
-            u = np.searchsorted(known, words[e])
-            if u < known.shape[0] and known[u] == words[e]:
-                H[u] += 1
-    return H, size
+        stored.save_references(self.matcher.references, self.settings, folder)

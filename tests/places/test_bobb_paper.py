@@ -1,0 +1,229 @@
+"""The recogniser's state: the same whatever the threads, on disk and in tables, and it finds what it has seen."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from vplog.data import Features
+from vplog.errors import LibraryError, SettingsError
+from vplog.places import rvp
+from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState, Place
+
+from .literal import all_boxes
+from .pictures import SMALL, noisy, nothing, reference
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Reference
+
+
+def _equal(a: Place, b: Place) -> bool:
+    return np.array_equal(a.references, b.references) and np.array_equal(a.boxes, b.boxes)
+
+
+@pytest.fixture(scope="module")
+def queries(references: list[Reference]) -> list[Features]:
+    seen = [noisy(r.features, seed) for seed, r in enumerate(references)]
+    return [*seen, reference(50).features, nothing()]
+
+
+@pytest.fixture(scope="module")
+def places(state: PaperBobbState, queries: list[Features]) -> list[Place]:
+    return [state.describe(features) for features in queries]
+
+
+def test_describing_from_many_threads_changes_nothing(
+    state: PaperBobbState, queries: list[Features], places: list[Place]
+) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        again = list(pool.map(state.describe, queries * 2))
+    assert all(map(_equal, again, places * 2))
+
+
+def test_learning_with_many_threads_changes_nothing(state: PaperBobbState, references: list[Reference]) -> None:
+    words = state.library.words
+    for threads in (1, 4):
+        other = SMALL.learn(references, threads)
+        assert other.hash == state.hash
+        np.testing.assert_array_equal(other.library.words.start, words.start)
+        np.testing.assert_array_equal(other.library.words.values, words.values)
+        for a, b in zip(other.patterns, state.patterns, strict=True):
+            for name in a.__dataclass_fields__:
+                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_a_saved_library_describes_the_same(
+    state: PaperBobbState, queries: list[Features], places: list[Place], tmp_path: Path
+) -> None:
+    state.save(tmp_path / "a" / "library")
+    loaded = PaperBobbSettings().load(tmp_path / "a" / "library", 2)  # the folder's settings count, not these
+    assert loaded.settings == SMALL
+    assert loaded.hash == state.hash
+    assert all(map(_equal, map(loaded.describe, queries), places))
+    loaded.save(tmp_path / "b")
+    for name in ("library.json", "features.parquet", "references.parquet"):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / "library" / name).read_bytes()
+
+
+def test_seeds_give_other_windows_and_partitions(references: list[Reference]) -> None:
+    a, b = (
+        PaperBobbSettings(partitions=5, features=100, references=2, seed=seed).learn(references[:3], 1)
+        for seed in (0, 1)
+    )
+    assert a.hash != b.hash
+    assert not np.array_equal(a._windows, b._windows)
+    assert not np.array_equal(a.patterns[0].x_cuts, b.patterns[0].x_cuts)
+    assert not np.array_equal(a.patterns[0].x_cuts, a.patterns[1].x_cuts)
+
+
+def test_the_hash_tells_libraries_apart(state: PaperBobbState, references: list[Reference]) -> None:
+    assert SMALL.learn(references[::-1], 1).hash != state.hash
+    assert SMALL.learn(references[:-1], 1).hash != state.hash
+
+
+@pytest.mark.parametrize(
+    "change", [{}, {"grid": 13, "boxes": 2}, {"references": 2, "max_box_share": 0.3, "aspects": (1.0,), "grid": 9}]
+)
+def test_bits_of_a_place(references: list[Reference], change: dict[str, Any]) -> None:
+    settings = PaperBobbSettings(**{"partitions": 1, "features": 20, "grid": 20, **change})
+    state = settings.learn(references[:7], 1)
+    boxes = len(all_boxes(settings.grid, rvp.box_shapes(settings.grid, settings.max_box_share, settings.aspects))) + 1
+    sets = math.factorial(7) // math.factorial(settings.references) // math.factorial(7 - settings.references)
+    per_box = next(bits for bits in range(64) if 2**bits >= boxes)
+    per_set = next(bits for bits in range(64) if 2**bits >= sets)
+    assert state.bits == per_set + settings.references * settings.boxes * per_box
+
+
+def test_the_papers_references_take_22_bits(references: list[Reference]) -> None:
+    """Section V: log2 C(100, 4) is told in 22 bits."""
+    many = [references[row % 12] for row in range(100)]
+    state = PaperBobbSettings(partitions=1, features=3).learn(many, 1)
+    per_box = math.ceil(math.log2(rvp.count_boxes(64, rvp.box_shapes(64, 0.1, state.settings.aspects))))
+    assert state.bits == 22 + 16 * per_box
+
+
+def test_boxes_are_small_and_where_references_are(places: list[Place]) -> None:
+    found = 0
+    for place in places:
+        assert place.boxes.shape == (4, 4, 4)
+        x0, y0, x1, y1 = np.moveaxis(place.boxes.astype(int), -1, 0)
+        assert ((x0 <= x1) & (y0 <= y1)).all()
+        assert place.boxes.max() <= SMALL.grid
+        assert ((x1 - x0) * (y1 - y0) <= SMALL.max_box_share * SMALL.grid**2).all()
+        assert not place.boxes[place.references < 0].any()
+        chosen = place.references[place.references >= 0]
+        assert len(set(chosen.tolist())) == len(chosen)
+        found += (x1 > x0).sum()
+    assert found > 100
+
+
+def test_an_image_without_features_is_like_nothing(state: PaperBobbState, places: list[Place]) -> None:
+    empty = places[-1]
+    assert (empty.references == -1).all()
+    assert not empty.boxes.any()
+    index = state.index(places)
+    assert not index.scores(empty).any()
+    assert len(index.query(empty, 5).rows) == 0
+    assert all(index.scores(place)[-1] == 0 for place in places)
+
+
+def test_fewer_references_than_asked_for(state: PaperBobbState, references: list[Reference]) -> None:
+    f = references[2].features
+    one = Features(f.points[:1], f.sizes[:1], f.descriptors[:1], f.depth_m[:1], f.width, f.height)
+    place = state.describe(one)
+    assert 2 in place.references  # and its neighbours perhaps
+    assert place.references[-1] == -1
+    assert not place.boxes[place.references == -1].any()
+
+
+def test_the_reference_itself_explains_an_image_best(places: list[Place]) -> None:
+    assert [int(place.references[0]) for place in places[:12]] == list(range(12))
+
+
+def test_a_place_is_most_like_itself(
+    state: PaperBobbState, references: list[Reference], queries: list[Features], places: list[Place]
+) -> None:
+    index = state.index([state.describe(r.features) for r in references])
+    for row, r in enumerate(references):
+        assert index.query(state.describe(r.features), 1).rows.tolist() == [row]
+    for row in range(12):  # and so are its noisy views
+        assert index.query(places[row], 1).rows.tolist() == [row]
+
+
+def test_places_survive_a_parquet_file(state: PaperBobbState, places: list[Place], tmp_path: Path) -> None:
+    pq.write_table(pa.table({"place": state.to_arrow(places)}), tmp_path / "d.parquet")
+    column = pq.read_table(tmp_path / "d.parquet")["place"].combine_chunks()
+    assert column.type == state.arrow_type
+    back = state.from_arrow(column)
+    assert all(map(_equal, back, places))
+    assert all(map(_equal, state.from_arrow(column.slice(3, 5)), places[3:8]))
+    np.testing.assert_array_equal(state.index(back).scores(places[4]), state.index(places).scores(places[4]))
+
+
+def test_no_places_at_all(state: PaperBobbState, places: list[Place]) -> None:
+    assert state.from_arrow(state.to_arrow([])) == []
+    index = state.index([])
+    assert len(index) == 0
+    assert len(index.query(places[0], 3).rows) == 0
+
+
+def test_columns_of_other_libraries_are_refused(state: PaperBobbState, places: list[Place]) -> None:
+    good = state.to_arrow(places)
+    for column in (pa.array([1, 2]), good.field("references"), good.cast(pa.struct([("a", pa.int32())]), safe=False)):
+        with pytest.raises(LibraryError, match="do not fit"):
+            state.from_arrow(column)
+    boxes = places[0].boxes
+    for wrong in (12, -2, 2**31 - 1):
+        with pytest.raises(LibraryError, match="references that this library does not have"):
+            state.from_arrow(state.to_arrow([Place(np.array([0, 1, wrong, -1], np.int32), boxes)]))
+    with pytest.raises(LibraryError, match="beyond the grid"):
+        state.from_arrow(state.to_arrow([Place(places[0].references, np.full((4, 4, 4), 65, np.uint8))]))
+
+
+def test_columns_with_empty_rows_are_refused(state: PaperBobbState, places: list[Place]) -> None:
+    rows = state.to_arrow(places).to_pylist()
+    for damage in (
+        None,
+        {"references": None, "boxes": rows[0]["boxes"]},
+        {"references": rows[0]["references"], "boxes": None},
+        {"references": [0, None, 1, 2], "boxes": rows[0]["boxes"]},
+    ):
+        with pytest.raises(LibraryError):
+            state.from_arrow(pa.array([*rows, damage], state.arrow_type))
+
+
+def test_too_small_a_library_is_refused(references: list[Reference]) -> None:
+    with pytest.raises(LibraryError, match=r"3 reference images, but places\.references is 4"):
+        SMALL.learn(references[:3], 1)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"grid": 256},
+        {"grid": 3},  # a tenth of nine cells is none
+        {"columns": 257},
+        {"rows": 0},
+        {"references": 0},
+        {"boxes": 0},
+        {"partitions": 0},
+        {"window_share": 1.1},
+        {"max_box_share": 0.0},
+        {"aspects": []},
+        {"aspects": [-1.0]},
+        {"features": 0},
+        {"neighbours": 0},
+        {"seed": -1},
+    ],
+)
+def test_settings_that_cannot_work(change: dict[str, Any]) -> None:
+    with pytest.raises(SettingsError):
+        PaperBobbSettings.read(change, "test")

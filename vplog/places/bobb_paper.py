@@ -1,0 +1,286 @@
+"""Bag of bounding boxes: Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014.
+
+An image is explained by the J references that share most of its features (section III-A) and, on each of them, by
+I boxes: each where the features of one window of the image are found again (section III-B, Algorithm 3).
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Self
+
+import numba
+import numpy as np
+import pyarrow as pa
+from pydantic import Field, PositiveFloat, model_validator
+
+from vplog.errors import LibraryError
+from vplog.places import library as lib
+from vplog.places import rvp, stored
+from vplog.places.search import BoxIndex
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Reference
+
+
+class PaperBobbSettings(lib.WordSettings):
+    """Bag of bounding boxes with the paper's numbers (section IV)."""
+
+    kind: Literal["bobb_paper"] = "bobb_paper"
+    """Which recogniser."""
+    references: int = Field(default=4, ge=1)
+    """J: reference images that explain an image."""
+    boxes: int = Field(default=4, ge=1)
+    """I: boxes mined on each of them."""
+    partitions: int = Field(default=200, ge=1)
+    """K: random partitions of a reference."""
+    columns: int = Field(default=32, ge=1, le=256)
+    """M: patches of a partition along the image's width."""
+    rows: int = Field(default=16, ge=1, le=256)
+    """N: patches of a partition along the image's height."""
+    window_share: float = Field(default=0.4, gt=0, le=1)
+    """Side of a window (subimage) as a share of the image's; the paper leaves it open."""
+    grid: int = Field(default=64, ge=1, le=255)
+    """Boxes begin and end on a grid of this many cells along each side, at most 255: one byte a coordinate."""
+    max_box_share: float = Field(default=0.1, gt=0, le=1)
+    """Largest share of the reference a box may cover."""
+    aspects: tuple[PositiveFloat, ...] = Field(default=(0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0), min_length=1)
+    """Width to height of the boxes tried, in units of the image's own; votes never shrink a box, so all are largest."""
+    seed: int = Field(default=0, ge=0)
+    """Of the windows and the partitions."""
+
+    @model_validator(mode="after")
+    def _has_boxes(self) -> Self:
+        if self.grid**2 * self.max_box_share < 1:
+            raise ValueError(
+                f"max_box_share {self.max_box_share} of a grid of {self.grid} x {self.grid} is less than one cell"
+            )
+        return self
+
+    def learn(self, references: Iterable[Reference], threads: int) -> PaperBobbState:
+        """Index the references and partition them. Raises LibraryError where they are too few or have no features."""
+        library = lib.build_library(references, self, threads)
+        if len(library) < self.references:
+            raise LibraryError(
+                f"The library has {len(library)} reference images, but places.references is {self.references}. "
+                "Add images, or set places.references lower."
+            )
+        with ThreadPoolExecutor(threads) as pool:
+            patterns = list(pool.map(lambda row: _prepare(library, row, self), range(len(library))))
+        return PaperBobbState(self, library, patterns)
+
+    def load(self, folder: Path, threads: int) -> PaperBobbState:
+        """A library saved by `PaperBobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
+        record = stored.read_library_record(folder)
+        state = PaperBobbSettings.read(record["settings"], f"{folder}/library.json").learn(
+            stored.load_references(folder), threads
+        )
+        if state.hash != record["hash"]:
+            raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
+        return state
+
+
+@dataclass(frozen=True, eq=False)
+class _Pattern:
+    """One reference, ready for discovery."""
+
+    words: Int32s
+    """(U,) its words, increasing."""
+    posting_start: Int32s
+    posting: Int32s
+    patches: np.ndarray
+    totals: Int32s
+    x_cuts: Int32s
+    y_cuts: Int32s
+    grid_x: Int32s
+    grid_y: Int32s
+
+
+def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> _Pattern:
+    """Histograms of all patches of all partitions of one reference (Alg. 3 lines 6-9), as postings and totals."""
+    first, last = library.start[row], library.start[row + 1]
+    starts = library.words.start[first : last + 1]
+    values = library.words.values[starts[0] : starts[-1]]
+    owners = np.repeat(np.arange(last - first, dtype=np.int32), np.diff(starts))
+    order = np.argsort(values, kind="stable")
+    words, counts = np.unique(values, return_counts=True)
+    width, height = library.size(row)
+    cuts = rvp.draw_partitions(
+        width,
+        height,
+        settings.partitions,
+        settings.columns,
+        settings.rows,
+        np.random.default_rng([settings.seed, 1, row]),
+    )
+    patches = rvp.patches_of(library.points[first:last], cuts.x_cuts, cuts.y_cuts)
+    return _Pattern(
+        words=words.astype(np.int32),
+        posting_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        posting=owners[order],
+        patches=patches,
+        totals=rvp.patch_totals(patches, np.diff(starts), settings.columns * settings.rows),
+        x_cuts=cuts.x_cuts,
+        y_cuts=cuts.y_cuts,
+        grid_x=rvp.grid_cuts(width, settings.grid),
+        grid_y=rvp.grid_cuts(height, settings.grid),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """The descriptor: J references and I boxes on each."""
+
+    references: Int32s
+    """(J,) best first, -1 where fewer references share anything."""
+    boxes: Bytes
+    """(J, I, 4) x0 y0 x1 y1 in cells of the grid, all zero where nothing was found."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperBobbState:
+    """A library, indexed and partitioned. Shared freely between threads."""
+
+    settings: PaperBobbSettings
+    library: lib.Library
+    patterns: list[_Pattern]
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        rng = np.random.default_rng([s.seed, 0])
+        # Alg. 1 line 4 draws windows at random; one draw serves all images, so that no image's noise can change it
+        corners = rng.uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
+        object.__setattr__(self, "_windows", np.concatenate([corners, corners + s.window_share], axis=-1))
+        object.__setattr__(self, "_shapes", rvp.box_shapes(s.grid, s.max_box_share, s.aspects))
+        object.__setattr__(self, "hash", stored.references_hash(self.library.references, s))
+
+    _windows: Floats = None  # pyright: ignore[reportAssignmentType]
+    _shapes: Int32s = None  # pyright: ignore[reportAssignmentType]
+    hash: str = ""
+
+    @property
+    def bits(self) -> int:
+        """ceil(log2 C(L, J)) for the set of references and, for each of the I x J boxes, which of all boxes it is."""
+        s = self.settings
+        per_box = math.ceil(math.log2(rvp.count_boxes(s.grid, self._shapes)))
+        return math.ceil(math.log2(math.comb(len(self.library), s.references))) + s.references * s.boxes * per_box
+
+    @property
+    def arrow_type(self) -> pa.DataType:
+        s = self.settings
+        return pa.struct(
+            [
+                pa.field("references", pa.list_(pa.int32(), s.references)),
+                pa.field("boxes", pa.list_(pa.uint8(), s.references * s.boxes * 4)),
+            ]
+        )
+
+    def describe(self, features: Features) -> Place:
+        """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
+        s = self.settings
+        points = features.points[: s.features]
+        words = self.library.translate(features.descriptors[: s.features])
+        chosen = self._retrieve(words)
+        references = np.full(s.references, -1, np.int32)
+        boxes = np.zeros((s.references, s.boxes, 4), np.uint8)
+        for j, reference in enumerate(chosen):
+            references[j] = reference
+            for i in range(s.boxes):
+                cells = self.votes(words, points, (features.width, features.height), reference, self._windows[j, i])
+                boxes[j, i] = rvp.dominant_box(cells, self._shapes)
+        return Place(references, boxes)
+
+    def _retrieve(self, words: lib.Words) -> Int32s:
+        """At most J references, those that share words with most features first (Alg. 1 line 2)."""
+        matches = _count_matches(words.start, words.values, self.library.start)
+        order = np.lexsort((np.arange(len(matches)), -matches))[: self.settings.references]
+        return order[matches[order] > 0].astype(np.int32)
+
+    def votes(
+        self, words: lib.Words, points: Float32s, size: tuple[int, int], reference: int, window: Floats
+    ) -> Floats:
+        """(G, G) votes that the features inside a window (x0 y0 x1 y1, shares of the image) give a reference."""
+        pattern = self.patterns[reference]
+        inside = _inside(points, size, window)
+        H, H_size = _histogram(words.start, words.values, inside, pattern.words)
+        return rvp.vote(
+            H, H_size, pattern.posting_start, pattern.posting, pattern.patches, pattern.totals,
+            pattern.x_cuts, pattern.y_cuts, pattern.grid_x, pattern.grid_y,
+        )  # fmt: skip
+
+    def index(self, descriptors: Sequence[Place]) -> BoxIndex:
+        s = self.settings
+        references = np.array([place.references for place in descriptors], np.int32).reshape(-1, s.references)
+        boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1, s.references, s.boxes, 4)
+        return BoxIndex(references, boxes, len(self.library), s.grid)
+
+    def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
+        s = self.settings
+        references = np.array([place.references for place in descriptors], np.int32).reshape(-1)
+        boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1)
+        columns = [
+            pa.FixedSizeListArray.from_arrays(pa.array(references), s.references),
+            pa.FixedSizeListArray.from_arrays(pa.array(boxes), s.references * s.boxes * 4),
+        ]
+        return pa.StructArray.from_arrays(columns, fields=list(self.arrow_type))
+
+    def from_arrow(self, column: pa.Array) -> list[Place]:
+        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
+        s = self.settings
+        if not column.type.equals(self.arrow_type):
+            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
+        lists = column.field("references"), column.field("boxes")
+        if column.null_count or any(part.null_count or part.flatten().null_count for part in lists):
+            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        references = lists[0].flatten().to_numpy().reshape(-1, s.references)
+        boxes = lists[1].flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
+        if len(references) and (references.max() >= len(self.library) or references.min() < -1):
+            raise LibraryError("The descriptors name references that this library does not have.")
+        if len(boxes) and boxes.max() > s.grid:
+            raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
+        return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.library.references, self.settings, folder)
+
+
+def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:
+    width, height = size
+    x, y = (points[:, 0] + 0.5) / width, (points[:, 1] + 0.5) / height
+    return (x >= window[0]) & (x < window[2]) & (y >= window[1]) & (y < window[3])
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_matches(start, words, reference_start):
+    """(L,) int32: features with a word among each reference's features; a feature counts once a reference."""
+    L = reference_start.shape[0] - 1
+    matches = np.zeros(L, np.int32)
+    for f in range(start.shape[0] - 1):
+        last = -1
+        for e in range(start[f], start[f + 1]):
+            reference = np.searchsorted(reference_start, words[e], side="right") - 1
+            if reference != last:  # words increase, so those of one reference stand together
+                matches[reference] += 1
+                last = reference
+    return matches
+
+
+@numba.njit(cache=True, nogil=True)
+def _histogram(start, words, inside, known):
+    """(U,) int32 counts of the reference's words among the features inside, and the count of all their words."""
+    H = np.zeros(known.shape[0], np.int32)
+    size = 0
+    for f in range(start.shape[0] - 1):
+        if not inside[f]:
+            continue
+        size += start[f + 1] - start[f]
+        for e in range(start[f], start[f + 1]):
+            u = np.searchsorted(known, words[e])
+            if u < known.shape[0] and known[u] == words[e]:
+                H[u] += 1
+    return H, size
