@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vplog.places import expected_votes
-from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, _rarity
+from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, Place, _rarity
 from vplog.places.code_search import CodeIndex
 from vplog.places.matches import WeighedMatchSettings, _itself, _weigh, large_enough
 
@@ -186,7 +186,7 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
     boxes[rng.random(boxes.shape) < 0.1] = NOWHERE
     table = expected_votes.overlaps(5, 4, 3, 2)
     index = CodeIndex(references, weights, boxes, table, L, pairing)  # pyright: ignore[reportArgumentType]
-    query = type("Place", (), {"references": references[0], "weights": weights[0], "boxes": boxes[0]})()
+    query = Place(references[0], weights[0], boxes[0])
     unit = weights / np.maximum(np.linalg.norm(weights.astype(float), axis=1, keepdims=True), 1)
     scores = index.scores(query, stop)
     assert len(scores) == min(stop, count)

@@ -56,7 +56,7 @@ class CodeIndex:
         entries = entries[: self._list_start[-1]]
         self._list_place = (entries // max(references.shape[1], 1)).astype(np.int32)
         self._list_weight = weights.reshape(-1)[entries]
-        self._list_boxes = np.ascontiguousarray(boxes.reshape(len(flat), -1)[entries])
+        self._list_boxes = np.ascontiguousarray(boxes.reshape(len(flat), boxes.shape[-1])[entries])
         self._length = np.sqrt(np.maximum((weights.astype(np.int64) ** 2).sum(axis=1), 1))
 
     def __len__(self) -> int:
