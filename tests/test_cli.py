@@ -509,7 +509,11 @@ def test_standing_still_all_the_time_is_said(verb: Verb, drive: Drive, tmp_path:
 
 def begun(drive: Drive, out: Path) -> subprocess.Popen[str]:
     """A run that has begun to store features."""
-    process = started("run", drive.log, "-o", out, *QUICK, "--threads", 1)
+
+    def heed_interrupts() -> None:  # a shell that starts the tests in the background has them ignored
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    process = started("run", drive.log, "-o", out, *QUICK, "--threads", 1, preexec_fn=heed_interrupts)
     scratch = out / ".features"
     while not (scratch.exists() and scratch.stat().st_size):
         assert process.poll() is None, process.communicate()
