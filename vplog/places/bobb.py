@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
+import faiss
 import numba
 import numpy as np
 import pyarrow as pa
@@ -100,19 +101,13 @@ class BobbSettings(WeighedMatchSettings):
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
             raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
-        with ThreadPoolExecutor(threads, initializer=_one_thread) as pool:
+        with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
             explained = list(pool.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
         return BobbState(self, matcher, _rarity(np.array(explained), self.popularity))
 
     def load(self, folder: Path, threads: int) -> BobbState:
         """A library saved by `BobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
         return relearn(BobbSettings, folder, threads)
-
-
-def _one_thread() -> None:
-    import faiss
-
-    faiss.omp_set_num_threads(1)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -19,6 +19,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp, stored
+from vplog.places.relearn import relearn
 from vplog.places.search import BoxIndex
 
 if TYPE_CHECKING:
@@ -76,13 +77,7 @@ class PaperBobbSettings(lib.WordSettings):
 
     def load(self, folder: Path, threads: int) -> PaperBobbState:
         """A library saved by `PaperBobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        record = stored.read_library_record(folder)
-        state = PaperBobbSettings.read(record["settings"], f"{folder}/library.json").learn(
-            stored.load_references(folder), threads
-        )
-        if state.hash != record["hash"]:
-            raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
-        return state
+        return relearn(PaperBobbSettings, folder, threads)
 
 
 @dataclass(frozen=True, eq=False)

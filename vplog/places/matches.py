@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import faiss
 import numba
 import numpy as np
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.stored import strongest
+from vplog.places.library import hnsw
 from vplog.places.vocabulary import root_sift
 from vplog.settings import Settings
 
@@ -115,25 +114,15 @@ def shares(features: Features) -> Float32s:
 
 def index_references(references: Iterable[Reference], settings: WeighedMatchSettings) -> Matcher:
     """Index the references' features. Raises LibraryError where they have none, or are too many to be numbered."""
-    kept = [strongest(replace(r, features=large_enough(r.features, settings)), settings.features) for r in references]
+    kept = [replace(r, features=large_enough(r.features, settings)) for r in references]
     if not kept:
         raise LibraryError("A library needs at least one reference image; none was given.")
     counts = [len(reference.features) for reference in kept]
     if sum(counts) == 0:
         raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")
     descriptors = np.concatenate([reference.features.descriptors for reference in kept])
-    # bytes in the index, and whole-number distances below 2^24: the same in any order of summing
-    index: Any = faiss.index_factory(descriptors.shape[1], f"HNSW{settings.hnsw_links}_SQ8_direct")
     values = _comparable(descriptors, settings)
-    index.train(values[:1])
-    index.hnsw.efConstruction = settings.hnsw_ef_construction
-    index.hnsw.efSearch = settings.neighbours
-    threads = faiss.omp_get_max_threads()
-    faiss.omp_set_num_threads(1)  # the order of insertion decides the graph
-    try:
-        index.add(values)
-    finally:
-        faiss.omp_set_num_threads(threads)
+    index = hnsw(values, settings.hnsw_links, settings.hnsw_ef_construction, settings.neighbours)
     points = np.concatenate([shares(reference.features) for reference in kept])
     owner = np.repeat(np.arange(len(kept), dtype=np.int32), counts)
     return Matcher(kept, settings, owner, points, index)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Protocol
 import numba
 import numpy as np
 
-from vplog.data import Ranking
+from vplog.places.dense import best_rows
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Int32s
+    from vplog.data import Bytes, Float32s, Int32s, Ranking
 
 
 class BoxPlace(Protocol):
@@ -45,12 +45,7 @@ class BoxIndex:
 
     def query(self, descriptor: BoxPlace, k: int, stop: int | None = None) -> Ranking:
         """The k best places below row `stop` that overlap at all; ties go to the earlier row."""
-        score = self.scores(descriptor, stop)
-        rows = np.flatnonzero(score > 0)
-        if len(rows) > k:  # everything as good as the k-th, so that ties do not depend on the partition
-            rows = rows[score[rows] >= -np.partition(-score[rows], k - 1)[k - 1]]
-        rows = rows[np.lexsort((rows, -score[rows]))][:k]
-        return Ranking(rows.astype(np.int32), score[rows])
+        return best_rows(self.scores(descriptor, stop), k)
 
 
 @numba.njit(cache=True, nogil=True)
