@@ -18,10 +18,13 @@ from vplog.evaluate.place_truth import TruthChoice
 from vplog.evaluate.retrieval import rank_queries, score_retrieval
 from vplog.features.sift import SiftSettings
 from vplog.features.store import FeatureStore
+from vplog.methods import known_methods, read_method, split_methods
 from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.sequence import SequenceSettings, match_sequences
+from vplog.trials import evaluate_method, stored_bytes
+from vplog.walks import candidate_stops, extract_walk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -29,8 +32,8 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.compare import Walk
     from vplog.demo.record import Drive
+    from vplog.walks import Walk
 
     Verb = Callable[..., Said]
 
@@ -71,7 +74,7 @@ def store(tmp_path: Path) -> Iterator[FeatureStore]:
 @pytest.fixture(scope="module")
 def day(walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
     with FeatureStore(tmp_path_factory.mktemp("day") / "features") as found:
-        yield compare.extract_walk(logs.open(walks[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), threads=2)
+        yield extract_walk(logs.open(walks[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), threads=2)
 
 
 def without_times(record: dict[str, Any]) -> dict[str, Any]:
@@ -88,7 +91,7 @@ def without_times(record: dict[str, Any]) -> dict[str, Any]:
 def test_a_walk_holds_the_chosen_frames(walks: tuple[Path, Path], store: FeatureStore) -> None:
     log = logs.open(walks[0])
     seen = []
-    walk = compare.extract_walk(log, SIFT, store, np.array([2, 3, 7]), np.array([3]), 2, lambda *at: seen.append(at))
+    walk = extract_walk(log, SIFT, store, np.array([2, 3, 7]), np.array([3]), 2, lambda *at: seen.append(at))
     assert walk.frames.tolist() == [2, 3, 7]
     assert walk.stamp_ns.tolist() == log.stamps()[[2, 3, 7]].tolist()
     assert [reference.stamp_ns for reference in walk.references] == [int(log.stamps()[3])]
@@ -107,20 +110,20 @@ def test_frames_keep_their_numbers_where_others_are_damaged(
     for number in range(4):
         data = (walks[0] / f"{number}.png").read_bytes()
         (folder / f"{number}.png").write_bytes(data[:100] if number == 1 else data)
-    walk = compare.extract_walk(logs.open(folder), SIFT, store, chosen=np.array([1, 2]))
+    walk = extract_walk(logs.open(folder), SIFT, store, chosen=np.array([1, 2]))
     assert walk.frames.tolist() == [0, 2, 3]
     assert len(walk.references) == 1
     assert "1 of 4 frames could not be decoded" in walk.warnings[0]
     with pytest.raises(LogError, match="none of 1 frames could be decoded"):
-        compare.extract_walk(logs.open(folder), SIFT, store, np.array([1]))
+        extract_walk(logs.open(folder), SIFT, store, np.array([1]))
 
 
 def test_threads_and_scratch_change_nothing(day: Walk, tmp_path: Path) -> None:
     """A drive against itself: frames 4 older or more, of which those 4 to 6 older are called true."""
-    stops = compare.candidate_stops(day.frames, day.frames, 4)
+    stops = candidate_stops(day.frames, day.frames, 4)
     truth = index_pairs(day.frames - 5, day.frames, 1)
     results = [
-        compare.evaluate_method(BOBB, day.references, day, day, truth, stops, threads=threads, scratch=scratch)
+        evaluate_method(BOBB, day.references, day, day, truth, stops, threads=threads, scratch=scratch)
         for threads, scratch in ((1, None), (3, tmp_path))
     ]
     a, b = results
@@ -135,7 +138,7 @@ def test_figures_of_a_method(day: Walk) -> None:
     """Every frame finds itself first: each has some feature in the library and no twin."""
     truth = index_pairs(day.frames, day.frames, 0)
     seen: list[tuple[str, int, int]] = []
-    result = compare.evaluate_method(
+    result = evaluate_method(
         BOBB, day.references, day, day, truth, np.full(FRAMES, FRAMES), progress=lambda *at: seen.append(at)
     )
     assert result.ranks.top_row.tolist() == list(range(FRAMES))
@@ -152,11 +155,11 @@ def test_figures_of_a_method(day: Walk) -> None:
 
 def test_figures_of_sequences(day: Walk, tmp_path: Path) -> None:
     """Beside those of single views, and the same as by the whole matrix at once."""
-    truth, stops = index_pairs(day.frames - 5, day.frames, 1), compare.candidate_stops(day.frames, day.frames, 4)
+    truth, stops = index_pairs(day.frames - 5, day.frames, 1), candidate_stops(day.frames, day.frames, 4)
     sequence = SequenceSettings(length=5)
-    single = compare.evaluate_method(BOBB, day.references, day, day, truth, stops)
+    single = evaluate_method(BOBB, day.references, day, day, truth, stops)
     for scratch, threads in ((None, 1), (tmp_path, 3)):
-        both = compare.evaluate_method(
+        both = evaluate_method(
             BOBB, day.references, day, day, truth, stops, threads, sequence=sequence, scratch=scratch
         )
         lines = rank_queries(match_sequences(single.scores, sequence, stops), truth, stops)
@@ -168,22 +171,22 @@ def test_figures_of_sequences(day: Walk, tmp_path: Path) -> None:
 
 
 def test_candidates_are_older_by_the_gap() -> None:
-    assert compare.candidate_stops(np.arange(6), np.arange(4), None).tolist() == [4] * 6
-    assert compare.candidate_stops(np.arange(6), np.arange(6), 2).tolist() == [0, 0, 1, 2, 3, 4]
+    assert candidate_stops(np.arange(6), np.arange(4), None).tolist() == [4] * 6
+    assert candidate_stops(np.arange(6), np.arange(6), 2).tolist() == [0, 0, 1, 2, 3, 4]
     lost = np.array([0, 1, 4, 5])  # 2 and 3 could not be decoded
-    assert compare.candidate_stops(lost, lost, 2).tolist() == [0, 0, 2, 2]
+    assert candidate_stops(lost, lost, 2).tolist() == [0, 0, 2, 2]
 
 
 def test_bytes_of_a_column() -> None:
     lists = pa.array([[1, 2, 3], [], [4]], pa.list_(pa.int16()))
     fixed = pa.array([[1, 2], [3, 4], [5, 6]], pa.list_(pa.uint8(), 2))
     both = pa.StructArray.from_arrays([lists, fixed], names=["lists", "fixed"])
-    assert compare.stored_bytes(fixed) == 6
-    assert compare.stored_bytes(lists) == 4 * 2 + 3 * 4  # values, offsets
-    assert compare.stored_bytes(both) == 6 + 20
-    assert compare.stored_bytes(pa.array([b"abc", b"d"], pa.binary())) == 4 + 2 * 4
-    assert compare.stored_bytes(pa.array([1.0, None, 2.0], pa.float32())) == 12
-    assert compare.stored_bytes(fixed.slice(1, 1)) == 2
+    assert stored_bytes(fixed) == 6
+    assert stored_bytes(lists) == 4 * 2 + 3 * 4  # values, offsets
+    assert stored_bytes(both) == 6 + 20
+    assert stored_bytes(pa.array([b"abc", b"d"], pa.binary())) == 4 + 2 * 4
+    assert stored_bytes(pa.array([1.0, None, 2.0], pa.float32())) == 12
+    assert stored_bytes(fixed.slice(1, 1)) == 2
 
 
 # Names of methods
@@ -192,18 +195,18 @@ def test_bytes_of_a_column() -> None:
 def test_methods_by_kind_pipeline_and_setting(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("places:\n  kind: bobb_paper\n  boxes: 2\n")
-    assert compare.read_method("bobb", Pipeline()) == BobbSettings()
-    assert compare.read_method("bobb", SMALL) == BOBB
-    assert compare.read_method("bobb_paper:boxes=9:aspects=[1, 2]", SMALL).aspects == (1.0, 2.0)
-    assert compare.read_method("paper", SMALL) == load_pipeline("paper").places
-    assert compare.read_method(f"{file}:seed=3", SMALL) == PaperBobbSettings(boxes=2, seed=3)
-    for kind, settings in compare.known_methods().items():
-        assert compare.read_method(kind, Pipeline()).kind == kind == settings().kind
+    assert read_method("bobb", Pipeline()) == BobbSettings()
+    assert read_method("bobb", SMALL) == BOBB
+    assert read_method("bobb_paper:boxes=9:aspects=[1, 2]", SMALL).aspects == (1.0, 2.0)
+    assert read_method("paper", SMALL) == load_pipeline("paper").places
+    assert read_method(f"{file}:seed=3", SMALL) == PaperBobbSettings(boxes=2, seed=3)
+    for kind, settings in known_methods().items():
+        assert read_method(kind, Pipeline()).kind == kind == settings().kind
 
 
 def test_commas_inside_brackets_belong_to_a_value() -> None:
-    assert compare.split_methods("a, b:c=[1,2]:d=2,e") == ["a", "b:c=[1,2]:d=2", "e"]
-    assert compare.split_methods("a") == ["a"]
+    assert split_methods("a, b:c=[1,2]:d=2,e") == ["a", "b:c=[1,2]:d=2", "e"]
+    assert split_methods("a") == ["a"]
 
 
 @pytest.mark.parametrize(
@@ -221,7 +224,7 @@ def test_commas_inside_brackets_belong_to_a_value() -> None:
 )
 def test_methods_that_do_not_exist(name: str, said: str) -> None:
     with pytest.raises(SettingsError) as error:
-        compare.read_method(name, Pipeline())
+        read_method(name, Pipeline())
     assert said in str(error.value)
     assert "\n" not in str(error.value)
 

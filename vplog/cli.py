@@ -9,18 +9,25 @@ import math
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import vplog
+from vplog.cli_print import (
+    Progress,
+    print_comparison,
+    print_evaluation,
+    print_info,
+    print_json,
+    print_run,
+    print_study,
+    say,
+)
 from vplog.errors import VplogError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from types import TracebackType
 
-    from rich.console import Console
-
-    from vplog.data import LogInfo
+    from vplog.evaluate.place_truth import TruthChoice
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
 
@@ -45,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except KeyboardInterrupt:
-        _say("interrupted; what was finished is kept, run.json says that the run is not")
+        say("interrupted; what was finished is kept, run.json says that the run is not")
         sys.exit(130)
     except VplogError as error:
         _fail(arguments, str(error))
@@ -62,12 +69,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
         raise  # noqa: PLE0704 (called from an except block)
-    _say(f"error: {message}")
+    say(f"error: {message}")
     sys.exit(1)
-
-
-def _say(message: str) -> None:
-    print(f"vplog: {message}", file=sys.stderr)
 
 
 def info(arguments: argparse.Namespace) -> None:
@@ -92,9 +95,9 @@ def info(arguments: argparse.Namespace) -> None:
                 "distortion": camera.distortion.tolist(),
                 "body_from_camera": camera.body_from_camera.tolist(),
             }
-        _print_json({**asdict(found), "camera": about, "command": command})
+        print_json({**asdict(found), "camera": about, "command": command})
         return
-    _print_info(found)
+    print_info(found)
     if camera is not None:
         text = (
             "uncalibrated" if camera.matrix is None else f"fx {camera.matrix[0, 0]:.1f} px, {camera.distortion_model}"
@@ -105,29 +108,18 @@ def info(arguments: argparse.Namespace) -> None:
     print(f"run       {command}")
 
 
-def _print_info(found: LogInfo) -> None:
-    from rich.table import Table
-
-    seconds = max(found.end_ns - found.start_ns, 0) / 1e9
-    print(f"log       {found.path}\nkind      {found.kind}, {found.messages} messages over {seconds:.1f} s")
-    table = Table("topic", "type", "count", "role", "used", box=None)
-    for topic in found.topics:
-        table.add_row(topic.name, topic.type, str(topic.count), topic.role, "yes" if topic.used else "")
-    _console(sys.stdout).print(table)
-
-
 def library(arguments: argparse.Namespace) -> None:
     """Build a reference library of random frames."""
     from vplog.pipeline import build_library
 
     pipeline = _pipeline(arguments)
-    with _Progress(arguments) as progress:
+    with Progress(arguments) as progress:
         state = build_library(
             arguments.logs, arguments.output, pipeline, _topics(arguments), arguments.threads, progress
         )
     record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
     if arguments.json:
-        _print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits})
+        print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits})
         return
     print(
         f"{arguments.output}: {record['references']} references, {record['features']} features, "
@@ -145,7 +137,7 @@ def run(arguments: argparse.Namespace) -> None:
             f"{len(arguments.logs)} logs were given, and a run takes one drive. Run each by itself, "
             "or share places between them with one --library."
         )
-    with _Progress(arguments) as progress:
+    with Progress(arguments) as progress:
         done = run_pipeline(
             arguments.logs[0],
             arguments.output,
@@ -156,23 +148,9 @@ def run(arguments: argparse.Namespace) -> None:
             progress,
         )
     if arguments.json:
-        _print_json({"run": str(arguments.output), **done.record})
+        print_json({"run": str(arguments.output), **done.record})
     else:
-        _print_run(arguments.output, done.record)
-
-
-def _print_run(out: Path, record: dict[str, Any]) -> None:
-    from vplog.data import Verdict
-
-    counts = record["counts"]
-    print(f"{out}: {counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates")
-    for name, count in counts["verdicts"].items():
-        print(f"  {count:6d} {name}: {Verdict(name).sentence}")
-    print(f"  {record['solution']['reason']}")
-    for warning in record["warnings"]:
-        _say(f"warning: {warning}")
-    totals = record["totals"]
-    print(f"  {totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+        print_run(arguments.output, done.record)
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -181,46 +159,22 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
     found = evaluate_run(arguments.run, arguments.truth, _topics(arguments))
     if arguments.json:
-        _print_json(found)
+        print_json(found)
     else:
-        _print_evaluation(found)
-
-
-def _print_evaluation(found: dict[str, Any]) -> None:
-    closures = found.get("closures")
-    if closures:
-        share = {
-            name: "none" if closures[name] is None else f"{closures[name]:.3f}" for name in ("precision", "recall")
-        }
-        print(
-            f"closures  {closures['accepted']} accepted, {closures['accepted_true']} of them true "
-            f"(precision {share['precision']}); {closures['revisits_found']} of {closures['revisits']} revisits found "
-            f"(recall {share['recall']}); {closures['opposite']} in the opposite direction"
-        )
-    for when in ("before", "after"):
-        rpe = found.get(f"rpe_{when}")
-        drift = (
-            ""
-            if rpe is None
-            else f"   RPE {rpe['translation_rmse_m']:.4f} m, {rpe['rotation_rmse_deg']:.4f} deg a frame"
-        )
-        ate = found[f"ate_{when}"]
-        print(f"{when:9} ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m{drift}")
+        print_evaluation(found)
 
 
 def compare(arguments: argparse.Namespace) -> None:
     """Place recognisers side by side on two drives, or on one that comes back."""
     from vplog.compare import compare as compare_methods
-    from vplog.compare import split_methods
-    from vplog.evaluate.place_truth import TruthChoice
+    from vplog.methods import split_methods
 
-    truth = TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
-    with _Progress(arguments) as progress:
+    with Progress(arguments) as progress:
         done = compare_methods(
             arguments.query,
             arguments.map,
             split_methods(arguments.methods),
-            truth,
+            _truth(arguments),
             _pipeline(arguments),
             library=arguments.library,
             library_size=arguments.library_size,
@@ -233,34 +187,37 @@ def compare(arguments: argparse.Namespace) -> None:
             progress=progress,
         )
     if arguments.json:
-        _print_json(done.record)
+        print_json(done.record)
     else:
-        _print_comparison(done.record)
+        print_comparison(done.record)
 
 
-def _print_comparison(found: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
+def study(arguments: argparse.Namespace) -> None:
+    """The experiments of the paper on two or more drives of one route, or on one that comes back."""
+    from vplog.methods import split_methods
+    from vplog.study.study import METHODS
+    from vplog.study.study import study as run_study
 
-    print(
-        f"{found['queries']} queries, {found['positives']} with a true match, against {found['map_frames']} frames; "
-        f"library of {found['library']['size']} images"
-    )
-    table = Table(box=None, pad_edge=False)
-    table.add_column("method", overflow="fold")  # what gives way where the terminal is narrow
-    for title in ("R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms"):
-        table.add_column(title, justify="right", no_wrap=True)
-    shares = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1")
-    for name, method in found["methods"].items():
-        costs = [f"{method['bytes_per_image']:g}"]
-        costs += [f"{method[cost]:.2f}" for cost in ("encode_ms", "query_ms")]
-        table.add_row(escape(name), *(f"{method[share]:.3f}" for share in shares), *costs)
-        if "sequence" in method:
-            by_sequence = method["sequence"]
-            table.add_row(f"  L={by_sequence['length']}", *(f"{by_sequence[share]:.3f}" for share in shares))
-    _console(sys.stdout).print(table)
-    for warning in found["warnings"]:
-        _say(f"warning: {warning}")
+    with Progress(arguments) as progress:
+        found = run_study(
+            arguments.logs,
+            _truth(arguments),
+            _pipeline(arguments),
+            arguments.output,
+            methods=METHODS if arguments.methods is None else split_methods(arguments.methods),
+            sizes=arguments.sizes,
+            seeds=arguments.seeds,
+            library_size=arguments.library_size,
+            min_gap=arguments.min_gap,
+            only=arguments.only,
+            topics=_topics(arguments),
+            threads=arguments.threads,
+            progress=progress,
+        )
+    if arguments.json:
+        print_json(found)
+    else:
+        print_study(arguments.output, found)
 
 
 def config(arguments: argparse.Namespace) -> None:
@@ -269,7 +226,7 @@ def config(arguments: argparse.Namespace) -> None:
 
     tree = _pipeline(arguments).model_dump(mode="json")
     if arguments.json:
-        _print_json(tree)
+        print_json(tree)
     else:
         print(yaml.safe_dump(tree, sort_keys=False), end="")
 
@@ -282,7 +239,7 @@ def schemas(arguments: argparse.Namespace) -> None:
     _folder(arguments.output)
     written = [str(path) for path in write_schemas(arguments.output, pipeline_schema())]
     if arguments.json:
-        _print_json({"written": written})
+        print_json({"written": written})
     else:
         print("\n".join(written))
 
@@ -304,63 +261,30 @@ def demo(arguments: argparse.Namespace) -> None:
 
     pipeline = _pipeline(arguments)
     _folder(arguments.output)
-    with _Progress(arguments) as progress:
+    with Progress(arguments) as progress:
         progress("render", 0, 1)
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
         progress("render", 1, 1)
         done = run_pipeline(drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress)
     found = evaluate_run(arguments.output / "run", str(drive.truth))
     if arguments.json:
-        _print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
+        print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    _print_run(arguments.output / "run", done.record)
+    print_run(arguments.output / "run", done.record)
     print(_DEMO_NEXT)
-    _print_evaluation(found)
-
-
-class _Progress:
-    """Bars with an ETA on a terminal's stderr; silence elsewhere."""
-
-    def __init__(self, arguments: argparse.Namespace) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-        from rich.progress import TimeRemainingColumn as Eta
-
-        self._tasks: dict[str, Any] = {}
-        self._bars = Progress(
-            TextColumn("{task.description:<18}", markup=False),
-            BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
-            console=_console(sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
-        )  # fmt: skip
-
-    def __enter__(self) -> _Progress:
-        self._bars.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bars.stop()
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total)
-        self._bars.update(self._tasks[stage], completed=done, total=total)
-
-
-def _console(stream: Any) -> Console:
-    from rich.console import Console
-
-    return Console(file=stream, width=None if stream.isatty() else 160)
-
-
-def _print_json(tree: dict[str, Any]) -> None:
-    from vplog.results.run_record import plain
-
-    print(json.dumps(plain(tree), indent=2, ensure_ascii=False, allow_nan=False))
+    print_evaluation(found)
 
 
 def _pipeline(arguments: argparse.Namespace) -> Pipeline:
     from vplog.pipeline import load_pipeline
 
     return load_pipeline(arguments.pipeline, arguments.set)
+
+
+def _truth(arguments: argparse.Namespace) -> TruthChoice:
+    from vplog.evaluate.place_truth import TruthChoice
+
+    return TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
 
 
 def _topics(arguments: argparse.Namespace) -> TopicChoice:
@@ -392,6 +316,7 @@ def _parser() -> argparse.ArgumentParser:
     settings = argparse.ArgumentParser(add_help=False)
     settings.add_argument("--pipeline", default="default", metavar="P", help="shipped name or .yaml file")
     settings.add_argument("--set", action="append", default=[], metavar="A.B=C", help="change one setting; repeatable")
+    truth = _truth_options()
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
     def add(name: str, verb: Verb, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -417,8 +342,11 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=Path, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
-    sub = add("compare", compare, topics, threads, settings)
+    sub = add("compare", compare, topics, threads, settings, truth)
     _add_comparison(sub)
+    sub = add("study", study, topics, threads, settings, truth)
+    _add_study(sub)
+    output(sub, "folder for study.json and the figures")
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
     sub = add("schemas", schemas)
@@ -429,12 +357,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_comparison(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("query", type=Path, metavar="QUERY", help="drive whose frames are looked for")
-    sub.add_argument("map", type=Path, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
-    sub.add_argument(
-        "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
-    )
+def _truth_options() -> argparse.ArgumentParser:
+    sub = argparse.ArgumentParser(add_help=False)
     sub.add_argument(
         "--truth",
         required=True,
@@ -447,11 +371,37 @@ def _add_comparison(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--min-gap", type=_at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
     )
+    sub.add_argument("--library-size", type=_at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
+    return sub
+
+
+def _add_comparison(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("query", type=Path, metavar="QUERY", help="drive whose frames are looked for")
+    sub.add_argument("map", type=Path, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
+    sub.add_argument(
+        "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
+    )
     sub.add_argument("--sequence", type=_at_least_one, metavar="L", help="also match sequences of L frames")
     sub.add_argument("--library", type=Path, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
-    sub.add_argument("--library-size", type=_at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
     sub.add_argument("--library-seed", type=_at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
     sub.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for compare.json, scores and curves")
+
+
+def _add_study(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="drives, each query and map in turn")
+    sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
+    sub.add_argument(
+        "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="of libraries (default: 10,20,50,100)"
+    )
+    sub.add_argument("--seeds", type=_at_least_one, default=3, metavar="N", help="libraries a figure (default: 3)")
+    sub.add_argument(
+        "--only", type=lambda text: text.split(","), metavar="E,E",
+        help="pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)",
+    )  # fmt: skip
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    return tuple(_at_least_one(part) for part in text.split(","))
 
 
 def _at_least(least: int) -> Callable[[str], int]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vplog.drawing import as_text, drawn
 from vplog.evaluate.retrieval import average_precision, precision_recall, recall_at
-from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -14,25 +14,16 @@ if TYPE_CHECKING:
 
 _DEEPEST_RANK = 25
 """Of the curves: the usual axis of recall@N in place recognition, e.g. Arandjelovic et al., NetVLAD, CVPR 2016."""
-_DPI = 150
-"""Of the PNG: 10 x 4.5 inches then fill three quarters of a full HD screen."""
 _LINES = ("-", "--", "-.", ":")
 """One kind each time the ten colours have gone round, so that forty methods are told apart."""
 
 
 def draw_curves(ranks: dict[str, Ranks], folder: Path) -> None:
     """Write curves.png and curves.svg. The same ranks give the same bytes."""
-    import matplotlib as mpl  # a second to load, which only this needs
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # ids by hash of the content instead of by chance; text as text, so that it can be searched
-    with mpl.rc_context({"svg.hashsalt": "vplog", "svg.fonttype": "none", "font.size": 9}):
-        figure = Figure(figsize=(10, 4.5), layout="constrained")
-        FigureCanvasAgg(figure)
+    with drawn(folder, "curves", 10, 4.5) as figure:
         left, right = figure.subplots(1, 2)
         for number, (plain_name, found) in enumerate(ranks.items()):
-            name = plain_name.replace("$", r"\$")  # or it begins a formula
+            name = as_text(plain_name)
             style = {"color": f"C{number % 10}", "linestyle": _LINES[number // 10 % len(_LINES)]}
             curve = precision_recall(found)
             left.step(
@@ -51,6 +42,3 @@ def draw_curves(ranks: dict[str, Ranks], folder: Path) -> None:
             axes.set_ylim(0, 1.02)
             axes.grid(alpha=0.3)
             axes.legend(loc="lower left" if axes is left else "lower right", fontsize=8)
-        for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-            with replacing(folder / f"curves.{kind}") as stream:
-                figure.savefig(stream, format=kind, dpi=_DPI, metadata=metadata)

@@ -20,6 +20,7 @@ from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.bovf import BovfSettings
 from vplog.places.fabmap import FabmapSettings
 from vplog.places.gist import GistSettings
+from vplog.places.hybrid import HybridSettings
 from vplog.places.thumbnail import ThumbnailSettings
 from vplog.places.vlad import VladSettings
 
@@ -42,6 +43,7 @@ CASES: dict[str, Any] = {
     "bovf, cut": BovfSettings(words=200, features=150, max_bytes=64),
     "fabmap": FabmapSettings(words=100, features=150),
     "gist": GistSettings(blocks=2),
+    "hybrid": HybridSettings(bobb=BobbSettings(references=4, features=150), words=4),
     "thumbnail": ThumbnailSettings(),
     "vlad": VladSettings(centres=8, features=150),
     "vlad, whole": VladSettings(centres=8, features=150, dimensions=None),

@@ -11,11 +11,19 @@ from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.bovf import BovfSettings
 from vplog.places.fabmap import FabmapSettings
 from vplog.places.gist import GistSettings
+from vplog.places.hybrid import HybridSettings
 from vplog.places.thumbnail import ThumbnailSettings
 from vplog.places.vlad import VladSettings
 
 PlaceSettings = Annotated[
-    BobbSettings | PaperBobbSettings | BovfSettings | FabmapSettings | GistSettings | ThumbnailSettings | VladSettings,
+    BobbSettings
+    | PaperBobbSettings
+    | BovfSettings
+    | FabmapSettings
+    | GistSettings
+    | HybridSettings
+    | ThumbnailSettings
+    | VladSettings,
     Field(discriminator="kind"),
 ]
 """Every recogniser, told apart by `kind`."""

@@ -1,0 +1,4 @@
+"""Speed, always as a ratio of two things measured side by side in one run: `python -m tests.benchmarks`.
+
+They take minutes and are no part of the tests; tests/test_benchmarks.py runs each of them once on next to nothing.
+"""

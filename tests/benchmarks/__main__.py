@@ -1,0 +1,111 @@
+"""`python -m tests.benchmarks [mining describe discovery search growth] [--json]`, from the top of the checkout.
+
+Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+from typing import TYPE_CHECKING
+
+from vplog.pipeline import load_pipeline, pipeline_folder
+from vplog.places.bobb import BobbSettings
+from vplog.places.bobb_paper import PaperBobbSettings
+
+from .discovery import discovery
+from .images import drives
+from .mining import describing, mining
+from .search import free_memory_gb, growth, search
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from vplog.pipeline import Pipeline
+
+    from .measure import Figure
+
+MINING_BARS = {"default": 0.40, "fast": 0.25}
+"""Mining on one thread, as a share of SIFT."""
+DESCRIBE_BAR = 0.7
+"""Frames a second with mining, as a share of those without, on all cores."""
+DISCOVERY_BAR = 1000.0
+"""Times faster than the algorithm as the paper lists it."""
+SEARCH_BARS = (4.0, 40.0)
+"""Times faster than a scan of binary codes, and of vectors of floats."""
+SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
+LARGEST_NEEDS_GB = 12.0
+"""Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
+
+
+def main() -> int:
+    arguments = _arguments()
+    figures = []
+    for figure in _measure(arguments):
+        figures.append(figure)
+        if not arguments.json:
+            _show(figure)
+    missed = [figure.name for figure in figures if not figure.passed]
+    if arguments.json:
+        machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+        print(json.dumps({"machine": machine, "figures": [figure.as_json() for figure in figures]}, indent=1))
+    else:
+        print(f"missed: {', '.join(missed)}" if missed else "every bar is reached")
+    return 1 if missed else 0
+
+
+def _arguments() -> argparse.Namespace:
+    kinds = ("mining", "describe", "discovery", "search", "growth")
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
+    parser.add_argument("what", nargs="*", metavar="WHAT", help=f"of {', '.join(kinds)}; all where none is named")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")
+    parser.add_argument("--images", type=int, default=20, help="images of each drive")
+    parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
+    arguments = parser.parse_args()
+    unknown = sorted(set(arguments.what) - set(kinds))
+    if unknown:
+        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(kinds)}")
+    arguments.what = arguments.what or list(kinds)
+    return arguments
+
+
+def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
+    what, rounds = set(arguments.what), arguments.rounds
+    if what & {"mining", "describe", "discovery"}:
+        sources = drives(arguments.images)
+        for name, pipeline in _pipelines():
+            for images in sources:
+                if "mining" in what:
+                    yield mining(images, pipeline, name, MINING_BARS[name], rounds)
+                if "describe" in what:
+                    yield describing(images, pipeline, name, DESCRIBE_BAR, rounds, os.cpu_count() or 1)
+        if "discovery" in what:
+            extractor = load_pipeline("default").features
+            yield from discovery(sources[0], extractor, BobbSettings(), PaperBobbSettings(), DISCOVERY_BAR)
+    if "search" in what:
+        yield from search(arguments.places, BobbSettings(), 20, rounds, SEARCH_BARS)
+    if "growth" in what:
+        possible = [size for size in SIZES if size < SIZES[-1] or free_memory_gb() >= LARGEST_NEEDS_GB]
+        yield from growth(tuple(possible), BobbSettings(), 20)
+
+
+def _pipelines() -> Iterator[tuple[str, Pipeline]]:
+    """The default, and the fast one where it is shipped."""
+    for name in MINING_BARS:
+        if (pipeline_folder() / f"{name}.yaml").is_file():
+            yield name, load_pipeline(name)
+
+
+def _show(figure: Figure) -> None:
+    bar = "" if figure.bar is None else f"{'<=' if figure.at_most else '>='} {figure.bar:g}"
+    verdict = "" if figure.bar is None else "pass" if figure.passed else "MISSED"
+    facts = ", ".join(f"{name} {value}" for name, value in figure.facts.items())
+    print(f"{figure.name:<72} {figure.ratio:>10.3g}  {bar:<8} {verdict}\n    {facts}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,223 @@
+"""Eq. (1) over a large map against what other systems scan: binary codes, and vectors of floats.
+
+Made-up places, for no one has recorded a million. What decides the cost is how long the lists are and how fast weights
+fall, so these are as the paper's and real drives have them: reference r is as popular as 1 / (r + L / 18), which makes
+the first ten times as frequent as the median one (the paper's Fig. 9); weights fall with rank n as n^-1.3, which fits
+the default on real walks (255, 137, 83, 48, 32, .. 13); 15 % of boxes are nowhere, and the others anywhere, so that
+unrelated places overlap by .42 at best and .09 in the same window (.41 and .12 on real walks).
+Half of the queries are map places seen again (three of ten references are others, weights differ by 30 %, 40 % of the
+boxes lie elsewhere), half are places that the map does not have, where least can be left out.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import faiss
+import numpy as np
+
+from vplog.places import expected_votes
+from vplog.places.bobb import NOWHERE, Place
+from vplog.places.code_search import CodeIndex
+
+from .measure import Figure, in_turns, one_thread, seconds
+
+if TYPE_CHECKING:
+    from vplog.places.bobb import BobbSettings
+
+LIBRARY = 1000
+BITS, FLOATS = 512, 512
+"""Of the codes and vectors compared with."""
+BEST = 20
+_CHUNK = 100_000
+"""Places made at a time: what is drawn for them is soon let go."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    references: np.ndarray
+    weights: np.ndarray
+    boxes: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.references)
+
+
+def make_places(count: int, settings: BobbSettings, seed: int, library: int = LIBRARY) -> Places:
+    """`count` unrelated places; see above."""
+    rng = np.random.default_rng(seed)
+    J = settings.references
+    popularity = np.cumsum(1.0 / (np.arange(library) + library / 18))
+    references = np.empty((count, J), np.uint16)
+    weights, boxes = np.empty((count, J), np.uint8), np.empty((count, J, settings.boxes), np.uint8)
+    for at in range(0, count, _CHUNK):
+        part = slice(at, min(at + _CHUNK, count))
+        references[part] = _draw(rng, popularity, len(references[part]), J)
+        fall = np.arange(1, J + 1) ** -1.3 * np.exp(rng.normal(0, 0.3, weights[part].shape))
+        fall = -np.sort(-fall, axis=1)
+        weights[part] = np.maximum(np.rint(255 * fall / fall[:, :1]), 1)
+        boxes[part] = _anywhere(rng, boxes[part].shape, settings)
+    return Places(references, weights, boxes)
+
+
+def _anywhere(rng: np.random.Generator, shape: tuple[int, ...], settings: BobbSettings) -> np.ndarray:
+    boxes = rng.integers(0, _positions(settings)[0] * _positions(settings)[1], shape, dtype=np.uint8)
+    boxes[rng.random(shape, np.float32) < 0.15] = NOWHERE
+    return boxes
+
+
+def _draw(rng: np.random.Generator, popularity: np.ndarray, count: int, J: int) -> np.ndarray:
+    """(count, J) different references: rows with one twice are drawn again."""
+    rows = np.arange(count)
+    result = np.empty((count, J), np.uint16)
+    while len(rows):
+        result[rows] = np.searchsorted(popularity, rng.random((len(rows), J)) * popularity[-1], side="right")
+        ordered = np.sort(result[rows], axis=1)
+        rows = rows[(ordered[:, 1:] == ordered[:, :-1]).any(axis=1)]
+    return result
+
+
+def make_queries(places: Places, count: int, settings: BobbSettings, library: int = LIBRARY) -> list[Place]:
+    """Every second one is a place of the map as it might be seen again."""
+    rng = np.random.default_rng(1)
+    new = make_places(count, settings, seed=2, library=library)
+    queries = []
+    for n in range(count):
+        references, weights, boxes = new.references[n], new.weights[n], new.boxes[n]
+        if n % 2:
+            row = int(rng.integers(len(places)))
+            other = rng.permutation(len(references))[: round(0.3 * len(references))]
+            fresh = np.setdiff1d(references, places.references[row])[: len(other)]
+            references = places.references[row].copy()
+            references[other[: len(fresh)]] = fresh
+            seen = places.weights[row] * np.exp(rng.normal(0, 0.3, len(weights)))
+            weights = np.maximum(np.rint(255 * seen / seen.max()), 1).astype(np.uint8)
+            boxes = np.where(rng.random(boxes.shape) < 0.4, boxes, places.boxes[row])
+        queries.append(Place(references, weights, boxes))
+    return queries
+
+
+def _positions(settings: BobbSettings) -> tuple[int, int]:
+    return settings.columns - settings.box_columns + 1, settings.rows - settings.box_rows + 1
+
+
+def _table(settings: BobbSettings) -> np.ndarray:
+    return expected_votes.overlaps(*_positions(settings), settings.box_columns, settings.box_rows)
+
+
+def make_index(places: Places, settings: BobbSettings, pairing: str, library: int = LIBRARY) -> CodeIndex:
+    return CodeIndex(
+        places.references, places.weights, places.boxes, _table(settings), library,
+        pairing,  # pyright: ignore[reportArgumentType]
+    )  # fmt: skip
+
+
+def plain_scores(places: Places, query: Place, settings: BobbSettings, pairing: str) -> np.ndarray:
+    """(N,) float32 Eq. (1) with weights, as it is written down: every pair of equal references, then one division."""
+    table = _table(settings).astype(np.int64)
+    total = np.zeros(len(places), np.int64)
+    for j, reference in enumerate(query.references):
+        row, k = np.nonzero(places.references == reference)
+        cells = table[query.boxes[j][None, :, None], places.boxes[row, k][:, None, :]]
+        best, same = cells.max(axis=2).sum(axis=1), np.trace(cells, axis1=1, axis2=2)
+        alike = {"best": best, "same": same, "both": best + same}[pairing]
+        np.add.at(total, row, int(query.weights[j]) * places.weights[row, k].astype(np.int64) * alike)
+    length = np.sqrt((places.weights.astype(np.int64) ** 2).sum(axis=1))
+    own = np.sqrt((query.weights.astype(np.int64) ** 2).sum())
+    whole = int(table.max()) * (2 if pairing == "both" else 1) * query.boxes.shape[1]
+    return (total / (length * (own * whole))).astype(np.float32)
+
+
+def is_exact(index: CodeIndex, places: Places, query: Place, settings: BobbSettings, pairing: str) -> bool:
+    """Every score is the plain one to the last bit, and the best rows are those of a full sort, ties by row."""
+    plain = plain_scores(places, query, settings, pairing)
+    ranking = index.query(query, BEST)
+    order = np.lexsort((np.arange(len(plain)), -plain))[:BEST]
+    order = order[plain[order] > 0]
+    return (
+        np.array_equal(index.scores(query), plain)
+        and np.array_equal(ranking.rows, order)
+        and np.array_equal(ranking.score, plain[order])
+    )
+
+
+def search(count: int, settings: BobbSettings, queries: int, rounds: int, bars: tuple[float, float]) -> list[Figure]:
+    """Scores and the best 20 of one query after the other, on one thread: flat scans of codes and vectors to ours."""
+    places = make_places(count, settings, seed=0)
+    asked = make_queries(places, queries, settings)
+    rng = np.random.default_rng(3)
+    codes: Any = faiss.IndexBinaryFlat(BITS)
+    vectors: Any = faiss.IndexFlatIP(FLOATS)
+    for at in range(0, count, _CHUNK):
+        part = min(_CHUNK, count - at)
+        codes.add(rng.integers(0, 256, (part, BITS // 8), np.uint8))
+        vectors.add(rng.standard_normal((part, FLOATS), np.float32))
+    code_queries = rng.integers(0, 256, (queries, 1, BITS // 8), np.uint8)
+    vector_queries = rng.standard_normal((queries, 1, FLOATS), np.float32)
+    figures = []
+    with one_thread():
+        for pairing in (settings.pairing, *sorted({"best", "both", "same"} - {settings.pairing})):
+            index = make_index(places, settings, pairing)
+            exact = all(is_exact(index, places, query, settings, pairing) for query in asked[:4])
+            turns_of = {
+                "IndexBinaryFlat": (lambda: [codes.search(one, BEST) for one in code_queries], bars[0], BITS // 8),
+                "IndexFlatIP": (lambda: [vectors.search(one, BEST) for one in vector_queries], bars[1], 4 * FLOATS),
+            }
+            for name, (scan, bar, size) in turns_of.items():
+                if name == "IndexFlatIP" and pairing != settings.pairing:
+                    continue
+                turns = in_turns(scan, lambda index=index: [index.query(one, BEST) for one in asked], rounds)
+                theirs, ours = (1000 * part / queries for part in turns.medians)
+                facts = {
+                    "places": count,
+                    "library": LIBRARY,
+                    "ours_ms": round(ours, 3),
+                    "theirs_ms": round(theirs, 3),
+                    "all_scores_ms": round(1000 * _a_query(index, asked), 3),
+                    "bytes_per_place": round(index.nbytes / count, 1),
+                    "bytes_stored": settings.references * (2 + 1 + settings.boxes),
+                    "theirs_bytes": size,
+                    "exact": exact,
+                }
+                width = BITS if name == "IndexBinaryFlat" else FLOATS
+                title = f"faiss {name} {width} / Eq. (1), top {BEST}, {pairing}, one thread"
+                figures.append(Figure(title, turns.ratio if exact else 0.0, bar, at_most=False, facts=facts))
+    return figures
+
+
+def _a_query(index: CodeIndex, asked: list[Place]) -> float:
+    """Seconds of the scores of all places."""
+    return statistics.median(seconds(lambda one=one: index.scores(one)) for one in asked)
+
+
+def growth(counts: tuple[int, ...], settings: BobbSettings, queries: int) -> list[Figure]:
+    """Milliseconds a query by size of the map, as a ratio to the smallest map's."""
+    figures, first = [], 0.0
+    with one_thread():
+        for count in counts:
+            places = make_places(count, settings, seed=0)
+            asked = make_queries(places, queries, settings)
+            built: list[CodeIndex] = []
+            building = seconds(lambda places=places, built=built: built.append(make_index(places, settings, "both")))
+            index = built[0]
+            index.query(asked[0], BEST)
+            spent = [seconds(lambda one=one, index=index: index.query(one, BEST)) for one in asked]
+            middle = 1000 * statistics.median(spent)
+            first = first or middle
+            facts = {
+                "places": count,
+                "query_ms": round(middle, 3),
+                "all_scores_ms": round(1000 * _a_query(index, asked), 3),
+                "build_s": round(building, 3),
+                "bytes_per_place": round(index.nbytes / count, 1),
+            }
+            figures.append(Figure(f"Eq. (1) over {count:,} places / {counts[0]:,}", middle / first, None, True, facts))
+    return figures
+
+
+def free_memory_gb() -> float:
+    """Memory that this machine has to give, in GB (10^9 bytes)."""
+    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9

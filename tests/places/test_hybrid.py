@@ -1,0 +1,154 @@
+"""Hybrid: boxes and signs of words, each as it is alone, balanced by the references."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vplog.errors import LibraryError
+from vplog.places.bobb import BobbSettings
+from vplog.places.hybrid import HybridIndex, HybridSettings, HybridState, learn_words
+from vplog.places.vocabulary import root_sift
+
+from .pictures import noisy, nothing, reference
+
+if TYPE_CHECKING:
+    from vplog.data import Bytes, Features, Reference
+    from vplog.places.code_search import CodeIndex
+
+SMALL = HybridSettings(bobb=BobbSettings(references=4, features=250), words=4)
+
+
+@pytest.fixture(scope="module")
+def hybrid(references: list[Reference]) -> HybridState:
+    return SMALL.learn(references, 2)
+
+
+class NoBoxes:
+    """The boxes of `count` places that have nothing in common with any."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def scores(self, _descriptor: object, stop: int | None = None) -> np.ndarray:
+        return np.zeros(self.count if stop is None else min(stop, self.count), np.float32)
+
+
+def signs_alone(signs: Bytes) -> HybridIndex:
+    boxes: CodeIndex = NoBoxes(len(signs))  # pyright: ignore[reportAssignmentType]
+    return HybridIndex(boxes, signs, signs.shape[1], 1.0)
+
+
+def literal_signs(state: HybridState, features: Features) -> list[bool]:
+    """What `Words.signs` says, a feature and a bit at a time."""
+    words = state.words
+    residuals = [np.zeros(words.centres.shape[1]) for _ in words.centres]
+    size = np.array([features.width, features.height])
+    for descriptor, point in zip(root_sift(features.descriptors), features.points, strict=True):
+        value = (descriptor.astype(np.float64) - words.mean) @ words.directions
+        value = np.append(value, ((point + 0.5) / size - 0.5) * words.place)
+        differences = [value - centre / 4096 for centre in words.centres]
+        nearest = int(np.argmin([np.linalg.norm(difference) for difference in differences]))
+        residuals[nearest] += differences[nearest] / np.linalg.norm(differences[nearest])
+    return [float(residual @ direction) > 0 for residual in residuals for direction in words.turn.T]
+
+
+def test_signs_are_those_of_the_words_residuals(hybrid: HybridState, references: list[Reference]) -> None:
+    whole = SMALL.model_copy(update={"bobb": SMALL.bobb.model_copy(update={"least_size": 0.0})})
+    state = whole.learn(references, 1)
+    for row in (0, 5):
+        features = state.bobb.matcher.references[row].features
+        bits = np.unpackbits(state.describe(features).signs).astype(bool)
+        # a sum next to zero may round to the other side
+        assert np.mean(bits == literal_signs(state, features)) > 0.98
+
+
+def test_bits_are_even_and_near_features_give_near_signs(hybrid: HybridState, references: list[Reference]) -> None:
+    places = [hybrid.describe(row.features) for row in references]
+    again = [hybrid.describe(noisy(row.features, 3)) for row in references]
+    bits = np.array([np.unpackbits(place.signs) for place in places])
+    assert 0.4 < bits.mean() < 0.6
+    other = np.array([np.unpackbits(place.signs) for place in again])
+    differ = (bits[:, None] != other[None]).mean(axis=2)
+    assert np.diag(differ).max() < differ[~np.eye(len(differ), dtype=bool)].min()
+
+
+@given(
+    st.integers(1, 20).flatmap(lambda n: st.lists(st.binary(min_size=n, max_size=n), min_size=1, max_size=30)),
+    st.integers(0, 29),
+)
+def test_agreement_counts_equal_bits(rows: list[bytes], query: int) -> None:
+    signs = np.array([list(row) for row in rows], np.uint8)
+    asked = signs[query % len(signs)]
+    described = type("Described", (), {"boxes": None, "signs": asked})()
+    _, agreement = signs_alone(signs).alike(described)
+    differ = np.unpackbits(signs ^ asked, axis=1).mean(axis=1)
+    expected = np.maximum(1 - 2 * differ, 0) * signs.any(axis=1) * asked.any()
+    np.testing.assert_allclose(agreement, expected, atol=1e-6)
+
+
+def test_a_score_is_both_similarities_in_their_shares(hybrid: HybridState, references: list[Reference]) -> None:
+    places = [hybrid.describe(row.features) for row in references]
+    index, boxes = hybrid.index(places), hybrid.bobb.index([place.boxes for place in places])
+    for place in places[:4]:
+        alone, words = index.alike(place)
+        np.testing.assert_array_equal(alone, boxes.scores(place.boxes))
+        np.testing.assert_allclose(
+            index.scores(place), (1 - hybrid.share) * alone + hybrid.share * words, rtol=1e-6, atol=1e-7
+        )
+    assert index.scores(places[2])[2] == pytest.approx(1)
+
+
+def test_at_a_half_both_vary_alike_between_the_references(hybrid: HybridState, references: list[Reference]) -> None:
+    places = [hybrid.describe(row.features) for row in references]
+    index = hybrid.index(places)
+    alike = np.array([index.alike(place) for place in places])
+    boxes, words = (part[~np.eye(len(places), dtype=bool)].std() for part in alike.transpose(1, 0, 2))
+    assert (1 - hybrid.share) * boxes == pytest.approx(hybrid.share * words, rel=1e-4)
+    for share in (0.0, 1.0):
+        assert SMALL.model_copy(update={"share": share}).learn(references, 1).share == share
+
+
+def test_words_tell_places_that_the_library_does_not_explain(references: list[Reference]) -> None:
+    """References of one panorama, places of another: no box is of use, the words are."""
+    state = SMALL.learn(references[:6], 1)
+    elsewhere = [reference(seed) for seed in range(40, 52, 2)]
+    index = state.index([state.describe(row.features) for row in elsewhere])
+    found = [index.query(state.describe(noisy(row.features, 1)), 1).rows[0] for row in elsewhere]
+    assert found == list(range(len(elsewhere)))
+
+
+def test_a_place_fits_160_bytes(references: list[Reference]) -> None:
+    state = HybridSettings(bobb=BobbSettings(references=8, features=150)).learn(references[:2], 1)
+    assert HybridSettings().bobb.references == 8
+    assert state.bits <= 8 * 160
+
+
+def test_one_reference_is_enough(references: list[Reference]) -> None:
+    state = SMALL.learn(references[:1], 1)
+    assert state.share == SMALL.share
+    assert not state.describe(nothing()).signs.any()
+
+
+def test_few_features_are_enough_for_all_words(references: list[Reference]) -> None:
+    few = HybridSettings(words=256)
+    words = learn_words([references[0].features], few.model_copy(update={"words": 256, "bits": 8}))
+    assert words.signs(references[0].features).shape == (256,)
+
+
+def test_bad_columns_are_refused(hybrid: HybridState, references: list[Reference]) -> None:
+    column = hybrid.to_arrow([hybrid.describe(references[0].features)])
+    with pytest.raises(LibraryError, match="not fit"):
+        hybrid.from_arrow(column.field("boxes"))
+    boxes = pa.array([None], hybrid.bobb.arrow_type)
+    broken = pa.StructArray.from_arrays([boxes, column.field("signs")], fields=list(hybrid.arrow_type))
+    with pytest.raises(LibraryError, match="no value"):
+        hybrid.from_arrow(broken)

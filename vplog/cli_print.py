@@ -1,0 +1,170 @@
+"""How results look on a terminal: text, tables, progress, and JSON for programs."""
+# ruff: noqa: T201
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import argparse
+    from pathlib import Path
+    from types import TracebackType
+
+    from rich.console import Console
+
+    from vplog.data import LogInfo
+
+
+def say(message: str) -> None:
+    print(f"vplog: {message}", file=sys.stderr)
+
+
+def print_info(found: LogInfo) -> None:
+    from rich.table import Table
+
+    seconds = max(found.end_ns - found.start_ns, 0) / 1e9
+    print(f"log       {found.path}\nkind      {found.kind}, {found.messages} messages over {seconds:.1f} s")
+    table = Table("topic", "type", "count", "role", "used", box=None)
+    for topic in found.topics:
+        table.add_row(topic.name, topic.type, str(topic.count), topic.role, "yes" if topic.used else "")
+    console(sys.stdout).print(table)
+
+
+def print_run(out: Path, record: dict[str, Any]) -> None:
+    from vplog.data import Verdict
+
+    counts = record["counts"]
+    print(f"{out}: {counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates")
+    for name, count in counts["verdicts"].items():
+        print(f"  {count:6d} {name}: {Verdict(name).sentence}")
+    print(f"  {record['solution']['reason']}")
+    for warning in record["warnings"]:
+        say(f"warning: {warning}")
+    totals = record["totals"]
+    print(f"  {totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+
+
+def print_evaluation(found: dict[str, Any]) -> None:
+    closures = found.get("closures")
+    if closures:
+        share = {
+            name: "none" if closures[name] is None else f"{closures[name]:.3f}" for name in ("precision", "recall")
+        }
+        print(
+            f"closures  {closures['accepted']} accepted, {closures['accepted_true']} of them true "
+            f"(precision {share['precision']}); {closures['revisits_found']} of {closures['revisits']} revisits found "
+            f"(recall {share['recall']}); {closures['opposite']} in the opposite direction"
+        )
+    for when in ("before", "after"):
+        rpe = found.get(f"rpe_{when}")
+        drift = (
+            ""
+            if rpe is None
+            else f"   RPE {rpe['translation_rmse_m']:.4f} m, {rpe['rotation_rmse_deg']:.4f} deg a frame"
+        )
+        ate = found[f"ate_{when}"]
+        print(f"{when:9} ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m{drift}")
+
+
+def print_comparison(found: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    print(
+        f"{found['queries']} queries, {found['positives']} with a true match, against {found['map_frames']} frames; "
+        f"library of {found['library']['size']} images"
+    )
+    table = Table(box=None, pad_edge=False)
+    table.add_column("method", overflow="fold")  # what gives way where the terminal is narrow
+    for title in ("R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms"):
+        table.add_column(title, justify="right", no_wrap=True)
+    shares = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1")
+    for name, method in found["methods"].items():
+        costs = [f"{method['bytes_per_image']:g}"]
+        costs += [f"{method[cost]:.2f}" for cost in ("encode_ms", "query_ms")]
+        table.add_row(escape(name), *(f"{method[share]:.3f}" for share in shares), *costs)
+        if "sequence" in method:
+            by_sequence = method["sequence"]
+            table.add_row(f"  L={by_sequence['length']}", *(f"{by_sequence[share]:.3f}" for share in shares))
+    console(sys.stdout).print(table)
+    for warning in found["warnings"]:
+        say(f"warning: {warning}")
+
+
+def print_study(out: Path, found: dict[str, Any]) -> None:
+    """Methods by pair of drives, departures from the paper, and where the rest is."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    done = found["experiments"]
+    scores = ("r_at_1", "anr", "ap")
+    if "pairs" in done:
+        table = Table(box=None, pad_edge=False)
+        table.add_column("R@1 / ANR %", overflow="fold")
+        rows = done["pairs"]["rows"]
+        for query, other in dict.fromkeys((row["query"], row["map"]) for row in rows):
+            table.add_column(escape(f"{query}\nin {other}"), justify="right")
+        for title in ("mean", "worst", "bytes"):
+            table.add_column(title, justify="right", no_wrap=True)
+        for mean in done["pairs"]["mean"]:
+            cells = [f"{r['r_at_1']:.2f} / {r['anr']:.2f}" for r in rows if r["method"] == mean["method"]]
+            cells += [f"{mean['r_at_1']:.3f} / {mean['anr']:.2f}"]
+            cells += [f"{mean['r_at_1_worst']:.2f} / {mean['anr_worst']:.2f}", f"{mean['bytes_per_image']:g}"]
+            table.add_row(escape(mean["method"]), *cells)
+        console(sys.stdout).print(table)
+    if "sizes" in done:
+        table = Table("library size", "method", "R@1", "ANR %", "AP", box=None, pad_edge=False)
+        for row in done["sizes"]["mean"]:
+            table.add_row(str(row["size"]), escape(row["method"]), *(f"{row[score]:.3f}" for score in scores))
+        console(sys.stdout).print(table)
+    if "ablations" in done:
+        table = Table("bobb without", "setting", "R@1", "ANR %", "AP", box=None, pad_edge=False)
+        for row in done["ablations"]["rows"]:
+            changes = [f"{row[f'{score}_change']:+.3f}" for score in scores]
+            table.add_row(escape(row["name"]), escape(row["setting"]), *changes)
+        console(sys.stdout).print(table)
+    for warning in found["warnings"]:
+        say(f"warning: {warning}")
+    figures = sum(len(one["figures"]) for one in done.values()) // 2
+    print(f"{out}: study.json, and {figures} figures as PNG and SVG")
+
+
+class Progress:
+    """Bars with an ETA on a terminal's stderr; silence elsewhere."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn as Eta
+
+        self._tasks: dict[str, Any] = {}
+        self._bars = Progress(
+            TextColumn("{task.description:<18}", markup=False),
+            BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
+            console=console(sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
+        )  # fmt: skip
+
+    def __enter__(self) -> Progress:
+        self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bars.stop()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total)
+        self._bars.update(self._tasks[stage], completed=done, total=total)
+
+
+def console(stream: Any) -> Console:
+    from rich.console import Console
+
+    return Console(file=stream, width=None if stream.isatty() else 160)
+
+
+def print_json(tree: dict[str, Any]) -> None:
+    from vplog.results.run_record import plain
+
+    print(json.dumps(plain(tree), indent=2, ensure_ascii=False, allow_nan=False))

@@ -1,0 +1,39 @@
+"""Figures drawn without a display, and files of them that are the same every time."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+DPI = 150
+"""Of the PNG: 10 x 4.5 inches then fill three quarters of a full HD screen."""
+
+
+@contextmanager
+def drawn(folder: Path, name: str, width: float, height: float) -> Iterator[Figure]:
+    """A figure of so many inches to be filled, written as NAME.png and NAME.svg when the block ends well."""
+    import matplotlib as mpl  # a second to load, which only figures need
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # ids by hash of the content instead of by chance; text as text, so that it can be searched
+    with mpl.rc_context({"svg.hashsalt": "vplog", "svg.fonttype": "none", "font.size": 9}):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+            with replacing(folder / f"{name}.{kind}") as stream:
+                figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
+
+
+def as_text(name: str) -> str:
+    """A name as a label: a dollar sign would begin a formula."""
+    return name.replace("$", r"\$")

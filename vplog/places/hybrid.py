@@ -1,0 +1,345 @@
+"""BoBB, with visual words where the library does not explain the scene: Tanaka et al., IROS 2014, section V.
+
+A library of few images explains few scenes. What their features look like is learned from far less: a handful of visual
+words, and in which directions features differ from them. An image is then, beside its boxes, one bit for each word and
+direction: to which side the image's features of that word lie, all together. These are the signs of a VLAD (Jegou et
+al., CVPR 2010) of residuals of unit length (Delhumeau et al., Revisiting the VLAD image representation, ACM MM 2013),
+with where a feature lies in the image as two more values of its descriptor.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import faiss
+import numba
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+
+from vplog.errors import LibraryError
+from vplog.places import stored
+from vplog.places.bobb import BobbSettings
+from vplog.places.dense import best_rows, vectors_from_arrow, vectors_to_arrow
+from vplog.places.matches import large_enough, shares
+from vplog.places.relearn import relearn
+from vplog.places.vocabulary import root_sift
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Bytes, Features, Float32s, Floats, Ranking, Reference
+    from vplog.places.bobb import BobbState, Place
+    from vplog.places.code_search import CodeIndex
+
+_SIFT_STEPS = 512
+"""Of 1: RootSIFT values are whole multiples of one, so their sums and products over a library are exact."""
+_STEPS = 4096
+"""Of 1: what is summed over features is rounded to whole ones, so sums stay below 2^53 and exact in any order, and no
+bit depends on the number of threads."""
+_DIRECTIONS = 64
+"""Principal directions of descriptors that are kept, half of them: those after hold a tenth of the variance."""
+_LEAST_VARIANCE = 1e-4
+"""Of the largest: directions with less are the noise of few features, and are not whitened further."""
+_ITERATIONS = 10
+"""Of k-means; with a thousand features a word its centres hardly move after."""
+_MOST_FEATURES = 100_000
+"""Library features that words are learned from, spread evenly: more than enough for a few hundred directions."""
+
+
+class HybridSettings(Settings):
+    """Boxes of BoBB and signs of a few words: 96 + 64 bytes."""
+
+    kind: Literal["hybrid"] = "hybrid"
+    """Which recogniser."""
+    bobb: BobbSettings = BobbSettings(references=8)
+    """The boxes. Two references fewer than BoBB alone, so that a place stays within 160 bytes; its features, least size
+    and library are the words' own, too."""
+    words: int = Field(default=8, ge=1, le=256)
+    """Visual words. Few, so that each has about a hundred features of an image and their sum is more than noise."""
+    bits: Literal[8, 16, 32, 64] = 64
+    """Directions a word in which its features differ, one bit each."""
+    place: float = Field(default=1.0, ge=0)
+    """Where a feature lies counts like its descriptor when it is off by 1 / `place` of the image: the whole of it, so
+    that a view may shift, but not be upside down."""
+    whitening: float = Field(default=0.5, ge=0, le=1)
+    """Directions are divided by their variance to half this power: few of them would decide all bits otherwise."""
+    share: float = Field(default=0.5, ge=0, le=1)
+    """How much the words count against the boxes, in standard deviations of either between the references: a half is
+    as much. What the library explains badly has few boxes in common, and is then told by the words."""
+    seed: int = Field(default=0, ge=0)
+    """Of the first centres, and of the directions' rotation."""
+
+    def learn(self, references: Iterable[Reference], threads: int) -> HybridState:
+        """Index the references, learn words, and how scores vary. Raises LibraryError where there are no features."""
+        kept = list(references)
+        bobb = self.bobb.learn(kept, threads)
+        words = learn_words([large_enough(r.features, self.bobb) for r in kept], self)
+        state = HybridState(self, kept, bobb, words, self.share)
+        with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
+            places = list(pool.map(lambda reference: state.describe(reference.features), kept))
+        return HybridState(self, kept, bobb, words, _balance(state.index(places), places, self.share))
+
+    def load(self, folder: Path, threads: int) -> HybridState:
+        """A library saved by `HybridState.save`. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(HybridSettings, folder, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Words:
+    """W words in a space of 64 principal directions of descriptors and 2 of positions, whose signs are asked for."""
+
+    mean: Float32s
+    """(128,) of RootSIFT."""
+    directions: Float32s
+    """(128, 64) of RootSIFT less the mean, to values whose root mean square length is 1."""
+    place: float
+    centres: Floats
+    """(W, 66) whole steps of 1/4096."""
+    turn: Floats
+    """(66, B) whole steps: a rotation, so that each bit tells as much."""
+
+    def signs(self, features: Features) -> Bytes:
+        """(W * B / 8,) bits: the side on which the features of a word lie, summed. All 0 without features."""
+        values = _values(features, self.mean, self.directions, self.place)
+        return np.packbits(_sum_residuals(values, self.centres, _STEPS) @ self.turn > 0)
+
+
+def learn_words(features: Sequence[Features], settings: HybridSettings) -> Words:
+    """From the library's features, of which there is one at least."""
+    steps = np.concatenate([np.rint(root_sift(f.descriptors) * _SIFT_STEPS) for f in features]).astype(np.float64)
+    points = np.concatenate([shares(f) for f in features])
+    rows = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _MOST_FEATURES)).astype(np.int64))
+    mean, directions = _principal(steps[rows] / _SIFT_STEPS, settings.whitening)
+    rng = np.random.default_rng(settings.seed)
+    values = _place_values(
+        (steps[rows] / _SIFT_STEPS).astype(np.float32), points[rows], mean, directions, settings.place
+    )
+    centres = _centres(values, settings.words, rng)
+    turn = np.linalg.qr(rng.normal(size=(values.shape[1], values.shape[1])))[0][:, : settings.bits]
+    return Words(mean, directions, settings.place, centres, np.rint(turn * _STEPS))
+
+
+def _principal(values: Floats, whitening: float) -> tuple[Float32s, Float32s]:
+    """Mean (128,) and directions (128, 64) of (F, 128) RootSIFT."""
+    mean = values.mean(axis=0)
+    covariance = values.T @ values / len(values) - np.outer(mean, mean)
+    variance, sides = np.linalg.eigh(covariance)
+    kept = np.argsort(-variance, kind="stable")[:_DIRECTIONS]
+    sides = sides[:, kept]
+    # an eigenvector's sign is a matter of the machine: let its largest entry be positive
+    sides = sides * np.sign(sides[np.argmax(np.abs(sides), axis=0), np.arange(len(kept))])
+    variance = np.maximum(variance[kept], max(_LEAST_VARIANCE * variance.max(), 1e-12))
+    length = np.sqrt((variance ** (1 - whitening)).sum())
+    return mean.astype(np.float32), (sides / (variance ** (whitening / 2) * length)).astype(np.float32)
+
+
+def _values(features: Features, mean: Float32s, directions: Float32s, place: float) -> Floats:
+    return _place_values(root_sift(features.descriptors), shares(features), mean, directions, place)
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(descriptors, mean, directions):
+    """(M, D) float32, one feature after the other: no BLAS, whose threads would compete with ours."""
+    result = np.zeros((descriptors.shape[0], directions.shape[1]), np.float32)
+    for f in range(descriptors.shape[0]):
+        for i in range(descriptors.shape[1]):
+            value = descriptors[f, i] - mean[i]
+            for d in range(directions.shape[1]):
+                result[f, d] += value * directions[i, d]
+    return result
+
+
+def _place_values(
+    descriptors: Float32s, points: Float32s, mean: Float32s, directions: Float32s, place: float
+) -> Floats:
+    """(M, 66) whole steps."""
+    described = _project(descriptors, mean, directions)
+    return np.rint(
+        np.column_stack([described, (points - np.float32(0.5)) * np.float32(place)]).astype(np.float64) * _STEPS
+    )
+
+
+def _centres(values: Floats, words: int, rng: np.random.Generator) -> Floats:
+    """(W, 66) whole steps by k-means of (F, 66); a word that no feature is nearest to stays where it is."""
+    centres = values[np.sort(rng.choice(len(values), words, replace=len(values) < words))]
+    for _ in range(_ITERATIONS):
+        total, count = _sum_by_word(values, centres)
+        centres = np.where(count[:, None] > 0, np.rint(total / np.maximum(count, 1)[:, None]), centres)
+    return centres
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest(value, centres):
+    best, least = 0, np.inf
+    for w in range(centres.shape[0]):
+        distance = 0.0
+        for d in range(value.shape[0]):
+            distance += (value[d] - centres[w, d]) ** 2
+        if distance < least:
+            best, least = w, distance
+    return best, least
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_by_word(values, centres):
+    total, count = np.zeros(centres.shape), np.zeros(centres.shape[0], np.int64)
+    for f in range(values.shape[0]):
+        word, _ = _nearest(values[f], centres)
+        total[word] += values[f]
+        count[word] += 1
+    return total, count
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_residuals(values, centres, steps):
+    """(W, 66): for each word, the sum of its features' directions from it, of unit length, in whole steps."""
+    result = np.zeros(centres.shape)
+    for f in range(values.shape[0]):
+        word, square = _nearest(values[f], centres)
+        if square > 0.0:
+            scale = steps / np.sqrt(square)
+            for d in range(values.shape[1]):
+                result[word, d] += np.rint((values[f, d] - centres[word, d]) * scale)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """The descriptor."""
+
+    boxes: Place
+    """BoBB's."""
+    signs: Bytes
+    """(W * B / 8,) of `Words.signs`."""
+
+
+@dataclass(frozen=True, eq=False)
+class HybridState:
+    """A library, indexed, and its words. Shared freely between threads."""
+
+    settings: HybridSettings
+    references: list[Reference]
+    bobb: BobbState
+    words: Words
+    share: float
+    """0..1: part of the words in a score."""
+    hash: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
+
+    @property
+    def _signs_type(self) -> pa.FixedSizeListType:
+        return pa.list_(pa.uint8(), self.settings.words * self.settings.bits // 8)
+
+    @property
+    def bits(self) -> int:
+        """Of the boxes and the signs, as stored."""
+        return self.bobb.bits + self.settings.words * self.settings.bits
+
+    @property
+    def arrow_type(self) -> pa.DataType:
+        return pa.struct([pa.field("boxes", self.bobb.arrow_type), pa.field("signs", self._signs_type)])
+
+    def describe(self, features: Features) -> Described:
+        """Boxes and signs of the same features."""
+        return Described(self.bobb.describe(features), self.words.signs(large_enough(features, self.settings.bobb)))
+
+    def index(self, descriptors: Sequence[Described]) -> HybridIndex:
+        boxes = self.bobb.index([place.boxes for place in descriptors])
+        return HybridIndex(
+            boxes, np.array([p.signs for p in descriptors], np.uint8), self._signs_type.list_size, self.share
+        )
+
+    def to_arrow(self, descriptors: Sequence[Described]) -> pa.Array:
+        columns = [
+            self.bobb.to_arrow([place.boxes for place in descriptors]),
+            vectors_to_arrow([place.signs for place in descriptors], self._signs_type),
+        ]
+        return pa.StructArray.from_arrays(columns, fields=list(self.arrow_type))
+
+    def from_arrow(self, column: pa.Array) -> list[Described]:
+        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
+        if not column.type.equals(self.arrow_type):
+            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
+        if column.null_count:
+            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        boxes = self.bobb.from_arrow(column.field("boxes"))
+        signs = vectors_from_arrow(column.field("signs"), self._signs_type)
+        return [Described(b, s) for b, s in zip(boxes, signs, strict=True)]
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.references, self.settings, folder)
+
+
+class HybridIndex:
+    """Places of a map; rows are in the order given."""
+
+    def __init__(self, boxes: CodeIndex, signs: Bytes, length: int, share: float) -> None:
+        """`signs` (N, length); `share` of the words in a score."""
+        self._boxes, self._share, self._bits = boxes, share, 8 * length
+        self._signs = _words_of_64(signs.reshape(-1, length))
+
+    def __len__(self) -> int:
+        return len(self._boxes)
+
+    def alike(self, descriptor: Described, stop: int | None = None) -> tuple[Float32s, Float32s]:
+        """(stop,) BoBB's score, and agreement of the signs 0..1: 0 where half of them or fewer are equal."""
+        boxes = self._boxes.scores(descriptor.boxes, stop)
+        query = _words_of_64(descriptor.signs[None])[0]
+        return boxes, _agreement(self._signs[: len(boxes)], query, self._bits)
+
+    def scores(self, descriptor: Described, stop: int | None = None) -> Float32s:
+        """(stop,) 0..1: both similarities in their shares; 1 is equal."""
+        boxes, words = self.alike(descriptor, stop)
+        return ((1 - self._share) * boxes + self._share * words).astype(np.float32)
+
+    def query(self, descriptor: Described, k: int, stop: int | None = None) -> Ranking:
+        """The k best places below row `stop` that are alike at all; ties go to the earlier row."""
+        return best_rows(self.scores(descriptor, stop), k)
+
+
+def _words_of_64(signs: Bytes) -> NDArray[np.uint64]:
+    """(N, ceil(length / 8)), with zeros behind."""
+    return np.ascontiguousarray(np.pad(signs, ((0, 0), (0, -signs.shape[1] % 8)))).view(np.uint64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _agreement(signs, query, bits):
+    """(N,) float32: 1 - 2 x share of the bits that differ, 0 at least, and 0 for an image without features."""
+    result = np.zeros(signs.shape[0], np.float32)
+    if not np.any(query):
+        return result
+    for row in range(signs.shape[0]):
+        differ, some = np.uint64(0), np.uint64(0)
+        for word in range(signs.shape[1]):
+            x = signs[row, word] ^ query[word]
+            some |= signs[row, word]
+            # bits set in pairs, fours and eights, and the eights summed by a product
+            x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
+            x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+            x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+            differ += (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+        if some:
+            result[row] = max(1.0 - 2.0 * np.float64(differ) / bits, 0.0)
+    return result
+
+
+def _balance(index: HybridIndex, places: Sequence[Described], share: float) -> float:
+    """Part of the words in a score, so that both similarities vary alike between different references at half.
+
+    With fewer references than it takes to tell how they vary, `share` itself.
+    """
+    alike = np.array([index.alike(place) for place in places])
+    pairs = alike.transpose(1, 0, 2)[:, ~np.eye(len(places), dtype=bool)].astype(np.float64)
+    boxes, words = pairs.std(axis=1).tolist() if pairs.size else (0.0, 0.0)
+    if min(boxes, words) <= 0.0:
+        return share
+    return share / words / (share / words + (1 - share) / boxes)

@@ -1,0 +1,46 @@
+"""Every named departure of `bobb` from the paper, and the setting that takes it back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+BASE = "bobb"
+"""The recogniser that the departures are of."""
+
+
+@dataclass(frozen=True)
+class Departure:
+    """One idea, on its own."""
+
+    name: str
+    """What is there without it, in a few words."""
+    undone_by: tuple[str, ...]
+    """Assignments of settings, as `--methods bobb:setting=value` takes them."""
+    why: str
+    """What the idea is for, in one sentence."""
+
+    @property
+    def method(self) -> str:
+        """The recogniser without it, as `--methods` takes it."""
+        return ":".join((BASE, *self.undone_by))
+
+
+DEPARTURES = (
+    Departure(
+        "plain SIFT", ("root_sift=false",), "Roots of descriptors keep a few large values from ruling the distance."
+    ),
+    Departure("grain too", ("least_size=0",), "The smallest features are grain that another camera or light lacks."),
+    Departure("400 features", ("features=400",), "More features explain dim and blurred views, and cost time."),
+    Departure("10 neighbours", ("neighbours=10",), "The scale of distances is read off a far neighbour, not a match."),
+    Departure("all matches weigh alike", ("reach=100",), "Distances change with light, so a match counts relatively."),
+    Departure(
+        "no agreement", ("agreement_floor=1",), "Matches of one place move alike from view to view; chance ones do not."
+    ),
+    Departure("popular ones count fully", ("popularity=0",), "What explains every view tells none apart."),
+    Departure("J = 4", ("references=4",), "More references explain more of a view, at twelve bytes each."),
+    Departure("2 x 2 windows", ("windows_along=2",), "Nine windows say where in the view a box comes from."),
+    Departure("windows of a quarter", ("window_share=0.25",), "A window must hold enough features to be found again."),
+    Departure("best window only", ("pairing=best",), "Eq. (1); the same window says that the view is the same."),
+    Departure("same window only", ("pairing=same",), "The best window also finds a view from nearer or aside."),
+)
+"""One row of the study each."""

@@ -1,0 +1,264 @@
+"""The whole study: drives opened, experiments chosen, each written when it is done and not done twice."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import re
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import vplog
+from vplog import logs, record
+from vplog.compare import check_truth, same_drive
+from vplog.errors import ResultError, SettingsError, TruthError
+from vplog.evaluate.place_truth import TruthChoice, open_truth
+from vplog.methods import read_methods
+from vplog.references import PAPER_SIZE
+from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
+from vplog.study.bench import Bench, all_pairs
+from vplog.study.charts import CHARTS
+from vplog.study.experiments import NUMBERS, Plan
+from vplog.study.pictures import PICTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vplog.pipeline import Pipeline
+    from vplog.walks import Progress
+
+METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
+"""Compared where the user names none."""
+SIZES = (10, 20, 50, 100)
+"""L of Fig. 6."""
+SEEDS = 3
+"""Libraries drawn for each figure: enough to see where one draw was lucky."""
+EXPERIMENTS = (*NUMBERS, *PICTURES)
+"""All of them, in the order they are done."""
+_TWO_DRIVES = {
+    "library": "which drive the library comes from",
+    "conditions": "a change of condition between drives",
+}
+"""What these experiments need two drives for."""
+_NOT_SCORES = {"charts.py", "pictures.py", "style.py", "experiments.py", "study.py", "ablations.py", "boxes.py"}
+"""Files of the study that what a trial finds does not depend on."""
+
+
+def study(
+    drives: Sequence[Path],
+    truth: TruthChoice,
+    pipeline: Pipeline,
+    out: Path,
+    methods: Sequence[str] = METHODS,
+    sizes: Sequence[int] = SIZES,
+    seeds: int = SEEDS,
+    library_size: int = PAPER_SIZE,
+    min_gap: int | None = None,
+    only: Sequence[str] | None = None,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """Every experiment (those of `only`) on drives of one route, each query and map in turn; what study.json says.
+
+    A single drive is looked for in its own past, frames at least `min_gap` older. Raises VplogError with one line
+    where that cannot be.
+    """
+    chosen = _choose(only, len(drives))
+    plan = Plan(tuple(methods), library_size, tuple(sorted(set(sizes))), seeds, pipeline)
+    recognisers = read_methods(methods, pipeline)
+    _check_drives(drives, min_gap)
+    _begin(out)
+    warnings: list[str] = []
+    with ExitStack() as stack:
+        stack.enter_context(record.heard(warnings))
+        opened = [logs.open(path, topics) for path in drives]
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=out)))
+        names = short_names([log.name for log in opened])
+        known = {}
+        for query, other in all_pairs(len(drives)):
+            of_pair = truth_of_pair(truth, query, other, len(drives))
+            known[query, other] = open_truth(of_pair, opened[query], opened[other])
+            warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)
+        hashes = [_hash(record.hash_inputs(path)) for path in drives]
+        common = {
+            "features": pipeline.features.model_dump(mode="json"),
+            "topics": None if topics is None else topics.model_dump(mode="json"),
+            "min_gap": min_gap,
+            "truth_hash": _truth_hash(truth),
+        }
+        bench = Bench(
+            names, opened, hashes, recognisers, known, _covered(known, opened), pipeline.features, min_gap,
+            {**common, "code": _code_hash(_NOT_SCORES)}, out / "trials.json", scratch, stack, threads, progress,
+        )  # fmt: skip
+        account = {
+            "vplog": vplog.__version__,
+            "drives": [
+                {"name": name, "log": str(path), "frames": len(log.stamps()), "hash": digest}
+                for name, path, log, digest in zip(names, drives, opened, hashes, strict=True)
+            ],
+            "truth": asdict(truth),
+            **common,
+            "library_size": library_size,
+            "sizes": list(plan.sizes),
+            "seeds": seeds,
+            "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
+        }
+        inputs = _hash({**account, "pipeline": pipeline.model_dump(mode="json"), "code": _code_hash(set())})
+        done = _kept(out, inputs)
+        for name in chosen:
+            if name not in done:
+                done[name] = _do(name, bench, plan, out)
+                _write(out, account, inputs, done, [])
+        said = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
+        return _write(out, account, inputs, done, list(dict.fromkeys(said)))
+
+
+def _do(name: str, bench: Bench, plan: Plan, out: Path) -> dict[str, Any]:
+    began = time.perf_counter()
+    if name in NUMBERS:
+        found = NUMBERS[name](bench, plan)
+        CHARTS[name](found, out)
+        figures = [name]
+    else:
+        found, figures = PICTURES[name](bench, plan, out)
+    files = [f"{figure}.{kind}" for figure in figures for kind in ("png", "svg")]
+    return {"figures": files, **found, "seconds": round(time.perf_counter() - began, 3)}
+
+
+def _write(
+    out: Path, account: dict[str, Any], inputs: str, done: dict[str, Any], warnings: list[str]
+) -> dict[str, Any]:
+    ordered = {name: done[name] for name in EXPERIMENTS if name in done}
+    result = plain({**account, "inputs": inputs, "experiments": ordered, "warnings": warnings})
+    write_run_json(out / "study.json", result)
+    return result
+
+
+def _kept(out: Path, inputs: str) -> dict[str, Any]:
+    """Experiments that study.json holds of the same inputs, with all their figures. Figures of others are removed."""
+    try:
+        found = read_run_json(out / "study.json")
+    except ResultError:
+        return {}
+    earlier = found.get("experiments")
+    kept = {}
+    for name, one in earlier.items() if isinstance(earlier, dict) else ():
+        files = one.get("figures") if isinstance(one, dict) else None
+        if name not in EXPERIMENTS or not isinstance(files, list):
+            continue
+        paths = [out / Path(str(file)).name for file in files]
+        if found.get("inputs") == inputs and all(path.is_file() for path in paths):
+            kept[name] = one
+            continue
+        for path in paths:
+            if path.suffix in (".png", ".svg"):
+                path.unlink(missing_ok=True)
+    return kept
+
+
+def _choose(only: Sequence[str] | None, drives: int) -> list[str]:
+    """Names of the experiments to do. Raises SettingsError for one that is none, or that needs more drives."""
+    for name in only or ():
+        if name not in EXPERIMENTS:
+            raise SettingsError(f"--only {name}: there is no such experiment. Choose of {', '.join(EXPERIMENTS)}.")
+        if drives < 2 and name in _TWO_DRIVES:
+            raise SettingsError(f"--only {name} is about {_TWO_DRIVES[name]}; give two drives or more.")
+    return [name for name in EXPERIMENTS if (only is None or name in only) and not (drives < 2 and name in _TWO_DRIVES)]
+
+
+def _check_drives(drives: Sequence[Path], min_gap: int | None) -> None:
+    for number, path in enumerate(drives):
+        if any(same_drive(path, other) for other in drives[:number]):
+            raise SettingsError(f"{path} is given twice. Give each drive once; it is query and map in turn.")
+    if len(drives) == 1 and min_gap is None:
+        raise SettingsError(
+            f"{drives[0]} alone is looked for in its own past. Say how many frames older a match must be: "
+            "--min-gap 50. Or give more drives of the same route."
+        )
+    if len(drives) > 1 and min_gap is not None:
+        raise SettingsError("--min-gap is for a drive looked for in its own past; leave it out, or give one drive.")
+
+
+def _begin(out: Path) -> None:
+    if out.is_dir() and any(out.iterdir()) and not any((out / f"{n}.json").is_file() for n in ("study", "trials")):
+        raise SettingsError(f"{out} is a folder with other things in it, not a study. Choose another with -o.")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
+
+
+def truth_of_pair(truth: TruthChoice, query: int, other: int, drives: int) -> TruthChoice:
+    """The choice for one pair: of a list of TUM files, one for each drive, those of its two.
+
+    Raises TruthError where the list has another length, or a table of pairs would serve more than one pair.
+    """
+    if truth.source.lower().endswith(".csv") and drives > 1:
+        raise TruthError(
+            f"--truth {truth.source} lists the pairs of one query and one map, and here every drive is both. "
+            "Use index, poses, gps or a TUM file for each drive."
+        )
+    files = truth.source.split(",")
+    if len(files) == 1 or Path(truth.source).is_file():
+        return truth
+    if len(files) != drives:
+        raise TruthError(f"--truth has {len(files)} files for {drives} drives. Give one for all, or one for each.")
+    return replace(truth, source=f"{files[query]},{files[other]}")
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names without the words that all begin with, and different from each other.
+
+    >>> short_names(["walk_day_left", "walk_night", "walk_night"])
+    ['day_left', 'night', 'night (2)']
+    """
+    begin = 0
+    if len(names) > 1:
+        alike = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+        shared = "".join(letters[0] for letters in alike)
+        begin = max(shared.rfind(mark) for mark in "_- ") + 1
+    result: list[str] = []
+    for name in names:
+        short = name[begin:] or name
+        same = sum(re.sub(r" \(\d+\)$", "", other) == short for other in result)
+        result.append(f"{short} ({same + 1})" if same else short)
+    return result
+
+
+def _covered(known: dict[tuple[int, int], Any], opened: Sequence[Any]) -> list[np.ndarray]:
+    """Frames of each drive that the truth of all its pairs covers."""
+    frames = [np.arange(len(log.stamps())) for log in opened]
+    for (query, other), truth in known.items():
+        frames[query] = np.intersect1d(frames[query], truth.query_frames)
+        frames[other] = np.intersect1d(frames[other], truth.map_frames)
+    return frames
+
+
+def _hash(tree: Any) -> str:
+    return hashlib.sha256(canonical_json(tree).encode()).hexdigest()
+
+
+def _truth_hash(truth: TruthChoice) -> str:
+    """Of the choice, and of the files it names."""
+    files = [Path(file) for file in {truth.source, *truth.source.split(",")} if Path(file).is_file()]
+    return _hash([asdict(truth), [record.hash_inputs(file) for file in sorted(files)]])
+
+
+def _code_hash(without: set[str]) -> str:
+    """Of the package's own files: another version of a recogniser finds other places by the same settings."""
+    package = Path(vplog.__file__).parent
+    digest = hashlib.sha256()
+    for part in ("data.py", "evaluate", "extract.py", "features", "logs", "places", "references.py", "study",
+                 "trials.py", "walks.py"):  # fmt: skip
+        files = sorted((package / part).rglob("*.py")) if (package / part).is_dir() else [package / part]
+        for file in files:
+            if file.parent.name != "study" or file.name not in without:
+                digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
