@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vplog.errors import LibraryError
-from vplog.places.bobb import BobbSettings
-from vplog.places.hybrid import HybridIndex, HybridSettings, HybridState, learn_words
+from vplog.places.bobb import BobbSettings, Place
+from vplog.places.hybrid import Described, HybridIndex, HybridSettings, HybridState, learn_words
+from vplog.places.stored import strongest
 from vplog.places.vocabulary import root_sift
 
 from .pictures import noisy, nothing, reference
@@ -61,7 +62,7 @@ def literal_signs(state: HybridState, features: Features) -> list[bool]:
     return [float(residual @ direction) > 0 for residual in residuals for direction in words.turn.T]
 
 
-def test_signs_are_those_of_the_words_residuals(hybrid: HybridState, references: list[Reference]) -> None:
+def test_signs_are_those_of_the_words_residuals(references: list[Reference]) -> None:
     whole = SMALL.model_copy(update={"bobb": SMALL.bobb.model_copy(update={"least_size": 0.0})})
     state = whole.learn(references, 1)
     for row in (0, 5):
@@ -88,8 +89,8 @@ def test_bits_are_even_and_near_features_give_near_signs(hybrid: HybridState, re
 def test_agreement_counts_equal_bits(rows: list[bytes], query: int) -> None:
     signs = np.array([list(row) for row in rows], np.uint8)
     asked = signs[query % len(signs)]
-    described = type("Described", (), {"boxes": None, "signs": asked})()
-    _, agreement = signs_alone(signs).alike(described)
+    none = Place(np.zeros(0, np.uint16), np.zeros(0, np.uint8), np.zeros((0, 9), np.uint8))
+    _, agreement = signs_alone(signs).alike(Described(none, asked))
     differ = np.unpackbits(signs ^ asked, axis=1).mean(axis=1)
     expected = np.maximum(1 - 2 * differ, 0) * signs.any(axis=1) * asked.any()
     np.testing.assert_allclose(agreement, expected, atol=1e-6)
@@ -127,8 +128,7 @@ def test_words_tell_places_that_the_library_does_not_explain(references: list[Re
 
 
 def test_a_place_fits_160_bytes(references: list[Reference]) -> None:
-    state = HybridSettings(bobb=BobbSettings(references=8, features=150)).learn(references[:2], 1)
-    assert HybridSettings().bobb.references == 8
+    state = HybridSettings().learn(references[:2], 1)
     assert state.bits <= 8 * 160
 
 
@@ -138,9 +138,8 @@ def test_one_reference_is_enough(references: list[Reference]) -> None:
     assert not state.describe(nothing()).signs.any()
 
 
-def test_few_features_are_enough_for_all_words(references: list[Reference]) -> None:
-    few = HybridSettings(words=256)
-    words = learn_words([references[0].features], few.model_copy(update={"words": 256, "bits": 8}))
+def test_fewer_features_than_words_will_do(references: list[Reference]) -> None:
+    words = learn_words([strongest(references[0], 100).features], HybridSettings(words=256, bits=8))
     assert words.signs(references[0].features).shape == (256,)
 
 

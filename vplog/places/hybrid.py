@@ -44,13 +44,15 @@ _STEPS = 4096
 """Of 1: what is summed over features is rounded to whole ones, so sums stay below 2^53 and exact in any order, and no
 bit depends on the number of threads."""
 _DIRECTIONS = 64
-"""Principal directions of descriptors that are kept, half of them: those after hold a tenth of the variance."""
+"""Principal directions of descriptors that are kept, half of them: those after hold a twentieth of the variance."""
 _LEAST_VARIANCE = 1e-4
 """Of the largest: directions with less are the noise of few features, and are not whitened further."""
 _ITERATIONS = 10
 """Of k-means; with a thousand features a word its centres hardly move after."""
 _MOST_FEATURES = 100_000
 """Library features that words are learned from, spread evenly: more than enough for a few hundred directions."""
+_MOST_REFERENCES = 500
+"""References whose scores are compared with each other's, spread evenly: a quarter of a million pairs."""
 
 
 class HybridSettings(Settings):
@@ -66,8 +68,9 @@ class HybridSettings(Settings):
     bits: Literal[8, 16, 32, 64] = 64
     """Directions a word in which its features differ, one bit each."""
     place: float = Field(default=1.0, ge=0)
-    """Where a feature lies counts like its descriptor when it is off by 1 / `place` of the image: the whole of it, so
-    that a view may shift, but not be upside down."""
+    """How much where a feature lies counts: a difference of the whole image side weighs `place` times as much as the
+    root mean square of descriptors' distances from their mean. One by day in shifted views; more helps in other light,
+    where descriptors change and the layout does not; 0 asks for no place."""
     whitening: float = Field(default=0.5, ge=0, le=1)
     """Directions are divided by their variance to half this power: few of them would decide all bits otherwise."""
     share: float = Field(default=0.5, ge=0, le=1)
@@ -82,8 +85,9 @@ class HybridSettings(Settings):
         bobb = self.bobb.learn(kept, threads)
         words = learn_words([large_enough(r.features, self.bobb) for r in kept], self)
         state = HybridState(self, kept, bobb, words, self.share)
+        rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MOST_REFERENCES)).astype(np.int64)).tolist()
         with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
-            places = list(pool.map(lambda reference: state.describe(reference.features), kept))
+            places = list(pool.map(lambda row: state.describe(kept[row].features), rows))
         return HybridState(self, kept, bobb, words, _balance(state.index(places), places, self.share))
 
     def load(self, folder: Path, threads: int) -> HybridState:
