@@ -93,15 +93,18 @@ def bare_sift(settings: SiftSettings) -> Callable[[Bytes], Any]:
 
 def recall(state: BobbState, features: list[Features]) -> float:
     """Share of features whose nearest library feature the graph finds, or another one just as near."""
-    graph, settings = state.matcher.index, state.settings
-    exact = faiss.IndexFlatL2(graph.d)
-    exact.add(graph.reconstruct_n(0, graph.ntotal))  # pyright: ignore[reportCallIssue]
+    matcher, settings = state.matcher, state.settings
     right = count = 0
-    for one in features:
-        values = matches._comparable(matches.large_enough(one, settings).descriptors, settings)
-        if len(values):
-            found = graph.search(values, settings.neighbours)[0][:, 0]
-            nearest = exact.search(values, 1)[0][:, 0]  # pyright: ignore[reportCallIssue]
-            right += int(np.sum(found <= nearest))
-            count += len(values)
+    for kind, described in ((matcher.keypoints, matches.keypoints_of), (matcher.patches, matches.patches_of)):
+        if kind is None:
+            continue
+        exact = faiss.IndexFlatL2(kind.graph.d)
+        exact.add(kind.graph.reconstruct_n(0, kind.graph.ntotal))  # pyright: ignore[reportCallIssue]
+        for one in features:
+            values, _ = described(one, settings)
+            if len(values):
+                found = kind.graph.search(values, settings.neighbours)[0][:, 0]
+                nearest = exact.search(values, 1)[0][:, 0]  # pyright: ignore[reportCallIssue]
+                right += int(np.sum(found <= nearest))
+                count += len(values)
     return right / max(count, 1)

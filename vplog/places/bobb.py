@@ -3,9 +3,10 @@
 The paper's three steps: the references that explain an image (section III-A), boxes on each of them where the features
 of a window are found again (section III-B), places alike where their boxes overlap on the same references (Eq. 1).
 `bobb_paper.py` is the paper to the letter. This one departs from it where that recognises better; each departure is a
-setting: matches weighed by relative distance (`reach`), RootSIFT (`root_sift`), no grain (`least_size`), matches that
-agree in their motion (`agreement`, `agreement_floor`), popular references counting less (`popularity`), weights of the
-references in the score, even windows (`windows_along`), the expected vote in closed form (`expected_votes.py`), boxes
+setting: matches weighed by relative distance (`reach`), RootSIFT (`root_sift`), no grain (`least_size`), patches
+beside keypoints (`patch_weight`), matches that agree in their motion (`agreement`, `agreement_floor`), popular
+references counting less (`popularity`), weights of the references in the score (`share_power`), a reference that
+explains itself (`own`), even windows (`windows_along`), the expected vote in closed form (`expected_votes.py`), boxes
 of one shape that a byte holds (`columns`, `rows`), and a window compared with its own as well as with the best
 (`pairing`).
 """
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Floats, Reference
+    from vplog.data import Bytes, Features, Float32s, Floats, Reference
     from vplog.places.code_search import Uint16s
     from vplog.places.matches import Matcher
 
@@ -58,6 +59,12 @@ class BobbSettings(WeighedMatchSettings):
     """Share of its weight that a match keeps when no other agrees; 1 switches agreement off."""
     popularity: float = Field(default=0.5, ge=0)
     """References that explain many others count less, by this power of how much they explain; 0 switches it off."""
+    share_power: float = Field(default=0.5, ge=0)
+    """A reference's weight is its part in explaining the image to this power. With the root, places of equal boxes
+    score the Bhattacharyya coefficient of what explains them; with 1 the first reference decides nearly alone."""
+    own: bool = True
+    """An image of the library is explained by itself, as much as by the best other reference; its boxes then lie where
+    the windows are. Off, it is explained by the others alone, and misses the one that a later visit has first."""
     windows_along: int = Field(default=3, ge=1, le=16)
     """Windows along each side; I is their square."""
     window_share: float = Field(default=0.4, gt=0, le=1)
@@ -70,9 +77,10 @@ class BobbSettings(WeighedMatchSettings):
     """M: patches of a random partition along the width; the closed form is the average over all of them."""
     patches_y: int = Field(default=16, ge=1)
     """N: patches of a random partition along the height."""
-    box_columns: int = Field(default=6, ge=1)
-    """Width of a box in cells. 6 x 3 of 16 x 12 is the largest box within the paper's tenth of the reference."""
-    box_rows: int = Field(default=3, ge=1)
+    box_columns: int = Field(default=8, ge=1)
+    """Width of a box in cells. A box of half the sides is a window with a tenth around it, and overlaps one that lies
+    up to half an image away: how far boxes are apart then tells, where the paper's tenth of the area misses at once."""
+    box_rows: int = Field(default=6, ge=1)
     """Height of a box in cells."""
     pairing: Literal["best", "same", "both"] = "both"
     """Boxes of two places compared on one reference: each with the best of the other's (Eq. 1), with that of the same
@@ -192,16 +200,15 @@ class BobbState:
         weights = np.zeros(s.references, np.uint8)
         boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
         matches = self.matcher.match(features)
-        for j, (reference, share, agreed) in enumerate(self._retrieve(matches)):
-            part = slice(matches.start[reference], matches.start[reference + 1])
-            references[j], weights[j] = reference, max(round(255 * share), 1)
+        for j, (reference, share, here, there, agreed) in enumerate(self._retrieve(matches)):
+            references[j], weights[j] = reference, max(round(255 * share**s.share_power), 1)
             boxes[j] = expected_votes.best_boxes(
-                matches.here[part], matches.there[part], agreed, self._windows, self._along_y, self._along_x, NOWHERE
+                here, there, agreed, self._windows, self._along_y, self._along_x, NOWHERE
             )
         return Place(references, weights, boxes)
 
-    def _retrieve(self, matches: Matches) -> list[tuple[int, float, np.ndarray]]:
-        """At most J references that explain most (Alg. 1 line 2), each's share of the best one's, and weights.
+    def _retrieve(self, matches: Matches) -> list[tuple[int, float, Float32s, Float32s, Float32s]]:
+        """At most J references that explain most (Alg. 1 line 2), each's share of the best one's, and its matches.
 
         The first 3 J by the sum of weights are looked at again, with matches that agree in their motion counting more.
         """
@@ -215,9 +222,14 @@ class BobbState:
             agreed = expected_votes.agreement(
                 matches.here[part], matches.there[part], matches.weight[part], s.agreement, s.agreement_floor
             )
-            found.append((reference, float(agreed.sum(dtype=np.float64) * self.rarity[reference]), agreed))
+            explained = float(agreed.sum(dtype=np.float64) * self.rarity[reference])
+            found.append((reference, explained, matches.here[part], matches.there[part], agreed))
         found.sort(key=lambda one: -one[1])
-        return [(reference, weight / found[0][1], agreed) for reference, weight, agreed in found[: s.references]]
+        if s.own and matches.itself >= 0:
+            best = found[0][1] if found else 1.0
+            everywhere = matches.points
+            found.insert(0, (matches.itself, best, everywhere, everywhere, np.ones(len(everywhere), np.float32)))
+        return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]
 
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
         s = self.settings

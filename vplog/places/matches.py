@@ -1,5 +1,8 @@
 """Which library features an image's features are like, and how much each of these matches is worth.
 
+Features are of two kinds, each compared with its own: keypoints, found again where the view turns or comes nearer, and
+patches at even steps, found again in other light.
+
 The paper takes every neighbour below one absolute distance for the same word. Distances change with light and blur, so
 here a match counts by how much nearer it is than the feature's last neighbour, which nobody takes for the same.
 """
@@ -15,11 +18,12 @@ from pydantic import Field
 
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
+from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from vplog.data import Bytes, Features, Float32s, Int32s, Reference
 
@@ -30,14 +34,17 @@ _ROOT_STEPS = 512.0
 class WeighedMatchSettings(Settings):
     """How features are matched to those of a library."""
 
-    features: int = Field(default=800, ge=1)
-    """Strongest features of an image that are used, of those large enough."""
+    features: int = Field(default=400, ge=0)
+    """Strongest keypoints of an image that are used, of those large enough; 0 uses patches alone."""
     least_size: float = Field(default=0.006, ge=0, le=1)
-    """Smallest feature used, as a share of the image's mean side: below about 3 px of a 640 x 360 image, features are
+    """Smallest keypoint used, as a share of the image's mean side: below about 3 px of a 640 x 360 image, keypoints are
     grain that another camera, resolution or light does not show again."""
     root_sift: bool = True
     """Compare the roots of descriptors (Arandjelovic & Zisserman 2012) instead of the descriptors."""
-    neighbours: int = Field(default=32, ge=2)
+    patch_weight: float = Field(default=2.0, ge=0)
+    """A patch's match weighs this many times a keypoint's: 400 keypoints then have about as much say as the 169
+    patches, on the images of a library among themselves. 0 uses keypoints alone."""
+    neighbours: int = Field(default=24, ge=2)
     """Nearest library features looked at for each feature; the last one sets the scale of the others' distances."""
     reach: float = Field(default=0.8, gt=0)
     """A match weighs 1 - d2 / (reach x d2 of the last neighbour), squared distances, and nothing below zero."""
@@ -58,9 +65,24 @@ class Matches:
     there: Float32s
     """(E, 2) where in the reference, as shares of its sides."""
     weight: Float32s
-    """(E,) 0..1."""
-    features: int
-    """Features of the image that were used."""
+    """(E,) 0..1, times `patch_weight` where it is of a patch."""
+    itself: int
+    """The reference that is the image itself, -1 where none is. It has no matches: it explains everything."""
+    points: Float32s
+    """(M, 2) where all the image's features are, as shares of its sides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Indexed:
+    """The F features of one kind that L references have."""
+
+    owner: Int32s
+    """(F,) reference of each."""
+    points: Float32s
+    """(F, 2) as shares of the reference's sides."""
+    graph: Any
+    weight: float
+    """Of a match."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,29 +91,38 @@ class Matcher:
 
     references: list[Reference]
     settings: WeighedMatchSettings
-    owner: Int32s
-    """(F,) reference of each library feature."""
-    points: Float32s
-    """(F, 2) as shares of the reference's sides."""
-    index: Any
+    keypoints: Indexed | None
+    patches: Indexed | None
+    """None where they are not used, or the references have none."""
 
     def __len__(self) -> int:
         return len(self.references)
 
     def match(self, features: Features) -> Matches:
-        """Matches of an image. A reference that is the image itself explains nothing, and is left out."""
-        used = large_enough(features, self.settings)
-        count, L = len(used), len(self.references)
-        if count == 0:
-            nothing = np.zeros((0, 2), np.float32)
-            return Matches(np.zeros(L + 1, np.int32), nothing, nothing, np.zeros(0, np.float32), 0)
-        distance, entry = self.index.search(_comparable(used.descriptors, self.settings), self.settings.neighbours)
-        itself = _itself(distance, entry, self.owner, L)
-        feature, library, weight = _weigh(distance, entry, self.owner, L, itself, self.settings.reach)
-        order = np.argsort(self.owner[library], kind="stable")
-        feature, library, weight = feature[order], library[order], weight[order]
-        start = np.searchsorted(self.owner[library], np.arange(L + 1)).astype(np.int32)
-        return Matches(start, shares(used)[feature], self.points[library], weight, count)
+        """Matches of an image."""
+        s, L = self.settings, len(self.references)
+        found = []
+        for kind, described in ((self.keypoints, keypoints_of), (self.patches, patches_of)):
+            if kind is not None:
+                values, points = described(features, s)
+                if len(values):
+                    found.append((kind, points, *kind.graph.search(values, s.neighbours)))
+        itself = max((_itself(distance, entry, kind.owner, L) for kind, _, distance, entry in found), default=-1)
+        rows = [np.zeros(0, np.int32)]
+        here, there, weight = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
+        for kind, points, distance, entry in found:
+            feature, library, one = _weigh(distance, entry, kind.owner, L, itself, s.reach)
+            rows.append(kind.owner[library])
+            here.append(points[feature])
+            there.append(kind.points[library])
+            weight.append(one * np.float32(kind.weight))
+        owner = np.concatenate(rows)
+        order = np.argsort(owner, kind="stable")
+        start = np.searchsorted(owner[order], np.arange(L + 1)).astype(np.int32)
+        return Matches(
+            start, np.concatenate(here)[order], np.concatenate(there)[order], np.concatenate(weight)[order],
+            itself, np.concatenate([here[0], *(points for _, points, _, _ in found)]),
+        )  # fmt: skip
 
 
 def large_enough(features: Features, settings: WeighedMatchSettings) -> Features:
@@ -112,20 +143,40 @@ def shares(features: Features) -> Float32s:
     return ((features.points + 0.5) / np.array([features.width, features.height])).astype(np.float32)
 
 
+def keypoints_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
+    """Descriptors (M, 128) float32, whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
+    used = large_enough(features, settings)
+    return _comparable(used.descriptors, settings), shares(used)
+
+
+def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
+    """The same of patches; none where the features have no thumbnail."""
+    if settings.patch_weight == 0 or features.thumbnail is None:
+        return np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32)
+    return describe_patches(features.thumbnail)
+
+
 def index_references(references: Iterable[Reference], settings: WeighedMatchSettings) -> Matcher:
-    """Index the references' features. Raises LibraryError where they have none, or are too many to be numbered."""
+    """Index the references' features. Raises LibraryError where they have none."""
     kept = [replace(r, features=large_enough(r.features, settings)) for r in references]
     if not kept:
         raise LibraryError("A library needs at least one reference image; none was given.")
-    counts = [len(reference.features) for reference in kept]
-    if sum(counts) == 0:
+    keypoints = _index([keypoints_of(r.features, settings) for r in kept], settings, 1.0)
+    patches = _index([patches_of(r.features, settings) for r in kept], settings, settings.patch_weight)
+    if keypoints is None and patches is None:
         raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")
-    descriptors = np.concatenate([reference.features.descriptors for reference in kept])
-    values = _comparable(descriptors, settings)
-    index = hnsw(values, settings.hnsw_links, settings.hnsw_ef_construction, settings.neighbours)
-    points = np.concatenate([shares(reference.features) for reference in kept])
-    owner = np.repeat(np.arange(len(kept), dtype=np.int32), counts)
-    return Matcher(kept, settings, owner, points, index)
+    return Matcher(kept, settings, keypoints, patches)
+
+
+def _index(
+    described: Sequence[tuple[Float32s, Float32s]], settings: WeighedMatchSettings, weight: float
+) -> Indexed | None:
+    values = np.concatenate([values for values, _ in described])
+    if not len(values):
+        return None
+    graph = hnsw(values, settings.hnsw_links, settings.hnsw_ef_construction, settings.neighbours)
+    owner = np.repeat(np.arange(len(described), dtype=np.int32), [len(values) for values, _ in described])
+    return Indexed(owner, np.concatenate([points for _, points in described]), graph, weight)
 
 
 def _comparable(descriptors: Bytes, settings: WeighedMatchSettings) -> Float32s:
