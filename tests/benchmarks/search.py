@@ -3,8 +3,8 @@
 Made-up places, for no one has recorded a million. What decides the cost is how long the lists are and how fast weights
 fall, so these are as the paper's and real drives have them: reference r is as popular as 1 / (r + L / 18), which makes
 the first ten times as frequent as the median one (the paper's Fig. 9); weights fall with rank n as n^-0.8, which fits
-the default on real walks (255, 163, 110, 79, 62, .. 35 on a street); 9 % of boxes are nowhere, and the others anywhere, so that
-unrelated places overlap by .69 at best and .32 in the same window (.65 and .34 to .37 on real drives).
+the default on real drives (255, 163, 110, 79, 62, .. 35 on a street); 9 % of boxes are nowhere, and the others
+anywhere, so that unrelated places overlap by .69 at best and .32 in the same window (.65 and .34 to .37 on real ones).
 Half of the queries are map places seen again (three of ten references are others, weights differ by 30 %, 40 % of the
 boxes lie elsewhere), half are places that the map does not have, where least can be left out.
 """

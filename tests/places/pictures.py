@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -45,9 +46,11 @@ def nothing() -> Features:
 
 
 def noisy(features: Features, seed: int, noise: float = 4.0) -> Features:
-    """The same features with other descriptors: near, but not equal."""
+    """The same features with other descriptors and another thumbnail: near, but not equal."""
     rng = np.random.default_rng(seed)
-    near = np.clip(np.rint(features.descriptors + rng.normal(0, noise, features.descriptors.shape)), 0, 255)
-    return Features(
-        features.points, features.sizes, near.astype(np.uint8), features.depth_m, features.width, features.height
-    )
+
+    def near(values: np.ndarray) -> np.ndarray:
+        return np.clip(np.rint(values + rng.normal(0, noise, values.shape)), 0, 255).astype(np.uint8)
+
+    thumbnail = None if features.thumbnail is None else near(features.thumbnail)
+    return replace(features, descriptors=near(features.descriptors), thumbnail=thumbnail)

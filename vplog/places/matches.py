@@ -196,7 +196,7 @@ def _itself(distance, entry, owner, L):
                 break
             same[owner[entry[f, k]]] += 1
     most = np.argmax(same)
-    return most if 2 * same[most] > distance.shape[0] else -1
+    return int(most) if 2 * same[most] > distance.shape[0] else -1
 
 
 @numba.njit(cache=True, nogil=True)

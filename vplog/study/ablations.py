@@ -30,7 +30,16 @@ DEPARTURES = (
         "plain SIFT", ("root_sift=false",), "Roots of descriptors keep a few large values from ruling the distance."
     ),
     Departure("grain too", ("least_size=0",), "The smallest features are grain that another camera or light lacks."),
-    Departure("400 features", ("features=400",), "More features explain dim and blurred views, and cost time."),
+    Departure("keypoints alone", ("patch_weight=0",), "Patches need no detector, which fails in the dark."),
+    Departure("patches alone", ("features=0",), "Keypoints are found again where the view turns or comes nearer."),
+    Departure("800 keypoints", ("features=800",), "More describe blurred views, and cost twice the time."),
+    Departure("own image left out", ("own=false",), "A later visit is explained by the image of the first one."),
+    Departure("weights not rooted", ("share_power=1",), "The root lets more than the first reference decide."),
+    Departure(
+        "boxes of a tenth",
+        ("box_columns=6", "box_rows=3"),
+        "Boxes of half the sides tell how far apart they are; smaller ones miss each other at once.",
+    ),
     Departure("10 neighbours", ("neighbours=10",), "The scale of distances is read off a far neighbour, not a match."),
     Departure("all matches weigh alike", ("reach=100",), "Distances change with light, so a match counts relatively."),
     Departure(
