@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from vplog.errors import LibraryError
 from vplog.places.bobb import BobbSettings, Place
+from vplog.places.dense import thumbnail_of
 from vplog.places.hybrid import Described, HybridIndex, HybridSettings, HybridState, learn_words
-from vplog.places.stored import strongest
+from vplog.places.matches import WeighedMatchSettings, patches_of
+from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift
 
 from .pictures import noisy, nothing, reference
@@ -53,9 +55,12 @@ def literal_signs(state: HybridState, features: Features) -> list[bool]:
     words = state.words
     residuals = [np.zeros(words.centres.shape[1]) for _ in words.centres]
     size = np.array([features.width, features.height])
-    for descriptor, point in zip(root_sift(features.descriptors), features.points, strict=True):
+    patches, middles = describe_patches(thumbnail_of(features))
+    descriptors = np.concatenate([root_sift(features.descriptors), patches / 512])
+    points = np.concatenate([(features.points + 0.5) / size, middles])
+    for descriptor, point in zip(descriptors, points, strict=True):
         value = (descriptor.astype(np.float64) - words.mean) @ words.directions
-        value = np.append(value, ((point + 0.5) / size - 0.5) * words.place)
+        value = np.append(value, (point - 0.5) * words.place)
         differences = [value - centre / 4096 for centre in words.centres]
         nearest = int(np.argmin([np.linalg.norm(difference) for difference in differences]))
         residuals[nearest] += differences[nearest] / np.linalg.norm(differences[nearest])
@@ -139,8 +144,9 @@ def test_one_reference_is_enough(references: list[Reference]) -> None:
 
 
 def test_fewer_features_than_words_will_do(references: list[Reference]) -> None:
-    words = learn_words([strongest(references[0], 100).features], HybridSettings(words=256, bits=8))
-    assert words.signs(references[0].features).shape == (256,)
+    described = patches_of(references[0].features, WeighedMatchSettings())
+    words = learn_words([described], HybridSettings(words=256, bits=8))
+    assert words.signs(*described).shape == (256,)
 
 
 def test_bad_columns_are_refused(hybrid: HybridState, references: list[Reference]) -> None:

@@ -1,10 +1,10 @@
 """BoBB, with visual words where the library does not explain the scene: Tanaka et al., IROS 2014, section V.
 
 A library of few images explains few scenes. What their features look like is learned from far less: a handful of visual
-words, and in which directions features differ from them. An image is then, beside its boxes, one bit for each word and
-direction: to which side the image's features of that word lie, all together. These are the signs of a VLAD (Jegou et
-al., CVPR 2010) of residuals of unit length (Delhumeau et al., Revisiting the VLAD image representation, ACM MM 2013),
-with where a feature lies in the image as two more values of its descriptor.
+words, and in which directions features differ from them, keypoints and patches alike. An image is then, beside its
+boxes, one bit for each word and direction: to which side the image's features of that word lie, all together. These
+are the signs of a VLAD (Jegou et al., CVPR 2010) of residuals of unit length (Delhumeau et al., Revisiting the VLAD
+image representation, ACM MM 2013), with where a feature lies in the image as two more values of its descriptor.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ from vplog.errors import LibraryError
 from vplog.places import stored
 from vplog.places.bobb import BobbSettings
 from vplog.places.dense import best_rows, vectors_from_arrow, vectors_to_arrow
-from vplog.places.matches import large_enough, shares
+from vplog.places.matches import keypoints_of, patches_of
 from vplog.places.relearn import relearn
-from vplog.places.vocabulary import root_sift
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -61,8 +60,10 @@ class HybridSettings(Settings):
     kind: Literal["hybrid"] = "hybrid"
     """Which recogniser."""
     bobb: BobbSettings = BobbSettings(references=8)
-    """The boxes. Two references fewer than BoBB alone, so that a place stays within 160 bytes; its features, least size
-    and library are the words' own, too."""
+    """The boxes. Two references fewer than BoBB alone, so that a place stays within 160 bytes; its least size and its
+    patches are the words' own, too."""
+    features: int = Field(default=800, ge=0)
+    """Strongest keypoints that have words, beside the patches: sums over many tell more, and cost no search."""
     words: int = Field(default=8, ge=1, le=256)
     """Visual words. Few, so that each has about a hundred features of an image and their sum is more than noise."""
     bits: Literal[8, 16, 32, 64] = 64
@@ -83,7 +84,7 @@ class HybridSettings(Settings):
         """Index the references, learn words, and how scores vary. Raises LibraryError where there are no features."""
         kept = list(references)
         bobb = self.bobb.learn(kept, threads)
-        words = learn_words([large_enough(r.features, self.bobb) for r in kept], self)
+        words = learn_words([_described(r.features, self) for r in kept], self)
         state = HybridState(self, kept, bobb, words, self.share)
         rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MOST_REFERENCES)).astype(np.int64)).tolist()
         with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
@@ -109,16 +110,23 @@ class Words:
     turn: Floats
     """(66, B) whole steps: a rotation, so that each bit tells as much."""
 
-    def signs(self, features: Features) -> Bytes:
+    def signs(self, values: Float32s, points: Float32s) -> Bytes:
         """(W * B / 8,) bits: the side on which the features of a word lie, summed. All 0 without features."""
-        values = _values(features, self.mean, self.directions, self.place)
-        return np.packbits(_sum_residuals(values, self.centres, _STEPS) @ self.turn > 0)
+        placed = _place_values(values / np.float32(_SIFT_STEPS), points, self.mean, self.directions, self.place)
+        return np.packbits(_sum_residuals(placed, self.centres, _STEPS) @ self.turn > 0)
 
 
-def learn_words(features: Sequence[Features], settings: HybridSettings) -> Words:
+def _described(features: Features, settings: HybridSettings) -> tuple[Float32s, Float32s]:
+    """(M, 128) RootSIFT in steps of 1/512 and (M, 2) places of an image's patches and keypoints."""
+    wanted = settings.bobb.model_copy(update={"features": settings.features, "root_sift": True})
+    kinds = keypoints_of(features, wanted), patches_of(features, wanted)
+    return np.concatenate([values for values, _ in kinds]), np.concatenate([points for _, points in kinds])
+
+
+def learn_words(features: Sequence[tuple[Float32s, Float32s]], settings: HybridSettings) -> Words:
     """From the library's features, of which there is one at least."""
-    steps = np.concatenate([np.rint(root_sift(f.descriptors) * _SIFT_STEPS) for f in features]).astype(np.float64)
-    points = np.concatenate([shares(f) for f in features])
+    steps = np.concatenate([values for values, _ in features]).astype(np.float64)
+    points = np.concatenate([points for _, points in features])
     rows = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _MOST_FEATURES)).astype(np.int64))
     mean, directions = _principal(steps[rows] / _SIFT_STEPS, settings.whitening)
     rng = np.random.default_rng(settings.seed)
@@ -142,10 +150,6 @@ def _principal(values: Floats, whitening: float) -> tuple[Float32s, Float32s]:
     variance = np.maximum(variance[kept], max(_LEAST_VARIANCE * variance.max(), 1e-12))
     length = np.sqrt((variance ** (1 - whitening)).sum())
     return mean.astype(np.float32), (sides / (variance ** (whitening / 2) * length)).astype(np.float32)
-
-
-def _values(features: Features, mean: Float32s, directions: Float32s, place: float) -> Floats:
-    return _place_values(root_sift(features.descriptors), shares(features), mean, directions, place)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -254,7 +258,7 @@ class HybridState:
 
     def describe(self, features: Features) -> Described:
         """Boxes and signs of the same features."""
-        return Described(self.bobb.describe(features), self.words.signs(large_enough(features, self.settings.bobb)))
+        return Described(self.bobb.describe(features), self.words.signs(*_described(features, self.settings)))
 
     def index(self, descriptors: Sequence[Described]) -> HybridIndex:
         boxes = self.bobb.index([place.boxes for place in descriptors])
