@@ -305,7 +305,7 @@ def test_two_drives_are_not_one_run(verb: Verb, drive: Drive, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (("--pipeline", "nonsense"), "default, paper"),
+        (("--pipeline", "nonsense"), "default, fast, paper"),
         (("--pipeline", "nonsense.yaml"), "nonsense.yaml"),
         (("--set", "propose.nonsense=1"), "propose.nonsense"),
         (("--set", "nonsense.per_query=1"), "nonsense"),

@@ -64,7 +64,8 @@ def without_seconds(found: dict[str, Any]) -> dict[str, Any]:
 def test_every_experiment_on_two_drives(
     verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vplog.study.experiments.DEPARTURES", DEPARTURES[4:6])  # two stand for all: one loop does them
+    two = [departure for departure in DEPARTURES if departure.name in ("no agreement", "own image left out")]
+    monkeypatch.setattr("vplog.study.experiments.DEPARTURES", two)  # they stand for all: one loop does them
     day, dusk = walks
     out = tmp_path / "study"
     arguments = ("study", day, dusk, "--truth", "index", "-o", out, *QUICK)
