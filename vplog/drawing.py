@@ -29,9 +29,24 @@ def drawn(folder: Path, name: str, width: float, height: float) -> Iterator[Figu
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
+        _settle(figure)
         for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
             with replacing(folder / f"{name}.{kind}") as stream:
                 figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
+
+
+def _settle(figure: Figure) -> None:
+    """Lay out once and for all. The solver's last digits hang on where its variables lie in memory, so that the same
+    figure would differ from one process to the next."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        left, bottom, width, height = axes.get_position(original=True).bounds
+        axes.set_position((round(left, 4), round(bottom, 4), round(width, 4), round(height, 4)), which="original")
+    for part in (figure, *figure.subfigs):
+        for text in part.texts:
+            x, y = text.get_position()
+            text.set_position((round(float(x), 4), round(float(y), 4)))
 
 
 def as_text(name: str) -> str:
