@@ -241,8 +241,8 @@ def test_the_same_frames_at_dusk(walks: tuple[Path, Path]) -> None:
     assert done.record["library"]["size"] == 8
     assert list(done.record["methods"]) == list(done.ranks) == methods
     assert done.record["methods"]["bovf:words=300"]["r_at_1"] > 0.9
-    # half the map's frames are references: none explains itself, but each explains its twin at dusk
-    assert done.record["methods"]["bobb"]["r_at_1"] > 0.4
+    # half the frames of the map are references: each explains itself, and its twin at dusk
+    assert done.record["methods"]["bobb"]["r_at_1"] > 0.7
     assert done.record["methods"]["bobb"]["settings"]["windows_along"] == 3
 
 
