@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from vplog.errors import LibraryError
 from vplog.places.chow_liu import ChowLiuTree
-from vplog.places.fabmap import FabmapSettings, FabmapState, Model, log_likelihood_table
+from vplog.places.fabmap import FabmapSettings, FabmapState
+from vplog.places.fabmap_model import Model, log_likelihood_table
 from vplog.places.vocabulary import Vocabulary
 
 from .pictures import noisy

@@ -24,7 +24,7 @@ class SiftSettings(Settings):
     kind: Literal["sift"] = "sift"
     """Which extractor."""
     max_features: int = Field(default=2000, ge=1)
-    """Features kept of an image, by response: enough that 800 of them are large enough to describe a place, while
+    """Features kept of an image, by response: enough that 400 of them are large enough to describe a place, while
     verification takes the 1000 strongest."""
     contrast_threshold: float = Field(default=0.02, ge=0)
     """Weakest extremum kept, half of Lowe's: `max_features` bounds a picture rich in contrast, and at night or in fog

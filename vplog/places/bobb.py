@@ -26,14 +26,16 @@ from pydantic import Field, model_validator
 from vplog.errors import LibraryError
 from vplog.places import expected_votes, stored
 from vplog.places.code_search import CodeIndex
+from vplog.places.columns import check_type, check_values
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
 from vplog.places.relearn import relearn
+from vplog.places.shared import Shared, list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Reference
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference
     from vplog.places.code_search import Uint16s
     from vplog.places.matches import Matcher
 
@@ -232,11 +234,28 @@ class BobbState:
         return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]
 
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
+        return CodeIndex(*self._arrays(descriptors), self._overlaps(), len(self.matcher), self.settings.pairing)
+
+    def _overlaps(self) -> Bytes:
         s = self.settings
-        overlap = expected_votes.overlaps(
+        return expected_votes.overlaps(
             s.columns - s.box_columns + 1, s.rows - s.box_rows + 1, s.box_columns, s.box_rows
         )
-        return CodeIndex(*self._arrays(descriptors), overlap, len(self.matcher), s.pairing)
+
+    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> Shared:
+        """The parts of the score of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
+        s = self.settings
+        references, weights, boxes = self._arrays(places)
+        table = self._overlaps()
+
+        def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
+            cells = table[boxes[rows, ranks][:, :, None], boxes[others, other_ranks][:, None, :]].astype(np.float64)
+            best, same = cells.max(axis=2).mean(axis=1), np.einsum("eii->e", cells) / s.boxes
+            overlap = {"best": best, "same": same, "both": (best + same) / 2.0}[s.pairing]
+            overlap /= s.box_columns * s.box_rows
+            return overlap, overlap * weights[rows, ranks] * weights[others, other_ranks]
+
+        return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
 
     def _arrays(self, descriptors: Sequence[Place]) -> tuple[Uint16s, Bytes, Bytes]:
         s = self.settings
@@ -256,11 +275,9 @@ class BobbState:
     def from_arrow(self, column: pa.Array) -> list[Place]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         s = self.settings
-        if not column.type.equals(self.arrow_type):
-            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
+        check_type(column, self.arrow_type)
         lists = [column.field(part.name) for part in self.arrow_type]
-        if column.null_count or any(part.null_count or part.flatten().null_count for part in lists):
-            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        check_values(column, *lists)
         references, weights, boxes = (part.flatten().to_numpy() for part in lists)
         if np.any((references >= len(self.matcher)) & (references != NOBODY)):
             raise LibraryError("The descriptors name references that this library does not have.")

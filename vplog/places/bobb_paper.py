@@ -19,14 +19,16 @@ from pydantic import Field, PositiveFloat, model_validator
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp, stored
+from vplog.places.columns import check_type, check_values
 from vplog.places.relearn import relearn
 from vplog.places.search import BoxIndex
+from vplog.places.shared import Shared, list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Reference
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference
 
 
 class PaperBobbSettings(lib.WordSettings):
@@ -214,6 +216,21 @@ class PaperBobbState:
         boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1, s.references, s.boxes, 4)
         return BoxIndex(references, boxes, len(self.library), s.grid)
 
+    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> Shared:
+        """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
+        s = self.settings
+        references = np.array([place.references for place in places], np.int64).reshape(-1, s.references)
+        boxes = np.array([place.boxes for place in places], np.int64).reshape(-1, s.references, s.boxes, 4)
+
+        def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
+            mine, theirs = boxes[rows, ranks][:, :, None], boxes[others, other_ranks][:, None]
+            common = np.minimum(mine[..., 2:], theirs[..., 2:]) - np.maximum(mine[..., :2], theirs[..., :2])
+            cells = np.maximum(common, 0).prod(axis=-1).max(axis=2).sum(axis=1).astype(np.float64)
+            area = (mine[..., 2:] - mine[..., :2]).prod(axis=-1).sum(axis=(1, 2))
+            return cells / np.maximum(area, 1), cells
+
+        return list_shared(references, query, match, compare)
+
     def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
         s = self.settings
         references = np.array([place.references for place in descriptors], np.int32).reshape(-1)
@@ -227,11 +244,9 @@ class PaperBobbState:
     def from_arrow(self, column: pa.Array) -> list[Place]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         s = self.settings
-        if not column.type.equals(self.arrow_type):
-            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
+        check_type(column, self.arrow_type)
         lists = column.field("references"), column.field("boxes")
-        if column.null_count or any(part.null_count or part.flatten().null_count for part in lists):
-            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        check_values(column, *lists)
         references = lists[0].flatten().to_numpy().reshape(-1, s.references)
         boxes = lists[1].flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
         if len(references) and (references.max() >= len(self.library) or references.min() < -1):

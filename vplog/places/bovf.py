@@ -16,6 +16,7 @@ from pydantic import Field
 
 from vplog.errors import LibraryError
 from vplog.places import stored
+from vplog.places.columns import check_type, check_values, words_by_place
 from vplog.places.dense import best_rows
 from vplog.places.relearn import keep_references, relearn
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
@@ -142,22 +143,15 @@ class BovfState:
 
     def from_arrow(self, column: pa.Array) -> list[Words]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""
-        if not column.type.equals(_PLACE):
-            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {_PLACE}.")
+        check_type(column, _PLACE)
         items = column.flatten()
-        parts = [items.field("word"), items.field("count")]
-        if column.null_count or items.null_count or any(part.null_count for part in parts):
-            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        parts = items.field("word"), items.field("count")
+        check_values(column, items, *parts)
         words, counts = (part.to_numpy() for part in parts)
-        if len(words) and words.max() >= len(self.vocabulary):
-            raise LibraryError("The descriptors name words that this library does not have.")
-        stop = np.cumsum(column.value_lengths().to_numpy())
-        start = stop - column.value_lengths().to_numpy()
-        rising = np.diff(words.astype(np.int32), prepend=-1) > 0
-        rising[start[start < len(words)]] = True  # a place's first word follows none
-        if not np.all(rising) or not np.all(counts):
-            raise LibraryError("The descriptors name a word twice, out of order or zero times; write them anew.")
-        return [Words(words[a:b], counts[a:b]) for a, b in zip(start, stop, strict=True)]
+        places = words_by_place(column, words, len(self.vocabulary))
+        if not np.all(counts):
+            raise LibraryError("The descriptors name a word zero times; write them anew with `vplog run`.")
+        return [Words(words[place], counts[place]) for place in places]
 
     def save(self, folder: Path) -> None:
         stored.save_references(self.references, self.settings, folder)

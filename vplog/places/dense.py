@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from vplog.data import Ranking
 from vplog.errors import LibraryError
+from vplog.places.columns import check_type, check_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -65,10 +66,8 @@ def vectors_to_arrow(vectors: Sequence[NDArray], arrow_type: pa.FixedSizeListTyp
 
 def vectors_from_arrow(column: pa.Array, arrow_type: pa.FixedSizeListType) -> list[NDArray]:
     """The vectors of a table's column. Raises LibraryError where it is of another kind, or not finite numbers."""
-    if not column.type.equals(arrow_type):
-        raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {arrow_type}.")
-    if column.null_count or column.flatten().null_count:
-        raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+    check_type(column, arrow_type)
+    check_values(column)
     values = column.flatten().to_numpy().reshape(-1, arrow_type.list_size)
     if not np.all(np.isfinite(values)):
         raise LibraryError("Some descriptors have values that are not finite; write them anew with `vplog run`.")

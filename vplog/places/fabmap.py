@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Self
 
-import numba
 import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
@@ -22,7 +21,10 @@ from pydantic import Field, model_validator
 from vplog.data import Ranking
 from vplog.errors import LibraryError
 from vplog.places import stored
-from vplog.places.chow_liu import ChowLiuTree, learn_tree
+from vplog.places.chow_liu import learn_tree
+from vplog.places.columns import check_type, check_values, words_by_place
+from vplog.places.fabmap_calibration import calibrate
+from vplog.places.fabmap_model import Evidence, Model, average_place, log_likelihood_table, log_mean
 from vplog.places.relearn import keep_references, relearn
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
 from vplog.settings import Settings
@@ -41,16 +43,6 @@ if TYPE_CHECKING:
 _WORD_BYTES, _PLACE_BYTES = 2, 4
 """In a table: a word's number in two bytes; where a place's list begins in four."""
 _PLACE = pa.list_(pa.field("item", pa.uint16(), nullable=False))
-_UNSEEN, _SEEN, _AVERAGE = 0, 1, 2
-"""What is known of a word at a place: its one image lacks it, has it, or there is no image."""
-_LEAST_IMAGES = 10
-"""A drive with fewer images tells nothing of how much to trust the evidence."""
-_MOST_QUERIES = 200
-"""So many references are asked of, spread evenly; more would not change the second digit of the weight."""
-_NEAR_SHARE = 10
-"""An image's place may be seen from a tenth of the drive's images before and after it; the others are far."""
-_WEIGHTS = np.geomspace(0.01, 1.0, 201)
-"""Weights tried, in steps of 2.3 %: below 0.01 the posterior is the prior, above 1 a word would count twice."""
 
 
 class FabmapSettings(Settings):
@@ -108,186 +100,13 @@ class FabmapSettings(Settings):
         drawn = np.sort(np.random.default_rng(self.seed).permutation(len(images))[: self.samples])
         weight, new_place_nats = 1.0, 0.0
         if self.calibrate:
-            weight, new_place_nats = _calibrate(kept, images, model, drawn if self.new_place == "sampled" else None)
+            weight, new_place_nats = calibrate(kept, images, model, drawn if self.new_place == "sampled" else None)
         samples = Evidence([images[row] for row in drawn], model) if self.new_place == "sampled" else None
         return FabmapState(self, kept, vocabulary, model, samples, weight, new_place_nats)
 
     def load(self, folder: Path, threads: int) -> FabmapState:
         """A library saved by `FabmapState.save`. Raises LibraryError where it is damaged or gives another hash."""
         return relearn(FabmapSettings, folder, threads)
-
-
-def log_likelihood_table(tree: ChowLiuTree, seen_if_there: float, seen_if_absent: float) -> Floats:
-    """(V, 3, 2, 2) ln p(z_q | z_p, L): by what is known of q at L (unseen, seen, nothing), then z_p, then z_q.
-
-    The word may or may not exist at the place (2008, section on the observation likelihood):
-    p(z_q | z_p, L) = sum over e_q of p(z_q | e_q, z_p) p(e_q | L).
-    """
-    detector = np.array([[1 - seen_if_absent, seen_if_absent], [1 - seen_if_there, seen_if_there]])  # [e, z]
-    marginal = np.stack([1 - tree.present, tree.present], axis=1)  # (V, z)
-    given_parent = np.stack([1 - tree.present_given_parent, tree.present_given_parent], axis=2)  # (V, z_p, z)
-    # p(z_q | e_q, z_p) is proportional to p(z_q | e_q) p(z_q | z_p) / p(z_q): detection does not depend on z_p.
-    # The papers write it (1 + alpha / beta)^-1.
-    observed = detector[:, None] * (given_parent / marginal[:, None])[:, None]  # (V, e, z_p, z)
-    observed /= observed.sum(axis=3, keepdims=True)
-    # The place model: the prior p(e_q = 1) is how often the word occurs at all, and the place's one image updates it
-    # by Bayes' rule (2008, on the update of the place model).
-    exists = np.empty((len(tree), 3))
-    for known in (_UNSEEN, _SEEN):
-        there, absent = detector[1, known] * tree.present, detector[0, known] * (1 - tree.present)
-        exists[:, known] = there / (there + absent)
-    exists[:, _AVERAGE] = tree.present
-    exists = exists[:, :, None, None]
-    return np.log(exists * observed[:, None, 1] + (1 - exists) * observed[:, None, 0])
-
-
-class Model:
-    """The tree's edges and the likelihoods, as the kernels want them."""
-
-    def __init__(self, tree: ChowLiuTree, table: Floats) -> None:
-        self.tree, self.table = tree, table
-        order = np.argsort(tree.parent, kind="stable").astype(np.int32)
-        start = np.searchsorted(tree.parent[order], np.arange(len(tree) + 1))
-        self.children, self.child_start = order, start.astype(np.int64)
-
-
-class Evidence:
-    """ln p(Z | L) of every place at once: FAB-MAP 2.0's inverted index.
-
-    Almost all words are absent from both image and place. What a place is worth to an image without any word is
-    summed beforehand; then only words of the image and their children in the tree are corrected for, and only at the
-    places that have the word. Rows are in the order given.
-    """
-
-    def __init__(self, places: Sequence[Words], model: Model) -> None:
-        self._count, self._model = len(places), model
-        lengths = [len(place) for place in places]
-        owners = np.repeat(np.arange(len(places), dtype=np.int32), lengths)
-        words = np.concatenate([np.zeros(0, np.int64), *(place.astype(np.int64) for place in places)])
-        order = np.argsort(words, kind="stable")
-        self._list_start = np.searchsorted(words[order], np.arange(len(model.tree) + 1)).astype(np.int64)
-        self._list_place = owners[order]
-        silent = model.table[:, :, 0, 0]
-        gain = (silent[:, _SEEN] - silent[:, _UNSEEN])[words]
-        self._base = silent[:, _UNSEEN].sum() + np.bincount(owners, gain, minlength=len(places))
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __call__(self, words: Words, stop: int) -> tuple[Floats, Bools]:
-        """(stop,) ln p(Z | L), and whether the place has a word of the image."""
-        model = self._model
-        return _evidence(
-            words, model.tree.parent, model.child_start, model.children, model.table,
-            self._list_start, self._list_place, self._base[:stop],
-        )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def _evidence(words, parent, child_start, children, table, list_start, list_place, base):
-    """(stop,) float64 log likelihood and bool: starts from `base`, a sum per place; `words` increase."""
-    V, stop = parent.shape[0], base.shape[0]
-    present = np.zeros(V, np.bool_)
-    for word in words:
-        present[word] = True
-    result, shared = base.copy(), np.zeros(stop, np.bool_)
-    everywhere = 0.0
-    for word in words:
-        for k in range(-1, child_start[word + 1] - child_start[word]):
-            q = np.int64(word) if k < 0 else np.int64(children[child_start[word] + k])
-            if k >= 0 and present[q]:
-                continue  # it is one of the words itself
-            z = 1 if present[q] else 0
-            zp = 1 if parent[q] >= 0 and present[parent[q]] else 0
-            everywhere += table[q, 0, zp, z] - table[q, 0, 0, 0]
-            change = (table[q, 1, zp, z] - table[q, 0, zp, z]) - (table[q, 1, 0, 0] - table[q, 0, 0, 0])
-            for e in range(list_start[q], list_start[q + 1]):
-                place = list_place[e]
-                if place >= stop:
-                    break
-                result[place] += change
-                if z == 1:
-                    shared[place] = True
-    return result + everywhere, shared
-
-
-def _average_place(words: Words, model: Model) -> float:
-    """ln p(Z | the average place): the mean field approximation of a new place (2008, section on new places)."""
-    present = np.zeros(len(model.tree), np.int64)
-    present[words] = 1
-    parent = model.tree.parent
-    z_parent = np.where(parent < 0, 0, present[parent])
-    return float(model.table[np.arange(len(parent)), _AVERAGE, z_parent, present].sum())
-
-
-def _log_mean(logs: Floats) -> float:
-    """ln of the mean of exp: a new place by samples (2008, section on new places)."""
-    return float(np.logaddexp.reduce(logs) - np.log(len(logs)))
-
-
-def _calibrate(
-    references: Sequence[Reference], images: Sequence[Words], model: Model, drawn: NDArray[np.int64] | None
-) -> tuple[float, float]:
-    """What the evidence is worth, from the references alone: its weight, and nats to add to a new place's.
-
-    References are queries in turn, and the others of the same drive are the places: those next to it in time show its
-    place, those far from it in time do not, and no truth is needed. The weight is an exponent of the likelihood (a
-    temperature: Guo et al., On calibration of modern neural networks, ICML 2017, section 4.2; Ribatet, Cooley &
-    Davison, Statistica Sinica 22, 2012, adjust composite likelihoods by it), here the one that makes the neighbours
-    most likely. The tree has seen the query too; trees without it give a weight within 3 %.
-    The nats make a new place come out as often as there is one, where every query is asked twice: with all the other
-    places, and with the far ones only. The papers' own (1, 0) where too few references have neighbours.
-    """
-    asked, others, neighbour, far = _by_time(references)
-    if len(asked) < _LEAST_IMAGES:
-        return 1.0, 0.0
-    evidence = Evidence(images, model)
-    log_ratio = np.empty((len(asked), len(images)))
-    for k, row in enumerate(asked):
-        log_ratio[k] = evidence(images[row], len(images))[0]
-        new_place = (
-            _average_place(images[row], model) if drawn is None else _log_mean(log_ratio[k, drawn[drawn != row]])
-        )
-        log_ratio[k] -= new_place
-    surprise = [
-        (_log_sum(weight * log_ratio, others) - _log_sum(weight * log_ratio, neighbour)).mean() for weight in _WEIGHTS
-    ]
-    weight = float(_WEIGHTS[np.argmin(surprise)])
-    # both questions together have a new place half of the time: even odds against the mean of the places
-    known = [_log_sum(weight * log_ratio, places) - np.log(places.sum(axis=1)) for places in (others, far)]
-    return weight, _even_odds(np.concatenate(known), len(asked)) / weight
-
-
-def _by_time(references: Sequence[Reference]) -> tuple[NDArray[np.int64], Bools, Bools, Bools]:
-    """(A,) rows to ask of, and (A, L) which are the other places of the drive, which its neighbours, which are far."""
-    names = {name: number for number, name in enumerate(sorted({reference.drive for reference in references}))}
-    drive = np.array([names[reference.drive] for reference in references])
-    order = np.lexsort((np.arange(len(drive)), np.array([reference.stamp_ns for reference in references]), drive))
-    size = np.bincount(drive)
-    position = np.empty(len(drive), np.int64)
-    position[order] = np.arange(len(drive)) - (np.cumsum(size) - size)[drive[order]]
-    asked = np.flatnonzero(size[drive] >= _LEAST_IMAGES)
-    asked = asked[:: -(-len(asked) // _MOST_QUERIES) or 1]
-    same = drive[asked, None] == drive
-    gap = np.abs(position[asked, None] - position)
-    return asked, same & (gap > 0), same & (gap == 1), same & (gap > size[drive] / _NEAR_SHARE) & (gap > 1)
-
-
-def _log_sum(logs: Floats, chosen: Bools) -> Floats:
-    """(A,) ln of the sum of exp over the chosen of (A, L)."""
-    return np.logaddexp.reduce(logs, axis=1, where=chosen, initial=-np.inf)
-
-
-def _even_odds(known: Floats, new_places: int) -> float:
-    """The log likelihood of a new place at which its probabilities against `known` sum to `new_places`."""
-    low, high = known.min() - 50.0, known.max() + 50.0  # e^-50 is nothing beside 1
-    for _ in range(60):  # halvings: to the last bit of a sum that grows with the answer
-        middle = (low + high) / 2
-        if np.exp(-np.logaddexp(0, known - middle)).sum() < new_places:
-            low = middle
-        else:
-            high = middle
-    return float((low + high) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,22 +156,10 @@ class FabmapState:
 
     def from_arrow(self, column: pa.Array) -> list[Words]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""
-        if not column.type.equals(_PLACE):
-            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {_PLACE}.")
-        items = column.flatten()
-        if column.null_count or items.null_count:
-            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
-        words = items.to_numpy()
-        if len(words) and words.max() >= len(self.vocabulary):
-            raise LibraryError("The descriptors name words that this library does not have.")
-        lengths = column.value_lengths().to_numpy()
-        stop = np.cumsum(lengths)
-        start = stop - lengths
-        rising = np.diff(words.astype(np.int32), prepend=-1) > 0
-        rising[start[start < len(words)]] = True  # a place's first word follows none
-        if not np.all(rising):
-            raise LibraryError("The descriptors name a word twice or out of order; write them anew with `vplog run`.")
-        return [words[a:b] for a, b in zip(start, stop, strict=True)]
+        check_type(column, _PLACE)
+        check_values(column)
+        words = column.flatten().to_numpy()
+        return [words[place] for place in words_by_place(column, words, len(self.vocabulary))]
 
     def save(self, folder: Path) -> None:
         stored.save_references(self.references, self.settings, folder)
@@ -423,8 +230,8 @@ class FabmapIndex:
     def _new_place(self, descriptor: Words) -> float:
         samples = self._state.samples
         if samples is None:
-            return _average_place(descriptor, self._state.model)
-        return _log_mean(samples(descriptor, len(samples))[0])
+            return average_place(descriptor, self._state.model)
+        return log_mean(samples(descriptor, len(samples))[0])
 
     def _below(self, stop: int | None) -> int:
         return len(self) if stop is None else min(stop, len(self))

@@ -19,12 +19,13 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from vplog.errors import LibraryError
 from vplog.places import stored
 from vplog.places.bobb import BobbSettings
+from vplog.places.columns import check_type, check_values
 from vplog.places.dense import best_rows, vectors_from_arrow, vectors_to_arrow
 from vplog.places.matches import keypoints_of, patches_of
 from vplog.places.relearn import relearn
+from vplog.places.vocabulary import ROOT_STEPS
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -33,12 +34,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Ranking, Reference
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference
     from vplog.places.bobb import BobbState, Place
     from vplog.places.code_search import CodeIndex
+    from vplog.places.shared import Shared
 
-_SIFT_STEPS = 512
-"""Of 1: RootSIFT values are whole multiples of one, so their sums and products over a library are exact."""
 _STEPS = 4096
 """Of 1: what is summed over features is rounded to whole ones, so sums stay below 2^53 and exact in any order, and no
 bit depends on the number of threads."""
@@ -112,7 +112,7 @@ class Words:
 
     def signs(self, values: Float32s, points: Float32s) -> Bytes:
         """(W * B / 8,) bits: the side on which the features of a word lie, summed. All 0 without features."""
-        placed = _place_values(values / np.float32(_SIFT_STEPS), points, self.mean, self.directions, self.place)
+        placed = _place_values(values / ROOT_STEPS, points, self.mean, self.directions, self.place)
         return np.packbits(_sum_residuals(placed, self.centres, _STEPS) @ self.turn > 0)
 
 
@@ -128,10 +128,10 @@ def learn_words(features: Sequence[tuple[Float32s, Float32s]], settings: HybridS
     steps = np.concatenate([values for values, _ in features]).astype(np.float64)
     points = np.concatenate([points for _, points in features])
     rows = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _MOST_FEATURES)).astype(np.int64))
-    mean, directions = _principal(steps[rows] / _SIFT_STEPS, settings.whitening)
+    mean, directions = _principal(steps[rows] / ROOT_STEPS, settings.whitening)
     rng = np.random.default_rng(settings.seed)
     values = _place_values(
-        (steps[rows] / _SIFT_STEPS).astype(np.float32), points[rows], mean, directions, settings.place
+        (steps[rows] / ROOT_STEPS).astype(np.float32), points[rows], mean, directions, settings.place
     )
     centres = _centres(values, settings.words, rng)
     turn = np.linalg.qr(rng.normal(size=(values.shape[1], values.shape[1])))[0][:, : settings.bits]
@@ -266,6 +266,10 @@ class HybridState:
             boxes, np.array([p.signs for p in descriptors], np.uint8), self._signs_type.list_size, self.share
         )
 
+    def shared(self, places: Sequence[Described], query: Int32s, match: Int32s) -> Shared:
+        """The references that explain both places of pairs (C,) of rows, by the boxes."""
+        return self.bobb.shared([place.boxes for place in places], query, match)
+
     def to_arrow(self, descriptors: Sequence[Described]) -> pa.Array:
         columns = [
             self.bobb.to_arrow([place.boxes for place in descriptors]),
@@ -275,10 +279,8 @@ class HybridState:
 
     def from_arrow(self, column: pa.Array) -> list[Described]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""
-        if not column.type.equals(self.arrow_type):
-            raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {self.arrow_type}.")
-        if column.null_count:
-            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+        check_type(column, self.arrow_type)
+        check_values(column)
         boxes = self.bobb.from_arrow(column.field("boxes"))
         signs = vectors_from_arrow(column.field("signs"), self._signs_type)
         return [Described(b, s) for b, s in zip(boxes, signs, strict=True)]

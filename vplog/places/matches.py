@@ -19,16 +19,13 @@ from pydantic import Field
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 from vplog.places.patches import describe_patches
-from vplog.places.vocabulary import root_sift
+from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from vplog.data import Bytes, Features, Float32s, Int32s, Reference
-
-_ROOT_STEPS = 512.0
-"""RootSIFT values are whole steps of 1/512; a byte holds all below one half, and larger ones hardly occur."""
 
 
 class WeighedMatchSettings(Settings):
@@ -183,7 +180,7 @@ def _comparable(descriptors: Bytes, settings: WeighedMatchSettings) -> Float32s:
     """(M, 128) float32 whole numbers 0..255."""
     if not settings.root_sift:
         return descriptors.astype(np.float32)
-    return np.minimum(np.rint(root_sift(descriptors) * _ROOT_STEPS), 255.0).astype(np.float32)
+    return root_sift_steps(descriptors)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
+from vplog.places.vocabulary import ROOT_STEPS
+
 if TYPE_CHECKING:
     from vplog.data import Bytes, Float32s
 
@@ -24,8 +26,6 @@ DIRECTIONS = 8
 """Of edges, over half a turn: 4 x 4 x 8 = 128 values, as SIFT."""
 _MOST = 0.2
 """Values of unit length are cut here, Lowe's way to keep a single strong edge from ruling."""
-_STEPS = 512.0
-"""Roots are whole steps of 1/512, as those of SIFT in `matches.py`."""
 
 
 def describe_patches(thumbnail: Bytes) -> tuple[Float32s, Float32s]:
@@ -35,7 +35,7 @@ def describe_patches(thumbnail: Bytes) -> tuple[Float32s, Float32s]:
     """
     values, points = _describe(_edges(np.sqrt(np.arange(256.0))[thumbnail], CELL, DIRECTIONS), CELLS, _MOST)
     seen = values.any(axis=1)
-    return np.minimum(np.rint(np.sqrt(values[seen]) * _STEPS), 255.0).astype(np.float32), points[seen]
+    return np.minimum(np.rint(np.sqrt(values[seen]) * ROOT_STEPS), 255.0).astype(np.float32), points[seen]
 
 
 @numba.njit(cache=True, nogil=True)

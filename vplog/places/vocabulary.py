@@ -18,8 +18,9 @@ from vplog.errors import LibraryError
 if TYPE_CHECKING:
     from vplog.data import Bytes, Float32s, Int32s
 
-_STEP = np.float32(1 / 512)
-"""Resolution of RootSIFT values; a byte of steps reaches 0.498, and SIFT's own cut at 0.2 keeps values below that."""
+ROOT_STEPS = np.float32(512)
+"""Steps of 1 that roots of descriptors are whole multiples of: a byte of them reaches 0.498, and SIFT's own cut at 0.2
+keeps values below that."""
 _FEATURES_PER_WORD = 4
 """A centre that is the mean of fewer features is one image's noise, and its word would never be seen again."""
 _ITERATIONS = 6
@@ -40,7 +41,7 @@ def root_sift(descriptors: Bytes) -> Float32s:
 
     Arandjelovic & Zisserman, Three things everyone should know, CVPR 2012, section 3; in steps of 1/512.
     """
-    return _steps(descriptors) * _STEP
+    return root_sift_steps(descriptors) / ROOT_STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class Vocabulary:
     """(V, 128) float32 RootSIFT, multiples of 1/512."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_index", _index(self.centres / _STEP, _EF_SEARCH))
+        object.__setattr__(self, "_index", _index(self.centres * ROOT_STEPS, _EF_SEARCH))
 
     _index: Any = None
 
@@ -63,7 +64,7 @@ class Vocabulary:
 
         Above 1024 words an approximate search misses the nearest for 2 in 1000, always in the same way.
         """
-        return _nearest(self._index, _steps(descriptors))
+        return _nearest(self._index, root_sift_steps(descriptors))
 
 
 def learn_vocabulary(descriptors: Bytes, words: int, seed: int, threads: int) -> Vocabulary:
@@ -78,7 +79,7 @@ def learn_vocabulary(descriptors: Bytes, words: int, seed: int, threads: int) ->
     most = count * _MOST_FEATURES_PER_WORD
     if len(descriptors) > most:
         descriptors = descriptors[np.sort(rng.choice(len(descriptors), most, replace=False))]
-    steps = _steps(descriptors)
+    steps = root_sift_steps(descriptors)
     centres = steps[np.sort(rng.choice(len(steps), count, replace=False))]
     parts = [steps[at : at + _CHUNK] for at in range(0, len(steps), _CHUNK)]
     with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
@@ -93,15 +94,15 @@ def learn_vocabulary(descriptors: Bytes, words: int, seed: int, threads: int) ->
             if np.array_equal(moved, centres):
                 break
             centres = moved
-    return Vocabulary(centres * _STEP)
+    return Vocabulary(centres / ROOT_STEPS)
 
 
-def _steps(descriptors: Bytes) -> Float32s:
-    """RootSIFT in whole steps, 0..255."""
+def root_sift_steps(descriptors: Bytes) -> Float32s:
+    """RootSIFT (M, 128) in whole steps, 0..255."""
     values = descriptors.astype(np.float32)
     values /= np.maximum(values.sum(axis=1, keepdims=True), 1)
     np.sqrt(values, out=values)
-    return np.minimum(np.rint(values / _STEP), 255)
+    return np.minimum(np.rint(values * ROOT_STEPS), 255)
 
 
 def _index(centres: Float32s, ef_search: int) -> Any:

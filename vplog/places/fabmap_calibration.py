@@ -1,0 +1,92 @@
+"""How much FAB-MAP's evidence is worth, from the references alone: without it the posterior is far too certain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.places.fabmap_model import Evidence, average_place, log_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Floats, Reference
+    from vplog.places.fabmap_model import Model
+
+    Words = NDArray[np.uint16]
+    Bools = NDArray[np.bool_]
+
+_LEAST_IMAGES = 10
+"""A drive with fewer images tells nothing of how much to trust the evidence."""
+_MOST_QUERIES = 200
+"""So many references are asked of, spread evenly; more would not change the second digit of the weight."""
+_NEAR_SHARE = 10
+"""An image's place may be seen from a tenth of the drive's images before and after it; the others are far."""
+_WEIGHTS = np.geomspace(0.01, 1.0, 201)
+"""Weights tried, in steps of 2.3 %: below 0.01 the posterior is the prior, above 1 a word would count twice."""
+
+
+def calibrate(
+    references: Sequence[Reference], images: Sequence[Words], model: Model, drawn: NDArray[np.int64] | None
+) -> tuple[float, float]:
+    """What the evidence is worth, from the references alone: its weight, and nats to add to a new place's.
+
+    References are queries in turn, and the others of the same drive are the places: those next to it in time show its
+    place, those far from it in time do not, and no truth is needed. The weight is an exponent of the likelihood (a
+    temperature: Guo et al., On calibration of modern neural networks, ICML 2017, section 4.2; Ribatet, Cooley &
+    Davison, Statistica Sinica 22, 2012, adjust composite likelihoods by it), here the one that makes the neighbours
+    most likely. The tree has seen the query too; trees without it give a weight within 3 %.
+    The nats make a new place come out as often as there is one, where every query is asked twice: with all the other
+    places, and with the far ones only. The papers' own (1, 0) where too few references have neighbours.
+    """
+    asked, others, neighbour, far = _by_time(references)
+    if len(asked) < _LEAST_IMAGES:
+        return 1.0, 0.0
+    evidence = Evidence(images, model)
+    log_ratio = np.empty((len(asked), len(images)))
+    for k, row in enumerate(asked):
+        log_ratio[k] = evidence(images[row], len(images))[0]
+        new_place = average_place(images[row], model) if drawn is None else log_mean(log_ratio[k, drawn[drawn != row]])
+        log_ratio[k] -= new_place
+    surprise = [
+        (_log_sum(weight * log_ratio, others) - _log_sum(weight * log_ratio, neighbour)).mean() for weight in _WEIGHTS
+    ]
+    weight = float(_WEIGHTS[np.argmin(surprise)])
+    # both questions together have a new place half of the time: even odds against the mean of the places
+    known = [_log_sum(weight * log_ratio, places) - np.log(places.sum(axis=1)) for places in (others, far)]
+    return weight, _even_odds(np.concatenate(known), len(asked)) / weight
+
+
+def _by_time(references: Sequence[Reference]) -> tuple[NDArray[np.int64], Bools, Bools, Bools]:
+    """(A,) rows to ask of, and (A, L) which are the other places of the drive, which its neighbours, which are far."""
+    names = {name: number for number, name in enumerate(sorted({reference.drive for reference in references}))}
+    drive = np.array([names[reference.drive] for reference in references])
+    order = np.lexsort((np.arange(len(drive)), np.array([reference.stamp_ns for reference in references]), drive))
+    size = np.bincount(drive)
+    position = np.empty(len(drive), np.int64)
+    position[order] = np.arange(len(drive)) - (np.cumsum(size) - size)[drive[order]]
+    asked = np.flatnonzero(size[drive] >= _LEAST_IMAGES)
+    asked = asked[:: -(-len(asked) // _MOST_QUERIES) or 1]
+    same = drive[asked, None] == drive
+    gap = np.abs(position[asked, None] - position)
+    return asked, same & (gap > 0), same & (gap == 1), same & (gap > size[drive] / _NEAR_SHARE) & (gap > 1)
+
+
+def _log_sum(logs: Floats, chosen: Bools) -> Floats:
+    """(A,) ln of the sum of exp over the chosen of (A, L)."""
+    return np.logaddexp.reduce(logs, axis=1, where=chosen, initial=-np.inf)
+
+
+def _even_odds(known: Floats, new_places: int) -> float:
+    """The log likelihood of a new place at which its probabilities against `known` sum to `new_places`."""
+    low, high = known.min() - 50.0, known.max() + 50.0  # e^-50 is nothing beside 1
+    for _ in range(60):  # halvings: to the last bit of a sum that grows with the answer
+        middle = (low + high) / 2
+        if np.exp(-np.logaddexp(0, known - middle)).sum() < new_places:
+            low = middle
+        else:
+            high = middle
+    return float((low + high) / 2)
