@@ -305,6 +305,23 @@ def test_files_are_the_same_every_time(verb: Verb, walks: tuple[Path, Path], tmp
     assert b"paper:partitions=5" in (outs[0] / "curves.svg").read_bytes()
 
 
+def test_probabilities_are_held_against_the_truth(verb: Verb, walks: tuple[Path, Path], tmp_path: Path) -> None:
+    """Only FAB-MAP states any; a comparison without it has no diagram, not even one of an earlier comparison."""
+    day, dusk = walks
+    out = tmp_path / "out"
+    arguments = ("compare", dusk, day, "--truth", "index", "--library-size", 12, "-o", out, "--json", *QUICK)
+    found = verb(*arguments, "--methods", "fabmap,thumbnail").json["methods"]
+    assert "calibration" not in found["thumbnail"]
+    said = found["fabmap"]["calibration"]
+    assert sum(said["count"]) == FRAMES
+    right = sum(n * share for n, share in zip(said["count"], said["accuracy"], strict=True) if n)
+    assert right / FRAMES == pytest.approx(found["fabmap"]["r_at_1"])
+    assert 0 <= said["expected_calibration_error"] <= 1
+    assert (out / "reliability.png").read_bytes()[1:4] == b"PNG"
+    assert "calibration" not in verb(*arguments, "--methods", "thumbnail").json["methods"]["thumbnail"]
+    assert not (out / "reliability.png").exists()
+
+
 def test_libraries_of_every_origin(verb: Verb, walks: tuple[Path, Path], tmp_path: Path) -> None:
     """The map's own frames are the default; a drive is drawn from in the same way; a saved library is taken whole."""
     day, dusk = walks

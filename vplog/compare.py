@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Float32s, Ints, Reference
+    from vplog.evaluate.calibration import Reliability
     from vplog.evaluate.retrieval import Ranks
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
@@ -115,6 +116,7 @@ def compare(
             "methods": {},
         }
         ranks: dict[str, Ranks] = {}
+        reliable: dict[str, Reliability] = {}
         for number, (name, settings) in enumerate(recognisers.items(), start=1):
             result = evaluate_method(
                 settings, references, map_walk, query_walk, pairs, stops, threads,
@@ -122,6 +124,8 @@ def compare(
             )  # fmt: skip
             account["methods"][name] = result.figures
             ranks[name] = result.ranks
+            if result.reliability is not None:
+                reliable[name] = result.reliability
             if result.sequence_ranks is not None:
                 ranks[f"{name}, L={sequence}"] = result.sequence_ranks
             if out is not None:
@@ -129,6 +133,8 @@ def compare(
         account["warnings"] = list(dict.fromkeys([*query_log.warnings, *map_log.warnings, *warnings]))
     if out is not None:
         compare_figures.draw_curves(ranks, out)
+        if reliable:
+            compare_figures.draw_reliability(reliable, out)
         run_record.write_run_json(out / "compare.json", account)
     return Comparison(account, ranks)
 
@@ -213,7 +219,8 @@ def _begin(out: Path) -> None:
         raise SettingsError(f"{out} is a folder with other things in it, not a comparison. Choose another with -o.")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "compare.json").unlink(missing_ok=True)  # written last: where it is, the rest is whole
+        for file in ("compare.json", "reliability.png", "reliability.svg"):  # the record is written last
+            (out / file).unlink(missing_ok=True)
     except OSError as error:
         raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
 

@@ -1,4 +1,4 @@
-"""The curves of a comparison: precision over recall, and recall over rank."""
+"""The figures of a comparison: precision over recall, recall over rank, and what probabilities are worth."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from vplog.evaluate.retrieval import average_precision, precision_recall, recall
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from vplog.evaluate.calibration import Reliability
     from vplog.evaluate.retrieval import Ranks
 
 _DEEPEST_RANK = 25
@@ -42,3 +43,29 @@ def draw_curves(ranks: dict[str, Ranks], folder: Path) -> None:
             axes.set_ylim(0, 1.02)
             axes.grid(alpha=0.3)
             axes.legend(loc="lower left" if axes is left else "lower right", fontsize=8)
+
+
+def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
+    """Write reliability.png and reliability.svg: of answers given with a probability, how many are right.
+
+    Guo et al., On calibration of modern neural networks, ICML 2017, Fig. 1. Below the diagonal is over-confident. The
+    bars beneath say how many answers a point is of.
+    """
+    with drawn(folder, "reliability", 5.5, 5.5) as figure:
+        top, below = figure.subplots(2, 1, height_ratios=(4, 1), sharex=True)
+        top.plot([0, 1], [0, 1], color="0.6", linestyle=":", label="as it says")
+        for number, (plain_name, one) in enumerate(found.items()):
+            filled, colour = one.count > 0, f"C{number % 10}"
+            top.plot(
+                one.confidence[filled], one.accuracy[filled], marker="o", color=colour,
+                label=f"{as_text(plain_name)}  ECE {one.expected_calibration_error:.3f}, "
+                f"over-confident by {one.overconfidence:+.3f}",
+            )  # fmt: skip
+            width = (one.edges[1] - one.edges[0]) / len(found)
+            below.bar(one.edges[:-1] + number * width, one.count, width, align="edge", color=colour)
+        top.set(ylabel="share of answers that are right", title="What the probability of an answer is worth")
+        below.set(xlabel="probability of the best answer", ylabel="answers", xlim=(0, 1.02))
+        top.set_ylim(0, 1.02)
+        for axes in (top, below):
+            axes.grid(alpha=0.3)
+        top.legend(loc="upper left", fontsize=8)

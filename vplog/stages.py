@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         Camera,
         Features,
         Float32s,
+        Floats,
         Frame,
         Gps,
         Ints,
@@ -82,6 +83,15 @@ class PlaceIndex(Protocol):
 
     def query(self, descriptor: Any, k: int, stop: int | None = None) -> Ranking:
         """The k best rows below `stop` (all rows where None). Rows that share nothing are left out."""
+        ...
+
+
+@runtime_checkable
+class ProbableIndex(PlaceIndex, Protocol):
+    """A map that also says how probable each of its places is."""
+
+    def posterior(self, descriptor: Any, stop: int | None = None) -> tuple[Floats, float]:
+        """(stop,) float64 probability of each place, and that of a place that is not in the map; they sum to 1."""
         ...
 
 

@@ -16,14 +16,17 @@ import pyarrow as pa
 
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
+from vplog.evaluate.calibration import reliability
 from vplog.extract import map_in_order, one_thread_each
 from vplog.places.sequence import sequence_rows
+from vplog.stages import ProbableIndex
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from vplog.data import Float32s, Floats, Ints, Reference
+    from vplog.evaluate.calibration import Reliability
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.retrieval import Ranks
     from vplog.places import PlaceSettings
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceIndex, PlaceState, Recogniser
     from vplog.walks import Progress, Walk
 
+RELIABILITY_BINS = 10
+"""Of probability: with the 200 answers of a short walk a bin holds 20."""
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` asks for by default, and the deepest recall reported."""
 
@@ -47,6 +52,8 @@ class MethodResult:
     """What compare.json says of the method."""
     sequence_ranks: Ranks | None = None
     """The same by sequences, where these were asked for."""
+    reliability: Reliability | None = None
+    """Whether its probabilities mean what they say, where it gives any."""
 
 
 def evaluate_method(
@@ -92,13 +99,16 @@ def evaluate_method(
         "hash": state.hash,
         "settings": settings.model_dump(mode="json"),
     }
+    reliable = reliability_of(index, queries, stops, ranks, threads) if isinstance(index, ProbableIndex) else None
+    if reliable is not None:
+        figures["calibration"] = reliable.as_json()
     if sequence is None:
-        return MethodResult(state, scores, ranks, figures)
+        return MethodResult(state, scores, ranks, figures, reliability=reliable)
     lines = score_table(len(queries), len(index), scratch, "sequences")
     match_lines(scores, sequence, stops, lines, threads, lambda *at: progress("sequences", *at))
     by_sequence = retrieval.rank_queries(lines, truth, stops)
     figures["sequence"] = {**sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
-    return MethodResult(state, scores, ranks, figures, by_sequence)
+    return MethodResult(state, scores, ranks, figures, by_sequence, reliable)
 
 
 def _learn(recogniser: Recogniser, references: Sequence[Reference], threads: int) -> tuple[PlaceState, float]:
@@ -155,6 +165,22 @@ def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: F
     with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
         for _ in map_in_order(pool, work, range(len(queries)), ahead=4 * threads):
             pass
+
+
+def reliability_of(
+    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, threads: int
+) -> Reliability | None:
+    """The probabilities that the index gives its best answers, against how often these are right; None without any."""
+
+    def work(row: int) -> float:
+        return float(index.posterior(queries[row], int(stops[row]))[0][ranks.top_row[row]])
+
+    answered = np.flatnonzero(ranks.top_row >= 0)
+    if not len(answered):
+        return None
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        said = list(map_in_order(pool, work, answered.tolist(), ahead=4 * threads))
+    return reliability(said, ranks.top_true[answered] > 0.5, RELIABILITY_BINS)
 
 
 def match_lines(

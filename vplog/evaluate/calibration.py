@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,17 @@ class Reliability:
         filled = self.count > 0
         gap = self.confidence[filled] - self.accuracy[filled]
         return float((self.count[filled] * gap).sum() / self.count.sum())
+
+    def as_json(self) -> dict[str, Any]:
+        """The diagram as plain values; None where a bin is empty."""
+        filled = self.count > 0
+        return {
+            "expected_calibration_error": round(self.expected_calibration_error, 6),
+            "overconfidence": round(self.overconfidence, 6),
+            "count": self.count.tolist(),
+            "confidence": [round(c, 6) if f else None for c, f in zip(self.confidence.tolist(), filled, strict=True)],
+            "accuracy": [round(a, 6) if f else None for a, f in zip(self.accuracy.tolist(), filled, strict=True)],
+        }
 
 
 def reliability(probability: ArrayLike, right: NDArray[np.bool_], bins: int) -> Reliability:
