@@ -99,7 +99,9 @@ def evaluate_method(
         "hash": state.hash,
         "settings": settings.model_dump(mode="json"),
     }
-    reliable = reliability_of(index, queries, stops, ranks, threads) if isinstance(index, ProbableIndex) else None
+    reliable = (
+        reliability_of(index, queries, stops, ranks, truth, threads) if isinstance(index, ProbableIndex) else None
+    )
     if reliable is not None:
         figures["calibration"] = reliable.as_json()
     if sequence is None:
@@ -168,12 +170,19 @@ def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: F
 
 
 def reliability_of(
-    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, threads: int
+    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, truth: Pairs, threads: int
 ) -> Reliability | None:
-    """The probabilities that the index gives its best answers, against how often these are right; None without any."""
+    """The probabilities of the best answers against how often these are right; None without an answer.
+
+    A drive's neighbouring frames show one place, among which its probability is divided. An answer is right where a
+    true row is near, so what is near counts for it: as many rows around it as a true run has, by their median.
+    """
+    beside = int(np.median(truth.stop - truth.first)) // 2 if len(truth.first) else 0
 
     def work(row: int) -> float:
-        return float(index.posterior(queries[row], int(stops[row]))[0][ranks.top_row[row]])
+        best = int(ranks.top_row[row])
+        probability = index.posterior(queries[row], int(stops[row]))[0]
+        return min(float(probability[max(best - beside, 0) : best + beside + 1].sum()), 1.0)
 
     answered = np.flatnonzero(ranks.top_row >= 0)
     if not len(answered):
