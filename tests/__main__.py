@@ -16,7 +16,8 @@ CHECKS = {
     "lint": ["-m", "ruff", "check", "."],
     "format": ["-m", "ruff", "format", "--check", "."],
     "types": ["-m", "pyright", "--pythonpath", sys.executable],
-    "tests": ["-m", "pytest", *sys.argv[1:]],
+    # a file stays with one worker, so that what its tests share is made once
+    "tests": ["-m", "pytest", "--numprocesses", "auto", "--dist", "loadfile", *sys.argv[1:]],
 }
 
 

@@ -65,7 +65,9 @@ def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
             below.bar(one.edges[:-1] + number * width, one.count, width, align="edge", color=colour)
         top.set(ylabel="share of answers that are right", title="What the probability of an answer is worth")
         below.set(xlabel="probability of the best answer", ylabel="answers", xlim=(0, 1.02))
+        below.set_yscale("log")  # of loop detection, most answers are improbable and few are certain
+        below.set_ylim(bottom=0.5)
         top.set_ylim(0, 1.02)
         for axes in (top, below):
             axes.grid(alpha=0.3)
-        top.legend(loc="upper left", fontsize=8)
+        top.legend(loc="best", fontsize=8)
