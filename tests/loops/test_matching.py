@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vplog.data import Features
-from vplog.loops.matching import MatchSettings, match, match_features
+from vplog.loops.matching import MatchSettings, first_matches, match, match_features
 
 
 def reference(a: np.ndarray, b: np.ndarray, ratio: float) -> list[tuple[int, int]]:
@@ -67,3 +67,20 @@ def test_only_the_strongest_are_matched(count: int) -> None:
     features = Features(points, np.ones(4, np.float32), descriptors, np.full(4, np.nan, np.float32), 20, 20)
     mine, _ = match_features(features, features, MatchSettings(features=count))
     assert mine.tolist() == (list(range(count)) if count > 1 else [])
+
+
+def test_a_first_look_ends_what_shares_little_and_nothing_else() -> None:
+    rng = np.random.default_rng(1)
+    many = rng.integers(0, 255, (1000, 128), dtype=np.uint8)
+    points = rng.uniform(0, 500, (1000, 2)).astype(np.float32)
+    unknown, size = np.full(1000, np.nan, np.float32), np.ones(1000, np.float32)
+    here = Features(points, size, many, unknown, 500, 500)
+    there = Features(points, size, np.roll(many, 5, axis=0), unknown, 500, 500)
+    other = Features(points, size, rng.integers(0, 255, (1000, 128), dtype=np.uint8), unknown, 500, 500)
+    chosen = MatchSettings()
+    assert first_matches(here, there, chosen, 25) is None
+    few = first_matches(here, other, chosen, 25)
+    assert few is not None
+    assert few < 10
+    assert first_matches(here, other, chosen.model_copy(update={"first_look": 1000}), 25) is None
+    assert first_matches(here, other, chosen, 0) is None

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -39,6 +40,39 @@ def test_points_to_pixels_and_back(model: str, distortion: list[float]) -> None:
     rays = np.random.default_rng(1).uniform(-0.45, 0.45, (200, 2))
     pixels = undistort.project(lens, np.column_stack([rays, np.ones(len(rays))]))
     np.testing.assert_allclose(undistort.rays(lens, pixels), rays, atol=1e-8)
+
+
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_agrees_with_opencv_run_to_its_end_and_with_the_formula(model: str, distortion: list[float]) -> None:
+    lens = camera(model, distortion)
+    assert lens.matrix is not None
+    grid = np.stack(np.meshgrid(np.linspace(40, 600, 16), np.linspace(40, 440, 12)), axis=-1).reshape(-1, 1, 2)
+    found = undistort.rays(lens, grid[:, 0])
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+    coefficients = np.array(distortion or [0.0] * 4)
+    if model == "equidistant":
+        expected = cv2.fisheye.undistortPoints(grid, lens.matrix, coefficients, criteria=end)
+    else:
+        expected = cv2.undistortPoints(grid, lens.matrix, coefficients, criteria=end)
+    np.testing.assert_allclose(found, expected[:, 0], atol=1e-7)
+    x, y = found.T
+    r2 = x**2 + y**2
+    if model == "equidistant":  # Kannala & Brandt 2006
+        k, r = np.array([*distortion, 0, 0, 0, 0])[:4], np.sqrt(r2)
+        angle = np.arctan(r)
+        bent = angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8) / r
+        seen = np.column_stack([x * bent, y * bent])
+    else:  # Brown 1966, with the divisor of OpenCV's rational model
+        k = np.array([*distortion, *[0.0] * 8])[:8]
+        bent = (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+        across = 2 * x * y
+        seen = np.column_stack(
+            [
+                x * bent + k[2] * across + k[3] * (r2 + 2 * x**2),
+                y * bent + k[2] * (r2 + 2 * y**2) + k[3] * across,
+            ]
+        )
+    np.testing.assert_allclose(seen * [500.0, 510.0] + [320.0, 240.0], grid[:, 0], atol=1e-5)
 
 
 def test_a_fisheye_without_coefficients_is_not_a_pinhole() -> None:

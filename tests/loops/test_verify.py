@@ -17,7 +17,7 @@ from vplog.loops.verify_metric import MetricSettings
 from .scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, view
 
 EXACT = VerifySettings(landmarks=LandmarkSettings(pixel_sigma=NOISE_PX, depth_share=0.0))
-COLUMNS = ("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread")
+COLUMNS = ("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread", "reverse_inliers")
 LAP = 16
 """Keyframes of the first pass; the second comes back over the same road, off to the side."""
 
@@ -80,8 +80,8 @@ def test_without_floors_the_covariance_is_the_errors_own(depth: bool) -> None:
     lens, frames, poses, seen = drive(depth)
     bare = EXACT.model_copy(
         update={
-            "metric": MetricSettings(rotation_floor=0.0, translation_floor=0.0, scale_share=0.0),
-            "calibration": EXACT.calibration.model_copy(update={"least_share": 0.0}),
+            "metric": MetricSettings(systematic_px=0.0, scale_share=0.0),
+            "calibration": EXACT.calibration.model_copy(update={"least_share": 0.0, "stamp_sigma_s": 0.0}),
         }
     )
     pairs = [(LAP + i, i + k) for i in range(LAP) for k in (-1, 0) if i + k >= 0]
@@ -89,6 +89,56 @@ def test_without_floors_the_covariance_is_the_errors_own(depth: bool) -> None:
     ratio = sigmas(ledger, poses)[[v is Verdict.ACCEPTED for v in ledger.verdict]]
     assert len(ratio) > 24
     assert 0.6 < np.sqrt(np.mean(ratio**2)) < 2.0
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_both_ways_agree_and_are_together_no_worse_than_one(depth: bool) -> None:
+    lens, frames, poses, seen = drive(depth)
+    both, one = (
+        verify(
+            proposals(lap_pairs()[::2]), frames, lens, seen.__getitem__, EXACT.model_copy(update={"both_ways": asked})
+        )
+        for asked in (True, False)
+    )
+    accepted = np.array([v is Verdict.ACCEPTED for v in both.verdict])
+    assert both.verdict == one.verdict
+    assert (both.reverse_inliers[accepted] >= 20).all()
+    assert (one.reverse_inliers == -1).all()
+    assert {s for s, a in zip(both.scale, accepted, strict=True) if a} == {"depth" if depth else "odometry"}
+    assert {s for s, a in zip(both.scale, accepted, strict=True) if not a} <= {"none"}
+    true = geometry.between(poses[both.match[accepted]], poses[both.query[accepted]])
+    error = [geometry.log(geometry.between(true, ledger.match_from_query[accepted])) for ledger in (both, one)]
+    size = [np.sqrt((e[:, 3:] ** 2).sum(1).mean()) for e in error]
+    assert size[0] < 1.1 * size[1]
+
+
+def test_two_ways_that_disagree_are_inconsistent() -> None:
+    lens, _, poses, seen = drive(False)
+    stretched = poses.copy()
+    stretched[LAP:, :3, 3] *= 1.4  # the odometry of the second pass has a wrong scale
+    sure = EXACT.model_copy(update={"metric": MetricSettings(systematic_px=0.0)})  # these pixels share no error
+    pairs = lap_pairs()[:8]
+    wrong = verify(proposals(pairs), keyframes(list(stretched)), lens, seen.__getitem__, sure)
+    alone = sure.model_copy(update={"both_ways": False})
+    one_way = verify(proposals(pairs), keyframes(list(stretched)), lens, seen.__getitem__, alone)
+    moved = np.linalg.norm(geometry.between(poses[wrong.match], poses[wrong.query])[:, :3, 3], axis=1)
+    far = np.array([v is Verdict.ACCEPTED for v in one_way.verdict]) & (moved > 0.8)
+    assert far.sum() >= 4
+    for row in np.flatnonzero(far):
+        assert wrong.verdict[row] is Verdict.INCONSISTENT
+        assert wrong.reverse_inliers[row] >= 0
+        assert wrong.scale[row] == "odometry"
+        assert np.isnan(wrong.match_from_query[row]).all()
+        assert np.isnan(wrong.information[row]).all()
+
+
+def test_where_the_query_has_no_landmarks_one_way_has_to_do() -> None:
+    lens, frames, poses, seen = drive(False)
+    alone = [empty(lens) if row >= LAP and row != LAP + 5 else f for row, f in enumerate(seen)]
+    ledger = verify(proposals([(LAP + 5, 5)]), frames, lens, alone.__getitem__, EXACT)
+    assert ledger.verdict == [Verdict.ACCEPTED]
+    assert ledger.reverse_inliers.tolist() == [-1]
+    assert sigmas(ledger, poses)[0] < 3.0
 
 
 def test_other_places_are_rejected_and_carry_no_pose() -> None:

@@ -1,4 +1,4 @@
-"""How far the camera's calibration can be trusted: its rotations against the odometry's."""
+"""What all closures of a drive share: how far the calibration and the stamps of its camera can be trusted."""
 
 from __future__ import annotations
 
@@ -31,6 +31,9 @@ class CalibrationSettings(Settings):
     """Share of the rotation that is never claimed to be known better: a careful calibration's focal length."""
     most_share: float = Field(default=0.2, gt=0, le=1)
     """A larger disagreement is the odometry's, not a lens's: it is taken as this much."""
+    stamp_sigma_s: float = Field(default=0.002, ge=0, le=1)
+    """Standard deviation in s of a frame's stamp against the odometry's: half an exposure by day, and what a driver
+    takes to write the stamp. It moves a closure along the drive by speed times this."""
 
 
 def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
@@ -71,3 +74,21 @@ def motion_covariance(match_from_query: Floats, share: float) -> Floats:
     result[:3, :3] = (turned @ turned) * np.eye(3)
     result[3:, 3:] = (moved @ moved) * np.eye(3)
     return share**2 / 3.0 * result  # three axes share the length
+
+
+def body_twists(keyframes: Keyframes) -> Floats:
+    """(N, 6) speed of the body at each keyframe, rad/s and m/s in its own frame, by odometry from its neighbours."""
+    count = len(keyframes.stamp_ns)
+    before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
+    seconds = np.maximum((keyframes.stamp_ns[after] - keyframes.stamp_ns[before]) * 1e-9, 1e-9)
+    motion = geometry.log(geometry.between(keyframes.odom_from_body[before], keyframes.odom_from_body[after]))
+    return np.asarray(motion / seconds[:, None], np.float64)
+
+
+def stamp_covariance(match_from_query: Floats, match_twist: Floats, query_twist: Floats, sigma_s: float) -> Floats:
+    """(6, 6) what wrong stamps of both frames add to a closure, in the query's frame.
+
+    exp(x m) T exp(y q) = T exp(Ad(T^-1) m x + q y) to first order, for stamps wrong by x and y.
+    """
+    moved = np.column_stack([geometry.adjoint(geometry.inverse(match_from_query)) @ match_twist, query_twist])
+    return sigma_s**2 * moved @ moved.T

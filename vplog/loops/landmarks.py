@@ -113,6 +113,12 @@ def from_depth(rays: Floats, depth_m: Floats, focal_px: float, settings: Landmar
     return Landmarks(rho, rays, covariance, known, int(np.isfinite(rho).sum()), from_depth=True)
 
 
+def for_stereo(settings: LandmarkSettings, focal_px: float, baseline_m: float) -> LandmarkSettings:
+    """The settings for depths of a stereo pair: disparity has the noise of two features, and no range ends it."""
+    sigma = float(np.sqrt(2.0)) * settings.pixel_sigma / (focal_px * baseline_m)
+    return settings.model_copy(update={"depth_sigma": sigma, "depth_range_m": np.inf})
+
+
 def inverse_depth(depth_m: Floats, settings: LandmarkSettings) -> tuple[Floats, Floats]:
     """Inverse depth (M,) in 1/m and its variance (M,) of measured depths (M,) in m; NaN where not to be used."""
     usable = (depth_m > 0) & (depth_m < settings.depth_range_m)

@@ -4,62 +4,32 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from pydantic import Field
 
 from vplog import geometry
 from vplog.data import Closures, Verdict
-from vplog.loops import undistort, verify_epipolar, verify_metric
-from vplog.loops.calibration import CalibrationSettings, motion_covariance, rotation_share, turning_pairs
-from vplog.loops.landmarks import Landmarks, LandmarkSettings, inverse_depth, landmarks_of
-from vplog.loops.matching import MatchSettings, match_features
-from vplog.loops.verify_epipolar import EpipolarSettings
-from vplog.loops.verify_metric import MetricSettings, Pose
-from vplog.settings import Settings
+from vplog.loops import undistort
+from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
+from vplog.loops.candidate import Drive, Row, VerifySettings, check_back, check_queries
+from vplog.loops.landmarks import for_stereo
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from concurrent.futures import Executor
 
-    from vplog.data import Camera, Features, Floats, Ints, Keyframes
+    from vplog.data import Camera, Features, Floats, Int32s, Ints, Keyframes
     from vplog.loops.propose import Proposals
 
     FeaturesOf = Callable[[int], Features]
     Progress = Callable[[int, int], None]
 
+__all__ = ["VerifySettings", "verify"]
 _LOG = logging.getLogger(__name__)
 _SUSPICIOUS_SHARE = 0.05
 """Disagreement of camera and odometry that is worth a word: five times a careful calibration's error."""
-
-
-class VerifySettings(Settings):
-    """How a proposed closure is checked."""
-
-    min_matches: int = Field(default=25, ge=0)
-    """Feature matches below which two images are not looked at further. Of the 20 that must agree in the end a fifth
-    has no landmark, and two images of different places share 16 by chance, seldom 25."""
-    matching: MatchSettings = MatchSettings()
-    """Which features are taken for the same point."""
-    landmarks: LandmarkSettings = LandmarkSettings()
-    """How the map frame's features get their 3D position."""
-    calibration: CalibrationSettings = CalibrationSettings()
-    """How far a calibrated camera's rotations are trusted."""
-    metric: MetricSettings = MetricSettings()
-    """When a pose is believed, for a calibrated camera."""
-    epipolar: EpipolarSettings = EpipolarSettings()
-    """When two images agree, for an uncalibrated camera."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """One candidate's part of the ledger."""
-
-    matches: int
-    landmarks: int
-    pose: Pose
 
 
 def verify(
@@ -70,53 +40,72 @@ def verify(
     settings: VerifySettings,
     threads: int = 1,
     progress: Progress | None = None,
+    baseline_m: float | None = None,
 ) -> Closures:
     """The ledger of `proposals`, one row each, in their order.
 
     `features` gives the features of a keyframe row and is called from any thread. `progress(done, total)` counts
     candidates and is called from the caller's thread. The result does not depend on `threads`. Candidates are worked
-    through by map frame, whose landmarks are made once, and only when some query shares enough features with it.
+    through by map frame, whose landmarks are made once, and only when some query shares enough features with it; those
+    believed are then looked at the other way round, by query. `baseline_m` says that the features' depths are those of
+    a stereo pair with this baseline, whose error is in the disparity.
 
     Raises LogError for a calibrated camera with an unknown distortion model.
     """
     total = len(proposals.query)
     if camera.matrix is not None:
-        undistort.focal_px(camera)  # refuse an unknown lens before the work, not within it
-    order = np.lexsort([proposals.query, proposals.match])
-    groups = np.split(order, np.flatnonzero(np.diff(proposals.match[order])) + 1) if total else []
+        focal_px = undistort.focal_px(camera)  # refuse an unknown lens before the work, not within it
+        if baseline_m is not None:
+            stereo = for_stereo(settings.landmarks, focal_px, baseline_m)
+            settings = settings.model_copy(update={"landmarks": stereo})
+    drive = Drive(keyframes, camera, features, settings, baseline_m is not None)
 
-    def check(match: int, queries: list[int]) -> list[_Row]:
+    def check(match: int, queries: list[int]) -> list[Row]:
         cv2.setNumThreads(1)  # one candidate, one thread; the pool is the only parallelism
-        return _check_queries(match, queries, keyframes, camera, features, settings)
+        return check_queries(drive, match, queries)
 
-    rows: list[_Row | None] = [None] * total
-    done = 0
-    share = 0.0
+    def back(query: int, matches: list[int], believed: list[Row]) -> list[Row]:
+        cv2.setNumThreads(1)
+        return check_back(drive, query, matches, believed, share)
+
+    rows: dict[int, Row] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        if camera.matrix is not None and total:
-            pairs = turning_pairs(keyframes, settings.calibration)
-            turns = pool.map(check, pairs[:, 0].tolist(), [[later] for later in pairs[:, 1].tolist()])
-            share = _calibration_share(pairs, [row.pose for (row,) in turns], keyframes, camera, settings)
+        share = _calibration_share(drive, pool, check) if camera.matrix is not None and total else 0.0
+        groups = _by(proposals.match, proposals.query, np.arange(total))
         matches = [int(proposals.match[group[0]]) for group in groups]
         queries = [proposals.query[group].tolist() for group in groups]
         for group, found in zip(groups, pool.map(check, matches, queries), strict=True):
-            for at, row in zip(group, found, strict=True):
-                rows[at] = row
-            done += len(group)
+            rows.update(zip(group.tolist(), found, strict=True))
             if progress is not None:
-                progress(done, total)
-    return _ledger(proposals, [row for row in rows if row is not None], camera, share)
+                progress(len(rows), total)
+        if settings.both_ways:
+            believed = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
+            groups = _by(proposals.query, proposals.match, believed)
+            queries = [int(proposals.query[group[0]]) for group in groups]
+            matches = [proposals.match[group].tolist() for group in groups]
+            one_way = [[rows[at] for at in group.tolist()] for group in groups]
+            for group, found in zip(groups, pool.map(back, queries, matches, one_way), strict=True):
+                rows.update(zip(group.tolist(), found, strict=True))
+    return _ledger(proposals, [rows[at] for at in range(total)], drive, share)
 
 
-def _calibration_share(
-    pairs: Ints, poses: list[Pose], keyframes: Keyframes, camera: Camera, settings: VerifySettings
-) -> float:
-    """By what share the camera's rotations over turning pairs (P, 2) disagree with the odometry's."""
+def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
+    """The ledger's `rows` in groups of one key, by increasing key, then other."""
+    order = rows[np.lexsort([other[rows], key[rows]])]
+    return np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(rows) else []
+
+
+def _calibration_share(drive: Drive, pool: Executor, check: Callable[[int, list[int]], list[Row]]) -> float:
+    """By what share the camera's rotations over turning pairs disagree with the odometry's."""
+    keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
+    pairs = turning_pairs(keyframes, settings)
+    turns = pool.map(check, pairs[:, 0].tolist(), [[later] for later in pairs[:, 1].tolist()])
+    poses = [row.pose for (row,) in turns]
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
     driven = geometry.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
     seen = np.array([_of_body(found, camera) for at in good if (found := poses[at].match_from_query) is not None])
-    share = rotation_share(driven, seen, settings.calibration)
+    share = rotation_share(driven, seen, settings)
     if share > _SUSPICIOUS_SHARE:
         _LOG.warning(
             "Camera %r and odometry disagree by %.0f %% about rotations: closures claim less. Check the focal length.",
@@ -131,82 +120,40 @@ def _of_body(match_from_query: Floats, camera: Camera) -> Floats:
     return camera.body_from_camera @ match_from_query @ geometry.inverse(camera.body_from_camera)
 
 
-def _check_queries(
-    match: int, queries: list[int], keyframes: Keyframes, camera: Camera, features: FeaturesOf, settings: VerifySettings
-) -> list[_Row]:
-    """The queries that were proposed for one map frame."""
-    theirs = features(match)
-    known = None
-    rows = []
-    for query in queries:
-        own = features(query)
-        mine, found = match_features(own, theirs, settings.matching)
-        if len(mine) < settings.min_matches:
-            rows.append(_Row(len(mine), 0, Pose(Verdict.TOO_FEW_MATCHES, 0, 0.0)))
-        elif camera.matrix is None:
-            pose = verify_epipolar.solve(
-                own.points[mine], theirs.points[found], own.width, own.height, settings.epipolar
-            )
-            rows.append(_Row(len(mine), 0, pose))
-        else:
-            if known is None:
-                known = landmarks_of(match, keyframes, camera, features, settings.matching, settings.landmarks)
-            rows.append(_check_metric(own, mine, found, known, camera, settings))
-    return rows
-
-
-def _check_metric(
-    own: Features,
-    mine: np.ndarray,
-    found: np.ndarray,
-    known: Landmarks,
-    camera: Camera,
-    settings: VerifySettings,
-) -> _Row:
-    rays = undistort.rays(camera, own.points[mine])
-    usable = known.known[found] & np.isfinite(rays).all(axis=1)
-    matches, count = len(mine), int(usable.sum())
-    if count < settings.metric.min_inliers:
-        # features were followed, but none moved enough against the others to have a depth
-        still = not known.from_depth and known.tracked >= settings.min_matches > known.known.sum()
-        verdict = Verdict.DEGENERATE_MOTION if still else Verdict.TOO_FEW_LANDMARKS
-        return _Row(matches, count, Pose(verdict, 0, 0.0))
-    depth_m = own.depth_m[mine[usable]].astype(np.float64)
-    pose = verify_metric.solve(
-        known,
-        found[usable],
-        rays[usable],
-        inverse_depth(depth_m, settings.landmarks),
-        own.points[mine[usable]] / [own.width, own.height],
-        camera,
-        settings.landmarks,
-        settings.metric,
-    )
-    return _Row(matches, count, pose)
-
-
-def _ledger(proposals: Proposals, rows: list[_Row], camera: Camera, calibration_share: float) -> Closures:
+def _ledger(proposals: Proposals, rows: list[Row], drive: Drive, share: float) -> Closures:
     """The columns of the ledger; poses and their information moved from the camera to the body."""
-    count = len(rows)
+    count, camera = len(rows), drive.camera
     pose, information = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
-    move = geometry.adjoint(geometry.inverse(camera.body_from_camera))
+    body_from_camera = geometry.adjoint(camera.body_from_camera)
+    camera_from_body = geometry.adjoint(geometry.inverse(camera.body_from_camera))
+    twist, stamp_sigma_s = body_twists(drive.keyframes), drive.settings.calibration.stamp_sigma_s
     for at, row in enumerate(rows):
         found, covariance = row.pose.match_from_query, row.pose.covariance
-        if found is None or covariance is None:
+        if found is None:
             continue
         pose[at] = _of_body(found, camera)
-        turned = move.T @ np.linalg.inv(covariance + motion_covariance(found, calibration_share)) @ move
-        information[at] = (turned + turned.T) / 2.0
+        if covariance is not None:
+            total = body_from_camera @ (covariance + motion_covariance(found, share)) @ body_from_camera.T
+            speeds = twist[proposals.match[at]], twist[proposals.query[at]]
+            known = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
+            information[at] = (known + known.T) / 2.0
+        elif row.pose.information is not None:  # turn and direction alone
+            known = camera_from_body.T @ row.pose.information @ camera_from_body
+            information[at] = (known + known.T) / 2.0
     return Closures(
         query=proposals.query.astype(np.int32),
         match=proposals.match.astype(np.int32),
         rank=proposals.rank.astype(np.int32),
         score=proposals.score.astype(np.float32),
         support=proposals.support.astype(np.int32),
+        shared_references=[np.empty(0, np.uint16)] * count,
+        shared_overlap=[np.empty(0, np.float32)] * count,
         matches=np.array([row.matches for row in rows], np.int32),
         landmarks=np.array([row.landmarks for row in rows], np.int32),
         inliers=np.array([row.pose.inliers for row in rows], np.int32),
         spread=np.array([row.pose.spread for row in rows], np.float32),
+        reverse_inliers=np.array([row.reverse_inliers for row in rows], np.int32),
+        scale=[row.scale for row in rows],
         match_from_query=pose,
         information=information,
         verdict=[row.pose.verdict for row in rows],
