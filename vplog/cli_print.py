@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -66,6 +67,32 @@ def print_evaluation(found: dict[str, Any]) -> None:
         )
         ate = found[f"ate_{when}"]
         print(f"{when:9} ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m{drift}")
+
+
+def print_explanation(told: dict[str, Any]) -> None:
+    print(f"closure {told['closure']} of {told['run']}")
+    for name, text in (
+        ("verdict", told["verdict"]),
+        ("proposed", told["proposed"]),
+        ("geometry", told["geometry"]),
+        ("solver", told["solver"]),
+        ("to change", told["change"]),
+    ):
+        print(textwrap.fill(text, 110, initial_indent=f"{name:10}", subsequent_indent=" " * 10))
+    if told["picture"]:
+        print(f"{'picture':10}{told['picture']['file']}")
+
+
+def print_optimised(found: dict[str, Any]) -> None:
+    print(
+        f"{found['output']}: {found['poses']} poses, {found['edges']} edges; of {found['loops']} closures "
+        f"{found['kept']} were kept, {found['rejected']} rejected"
+    )
+    print(f"  error {found['error_before']:.6g} before, {found['error_after']:.6g} after (half the chi-square)")
+    print(f"  {found['reason']}")
+    for warning in found["warnings"]:
+        say(f"warning: {warning}")
+    print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
 def print_comparison(found: dict[str, Any]) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
     Int32s = NDArray[np.int32]
     Bytes = NDArray[np.uint8]
+    Uint16s = NDArray[np.uint16]
 
 
 THUMBNAIL_SIDE = 128
@@ -147,6 +148,7 @@ class Verdict(StrEnum):
     NO_CALIBRATION = "no_calibration"
     IMPLAUSIBLE_POSE = "implausible_pose"
     TOO_FAR = "too_far"
+    INCONSISTENT = "inconsistent"
     REJECTED_BY_SOLVER = "rejected_by_solver"
 
     @property
@@ -164,6 +166,7 @@ _SENTENCES = {
     Verdict.NO_CALIBRATION: "The images agree by epipolar geometry, but without calibration there is no metric pose.",
     Verdict.IMPLAUSIBLE_POSE: "The pose found would put the camera further away than a shared view can be.",
     Verdict.TOO_FAR: "The views agree, but are further apart than one place is wide; nearer keyframes tell it better.",
+    Verdict.INCONSISTENT: "The pose from query to match and the one from match to query do not agree.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
 }
 
@@ -182,6 +185,12 @@ class Closures:
     """(C,) the recogniser's similarity."""
     support: Int32s
     """(C,) neighbours of the pair that agree by sequence; 0 where no sequence was used."""
+    shared_references: list[Uint16s]
+    """(C,) numbers of the library's references that explain both places, those that count most first; empty for a
+    recogniser without boxes, whose places share no references."""
+    shared_overlap: list[Float32s]
+    """(C,) of each shared reference, the share of a box that the two places' boxes have in common, mean over the
+    boxes, 0..1."""
     matches: Int32s
     """(C,) feature matches that passed the ratio and mutual tests."""
     landmarks: Int32s
@@ -190,6 +199,10 @@ class Closures:
     """(C,) matches that agree with the pose, or with the epipolar geometry where there is no pose."""
     spread: Float32s
     """(C,) share of the query image that the inliers' bounding box covers, 0..1."""
+    reverse_inliers: Int32s
+    """(C,) inliers of the check the other way round, match looked for from query; -1 where it was not tried."""
+    scale: list[str]
+    """(C,) where the metres of match_from_query come from: `odometry`, `depth`, `stereo`, or `none` without metres."""
     match_from_query: Floats
     """(C, 4, 4) body frames, NaN where no pose was found."""
     information: Floats
@@ -225,6 +238,9 @@ class PoseGraph:
     information: Floats
     """(E, 6, 6), in the frame of b."""
     kind: list[EdgeKind]
+    dimension: int = 3
+    """3, or 2 for a planar graph: all poses and edges then are turns about z and shifts along x and y, and only rows and
+    columns 2, 3, 4 of `information` (yaw, x, y) are used, the others being zero."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from vplog.results.atomic import replacing
 
@@ -18,7 +18,9 @@ DPI = 150
 
 
 @contextmanager
-def drawn(folder: Path, name: str, width: float, height: float) -> Iterator[Figure]:
+def drawn(
+    folder: Path, name: str, width: float, height: float, kinds: tuple[Literal["png", "svg"], ...] = ("png", "svg")
+) -> Iterator[Figure]:
     """A figure of so many inches to be filled, written as NAME.png and NAME.svg when the block ends well."""
     import matplotlib as mpl  # a second to load, which only figures need
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -30,7 +32,8 @@ def drawn(folder: Path, name: str, width: float, height: float) -> Iterator[Figu
         FigureCanvasAgg(figure)
         yield figure
         _settle(figure)
-        for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+        for kind in kinds:
+            metadata = {"Software": None} if kind == "png" else {"Date": None}
             with replacing(folder / f"{name}.{kind}") as stream:
                 figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
 

@@ -28,6 +28,7 @@ from vplog.places.coverage import STRONGEST, choose_by_coverage, coverage_warnin
 from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
 from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.places.shared import SharesReferences
 from vplog.places.stored import load_references, read_library_record
 from vplog.references import PAPER_SIZE, LibrarySettings, choose, evenly
 from vplog.results import g2o, mcap, run_record, tables, tum
@@ -172,6 +173,7 @@ def run(
                 proposals, keyframes, camera, store.__getitem__, pipeline.verify, threads,
                 lambda done, total: progress("verify", done, total),
             )  # fmt: skip
+            closures = name_shared(closures, state, descriptors)
         with watch.stage("solve"):
             covariance, doubts, noise_source = edge_covariance(odometry, keyframes.stamp_ns, pipeline.noise)
             graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
@@ -190,6 +192,7 @@ def run(
         account = {
             **record.head(pipeline, path, threads),
             "finished": True,
+            "topics": (topics or logs.TopicChoice()).model_dump(mode="json"),
             "inputs": hashes.result(),
             "library": {
                 "hash": state.hash,
@@ -319,6 +322,14 @@ def find_candidates(
     index, stops = state.index(descriptors), candidate_stops(keyframes, pipeline.propose)
     ranked = rank_places(index, descriptors, stops, pipeline.propose.asked, pipeline.sequence, threads)
     return propose(ranked, pipeline.propose)
+
+
+def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:
+    """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
+    if not isinstance(state, SharesReferences):
+        return closures
+    found = state.shared(descriptors, closures.query, closures.match)
+    return replace(closures, shared_references=found.references, shared_overlap=found.overlap)
 
 
 def judge(closures: Closures, graph: PoseGraph, solution: Solution, rows: Ints) -> Closures:

@@ -34,7 +34,7 @@ def test_proto_text_and_message_class_agree() -> None:
         kind = (
             field.message_type.full_name
             if field.message_type
-            else {1: "double", 2: "float", 5: "int32"}.get(field.type, "string")
+            else {1: "double", 2: "float", 5: "int32", 13: "uint32"}.get(field.type, "string")
         )
         repeated = "repeated " if field.is_repeated else ""
         assert f"\n  {repeated}{kind} {field.name} = {field.number};\n" in text

@@ -142,7 +142,12 @@ def test_every_ledger_row_is_a_message(tmp_path: Path) -> None:
         np.testing.assert_equal(message.residual_before_sigma, ledger.residual_before[row])
         np.testing.assert_equal(message.residual_after_sigma, ledger.residual_after[row])
         np.testing.assert_equal(message.tx_m, ledger.match_from_query[row, 0, 3])
+        assert message.reverse_inliers == ledger.reverse_inliers[row]
+        assert message.scale == ledger.scale[row]
+        assert list(message.shared_references) == ledger.shared_references[row].tolist()
+        assert list(message.shared_overlap) == ledger.shared_overlap[row].tolist()
         known = np.isfinite(ledger.weight[row])
+        assert len(message.covariance) == (36 if known else 0)
         assert list(message.information) == (ledger.information[row].ravel().tolist() if known else [])
 
 

@@ -44,6 +44,10 @@ def assert_same(read: Any, written: Any, poses: tuple[str, ...]) -> None:
         elif isinstance(right, np.ndarray):
             assert left.dtype == right.dtype, field.name
             np.testing.assert_array_equal(left, right, err_msg=field.name)
+        elif field.name.startswith("shared_"):
+            for one, other in zip(left, right, strict=True):
+                assert one.dtype == other.dtype, field.name
+                np.testing.assert_array_equal(one, other, err_msg=field.name)
         else:
             assert left == right, field.name
 
@@ -58,6 +62,47 @@ def test_keyframes_come_back(tmp_path: Path) -> None:
 def test_closures_come_back_with_what_is_unknown(tmp_path: Path) -> None:
     tables.write_closures(tmp_path / "c", RUN.closures, RUN.keyframes, METADATA)
     assert_same(tables.read_closures(tmp_path / "c"), RUN.closures, ("match_from_query",))
+
+
+def test_the_covariance_is_the_inverse_where_there_is_one(tmp_path: Path) -> None:
+    """Of a pose without metres some direction is open: its information has no inverse, and the table no covariance."""
+    information = RUN.closures.information.copy()
+    [accepted] = [row for row, verdict in enumerate(RUN.closures.verdict) if verdict is Verdict.ACCEPTED]
+    information[accepted, 5] = information[accepted, :, 5] = 0.0
+    closures = dataclasses.replace(RUN.closures, information=information)
+    tables.write_closures(tmp_path / "c", closures, RUN.keyframes, METADATA)
+    written = pq.read_table(tmp_path / "c")["covariance"].to_pylist()
+    known = [row for row, values in enumerate(written) if values is not None]
+    assert known == [row for row, verdict in enumerate(closures.verdict) if verdict is Verdict.REJECTED_BY_SOLVER]
+    np.testing.assert_allclose(np.reshape(written[known[0]], (6, 6)) @ information[known[0]], np.eye(6), atol=1e-9)
+
+
+def test_shared_references_without_their_overlap_are_refused(tmp_path: Path) -> None:
+    tables.write_closures(tmp_path / "c", RUN.closures, RUN.keyframes, METADATA)
+    table = pq.read_table(tmp_path / "c")
+    at = table.schema.get_field_index("shared_overlap")
+    empty = pa.array([[]] * len(table), table.schema.field(at).type)
+    pq.write_table(table.set_column(at, table.schema.field(at), empty), tmp_path / "c")
+    with pytest.raises(ResultError, match="without their overlap"):
+        tables.read_closures(tmp_path / "c")
+
+
+@pytest.mark.parametrize("name", ["verdict", "scale"])
+def test_words_that_are_none_of_ours_are_named(tmp_path: Path, name: str) -> None:
+    tables.write_closures(tmp_path / "c", RUN.closures, RUN.keyframes, METADATA)
+    table = pq.read_table(tmp_path / "c")
+    at = table.schema.get_field_index(name)
+    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(["guess"] * len(table))), tmp_path / "c")
+    with pytest.raises(ResultError, match=r"guess.*(too_far|stereo)"):
+        tables.read_closures(tmp_path / "c")
+
+
+@pytest.mark.parametrize("name", ["shared_references", "shared_overlap", "reverse_inliers", "scale", "covariance"])
+def test_a_ledger_of_an_older_version_is_told_apart(tmp_path: Path, name: str) -> None:
+    tables.write_closures(tmp_path / "c", RUN.closures, RUN.keyframes, METADATA)
+    pq.write_table(pq.read_table(tmp_path / "c").drop_columns([name]), tmp_path / "c")
+    with pytest.raises(ResultError, match=f"no column {name} .* another version of vplog"):
+        tables.read_closures(tmp_path / "c")
 
 
 def test_empty_ledger_comes_back(tmp_path: Path) -> None:
@@ -134,6 +179,9 @@ def test_duckdb_reads_every_table(tmp_path: Path) -> None:
     path = str(tmp_path / "closures.parquet")
     known, unknown = duckdb.execute("select count(tx), count(*) - count(tx) from read_parquet(?)", [path]).fetchall()[0]
     assert (known, unknown) == (2, len(RUN.closures) - 2)
+    most = "select max(list_max(shared_overlap)), sum(len(shared_references)) from read_parquet(?)"
+    shares = np.concatenate(RUN.closures.shared_overlap)
+    assert duckdb.execute(most, [path]).fetchall() == [(shares.max(), len(shares))]
     query = "select query_stamp_ns, reason, information[8] from read_parquet(?) where verdict = 'accepted'"
     row = RUN.closures.verdict.index(Verdict.ACCEPTED)
     stamp = int(RUN.keyframes.stamp_ns[RUN.closures.query[row]])

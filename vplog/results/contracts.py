@@ -51,16 +51,25 @@ def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
     columns = []
     for column in schema:
         metadata = {key.decode(): value.decode() for key, value in column.metadata.items()}
-        kind = "float64[36]" if pa.types.is_fixed_size_list(column.type) else str(column.type)
+        kind = _kind(column.type)
         if (name, column.name) == ("descriptors", "descriptor"):
             kind = "any"
         columns.append(
             {
                 "name": column.name,
-                "type": {"float": "float32", "double": "float64"}.get(kind, kind),
+                "type": kind,
                 "nullable": column.nullable,
                 "unit": metadata["unit"],
                 "description": metadata["description"],
             }
         )
     return {"table": name, "file": f"{name}.parquet", "metadata": _HEADER, "columns": columns}
+
+
+def _kind(kind: pa.DataType) -> str:
+    """The name of a type: `float64[36]` a list of that many, `uint16[]` a list of any length."""
+    if pa.types.is_fixed_size_list(kind):
+        return f"{_kind(kind.value_type)}[{kind.list_size}]"
+    if pa.types.is_list(kind):
+        return f"{_kind(kind.value_type)}[]"
+    return {"float": "float32", "double": "float64"}.get(str(kind), str(kind))

@@ -22,6 +22,7 @@ from vplog import geometry
 from vplog.data import EdgeKind, Verdict
 from vplog.results.atomic import replacing
 from vplog.results.messages import descriptor_set, loop_closure_class
+from vplog.results.tables import covariance_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,6 +75,7 @@ def write_mcap(
         ledger = _Channel(writer, "/loop_closures", loop_closure)
 
         bodies, relative = _parts(world_from_body), _parts(closures.match_from_query)
+        covariance = covariance_of(closures.information)
         rows = np.argsort(closures.query, kind="stable")
         first_row = np.searchsorted(closures.query[rows], np.arange(len(keyframes.stamp_ns) + 1))
         for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
@@ -90,8 +92,8 @@ def write_mcap(
                     static.write(stamp_ns, _transform(stamp_ns, BODY, CAMERA, part))
             transforms.write(stamp_ns, _transform(stamp_ns, MAP, BODY, bodies[node]))
             for row in rows[first_row[node] : first_row[node + 1]].tolist():
-                message = _loop_closure(loop_closure(), row, closures, relative[row], keyframes.stamp_ns)
-                ledger.write(stamp_ns, message)
+                parts = relative[row], covariance[row]
+                ledger.write(stamp_ns, _loop_closure(loop_closure(), row, closures, *parts, keyframes.stamp_ns))
             if node == len(keyframes.stamp_ns) - 1:
                 optimised.write(stamp_ns, _path(stamp_ns, bodies))
         writer.finish()
@@ -170,12 +172,17 @@ def _scene(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: C
     return message
 
 
-def _loop_closure(message: Any, row: int, closures: Closures, match_from_query: Part, stamp_ns: Ints) -> Message:
+def _loop_closure(
+    message: Any, row: int, closures: Closures, match_from_query: Part, covariance: Floats, stamp_ns: Ints
+) -> Message:
     message.timestamp.FromNanoseconds(int(stamp_ns[closures.query[row]]))
     message.match_timestamp.FromNanoseconds(int(stamp_ns[closures.match[row]]))
     message.frame_id = BODY
-    for name in ("query", "match", "rank", "support", "matches", "landmarks", "inliers"):
+    for name in ("query", "match", "rank", "support", "matches", "landmarks", "inliers", "reverse_inliers"):
         setattr(message, name, int(getattr(closures, name)[row]))
+    message.shared_references.extend(closures.shared_references[row].tolist())
+    message.shared_overlap.extend(closures.shared_overlap[row].tolist())
+    message.scale = closures.scale[row]
     message.score, message.spread = float(closures.score[row]), float(closures.spread[row])
     position, quaternion = match_from_query
     message.tx_m, message.ty_m, message.tz_m = position
@@ -183,6 +190,8 @@ def _loop_closure(message: Any, row: int, closures: Closures, match_from_query: 
     information = closures.information[row]
     if np.isfinite(information).all():
         message.information.extend(information.reshape(-1).tolist())
+    if np.isfinite(covariance).all():
+        message.covariance.extend(covariance.reshape(-1).tolist())
     message.verdict, message.reason = closures.verdict[row].value, closures.verdict[row].sentence
     message.residual_before_sigma = float(closures.residual_before[row])
     message.residual_after_sigma = float(closures.residual_after[row])

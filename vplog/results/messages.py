@@ -38,6 +38,11 @@ LOOP_CLOSURE_FIELDS = (
     ("residual_before_sigma", "double", "Mahalanobis distance to the odometry, NaN where not in the graph."),
     ("residual_after_sigma", "double", "The same after the solve."),
     ("weight", "double", "Weight of the robust solve, 0 to 1, NaN where not in the graph."),
+    ("shared_references", "repeated uint32", "References of the library that explain both; empty without boxes."),
+    ("shared_overlap", "repeated float", "Of each, the share of a box that the two have in common, 0 to 1."),
+    ("reverse_inliers", "int32", "Inliers from match to query, -1 where not tried."),
+    ("scale", "string", "Where the metres of the pose come from: `odometry`, `depth`, `stereo` or `none`."),
+    ("covariance", "repeated double", "The inverse of the information; empty without a pose."),
 )
 """Name, type and description; the number of a field is its place here, from 1. Only ever add to the end."""
 
@@ -45,6 +50,7 @@ _FIELD = descriptor_pb2.FieldDescriptorProto
 _TYPES = {
     "string": _FIELD.TYPE_STRING,
     "int32": _FIELD.TYPE_INT32,
+    "uint32": _FIELD.TYPE_UINT32,
     "float": _FIELD.TYPE_FLOAT,
     "double": _FIELD.TYPE_DOUBLE,
 }

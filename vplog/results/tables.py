@@ -64,6 +64,11 @@ def _pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Fie
 
 
 _MATRIX = pa.list_(pa.field("element", pa.float64(), nullable=False), 36)
+_NUMBERS = pa.list_(pa.field("element", pa.uint16(), nullable=False))
+_SHARES = pa.list_(pa.field("element", pa.float32(), nullable=False))
+_OPEN_SHARE = 1e-12
+"""Least eigenvalue of an information matrix as a share of its largest, below which nothing is known along it: a turn
+known to 0.01 degrees and a shift to 10 m are 3e-10 apart."""
 _INFORMATION_UNIT = "rad^-2, rad^-1 m^-1, m^-2"
 
 KEYFRAMES = pa.schema(
@@ -84,12 +89,17 @@ CLOSURES = pa.schema(
         _column("rank", pa.int32(), "1", "Place among the query's candidates, 0 is the best."),
         _column("score", pa.float32(), "1", "The recogniser's similarity, on its own scale."),
         _column("support", pa.int32(), "pairs", "Neighbours of the pair that agree by sequence; 0 without a sequence."),
+        _column("shared_references", _NUMBERS, "1", "Library references that explain both; empty without boxes."),
+        _column("shared_overlap", _SHARES, "1", "Of each, the share of a box that the two have in common, 0 to 1."),
         _column("matches", pa.int32(), "features", "Feature matches that passed the ratio and mutual tests."),
         _column("landmarks", pa.int32(), "features", "Matches with a known 3D position in the map frame."),
         _column("inliers", pa.int32(), "features", "Matches that agree with the pose, or with the epipolar geometry."),
         _column("spread", pa.float32(), "1", "Share of the query image that the inliers' bounding box covers."),
+        _column("reverse_inliers", pa.int32(), "features", "Inliers from match to query, -1 where not tried."),
+        _column("scale", pa.string(), "", "Where the metres come from: `odometry`, `depth`, `stereo` or `none`."),
         *_pose_columns("", "match_from_query between body frames, null where no pose was found", nullable=True),
         _column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of match_from_query, in the query's body frame.", True),
+        _column("covariance", _MATRIX, "rad^2, rad m, m^2", "The inverse of the information.", True),
         _column("verdict", pa.string(), "", "What became of the candidate."),
         _column("reason", pa.string(), "", "The verdict in one sentence."),
         _column(
@@ -154,11 +164,12 @@ def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:
 def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadata: TableMetadata) -> None:
     """closures.parquet, the ledger with the stamps of both keyframes and each verdict's sentence."""
     columns = {
-        **{name: getattr(closures, name) for name in _PLAIN_LEDGER},
+        **{name: getattr(closures, name) for name in (*_PLAIN_LEDGER, "shared_references", "shared_overlap", "scale")},
         "query_stamp_ns": keyframes.stamp_ns[closures.query],
         "match_stamp_ns": keyframes.stamp_ns[closures.match],
         **_pose_values("", closures.match_from_query),
         "information": closures.information,
+        "covariance": covariance_of(closures.information),
         "verdict": [verdict.value for verdict in closures.verdict],
         "reason": [verdict.sentence for verdict in closures.verdict],
     }
@@ -166,10 +177,24 @@ def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadat
 
 
 _PLAIN_LEDGER = (
-    *("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread"),
+    *("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread", "reverse_inliers"),
     *("residual_before", "residual_after", "weight"),
 )
 """Fields of the ledger that are one column as they are."""
+
+
+def covariance_of(information: Floats) -> Floats:
+    """The inverses of matrices (C, 6, 6), NaN where one is not known or leaves a direction open."""
+    covariance = np.full(information.shape, np.nan)
+    known = np.flatnonzero(np.isfinite(information).all((1, 2)))
+    values = np.linalg.eigvalsh(information[known])
+    sound = known[values[:, 0] > _OPEN_SHARE * values[:, -1]]
+    covariance[sound] = np.linalg.inv(information[sound])
+    return covariance
+
+
+_SCALES = ("odometry", "depth", "stereo", "none")
+"""Where the metres of a closure may come from."""
 
 
 def read_closures(path: Path) -> Closures:
@@ -179,12 +204,34 @@ def read_closures(path: Path) -> Closures:
         verdict = [Verdict(text) for text in table["verdict"].to_pylist()]
     except ValueError as error:
         raise ResultError(f"{path}: {error}. Verdicts: {', '.join(Verdict)}.") from None
+    scale = table["scale"].to_pylist()
+    if not set(scale) <= set(_SCALES):
+        raise ResultError(f"{path}: {sorted(set(scale) - set(_SCALES))[0]!r} is no scale: {', '.join(_SCALES)}.")
+    references, overlap = _lists(table, "shared_references"), _lists(table, "shared_overlap")
+    if any(len(numbers) != len(shares) for numbers, shares in zip(references, overlap, strict=True)):
+        raise ResultError(f"{path} has shared references without their overlap. Run `vplog run` again.")
     return Closures(
+        shared_references=references,
+        shared_overlap=overlap,
+        scale=scale,
         match_from_query=_poses(table, ""),
         information=_matrices(table, "information"),
         verdict=verdict,
         **{name: _values(table, name) for name in _PLAIN_LEDGER},
     )
+
+
+def read_closure(path: Path, row: int) -> dict[str, Any]:
+    """One row of the ledger by column, None where something is not known. The table is checked as in `read_closures`.
+
+    Raises ResultError where the table has no such row.
+    """
+    table = _read(path, "closures", CLOSURES)
+    if not 0 <= row < len(table):
+        known = f"0..{len(table) - 1}" if len(table) else "none: nothing was proposed"
+        raise ResultError(f"{path} has no closure {row}. Closures: {known}.")
+    [found] = table.slice(row, 1).select(CLOSURES.names).to_pylist()
+    return found
 
 
 def write_edges(path: Path, graph: PoseGraph, solution: Solution, residual: Floats, metadata: TableMetadata) -> None:
@@ -305,6 +352,10 @@ def _write(path: Path, name: str, schema: pa.Schema, columns: dict[str, Any], me
 
 def _array(values: Any, column: pa.Field) -> pa.Array:
     """The values of a column; NaN is null where the column may be null."""
+    if column.type in (_NUMBERS, _SHARES):
+        offsets = np.cumsum([0, *map(len, values)], dtype=np.int32)
+        flat = pa.array(np.concatenate([*values, np.empty(0)]), column.type.value_type)
+        return pa.ListArray.from_arrays(offsets, flat, type=column.type)
     if column.type != _MATRIX:
         return pa.array(values, column.type, mask=np.isnan(values) if column.nullable else None)
     rows = np.ascontiguousarray(values, np.float64).reshape(-1, _MATRIX.list_size)
@@ -330,7 +381,10 @@ def _read(path: Path, name: str, schema: pa.Schema | None) -> pa.Table:
         return table
     for column in schema:
         if column.name not in table.schema.names or table.schema.field(column.name).type != column.type:
-            raise ResultError(f"{path} has no column {column.name} of type {column.type}. Run `vplog run` again.")
+            raise ResultError(
+                f"{path} has no column {column.name} of type {column.type}: it is of another version of vplog. "
+                "Run `vplog run` again."
+            )
         if not column.nullable and table[column.name].null_count:
             raise ResultError(f"{path} holds nulls in column {column.name}. Run `vplog run` again.")
     return table
@@ -359,6 +413,13 @@ def _poses(table: pa.Table, prefix: str) -> Floats:
 def _values(table: pa.Table, name: str) -> np.ndarray:
     """A column as an array of its own, which may be written to."""
     return np.array(table[name].to_numpy())
+
+
+def _lists(table: pa.Table, name: str) -> list[np.ndarray]:
+    """A column of lists, each an array of its own."""
+    column = table[name].combine_chunks()
+    values, ends = column.flatten().to_numpy(), np.cumsum(column.value_lengths().to_numpy())
+    return [part.copy() for part in np.split(values, ends[:-1])] if len(column) else []
 
 
 def _matrices(table: pa.Table, name: str) -> Floats:

@@ -1,0 +1,153 @@
+"""One closure of a finished run, told in words and shown in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import explain_words, logs
+from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.explain_picture import Side, View, draw, find_agreement, find_boxes
+from vplog.extract import extract_frames
+from vplog.pipeline import Pipeline
+from vplog.results import run_record, tables
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.data import Closures, Keyframes
+    from vplog.explain_picture import SharedBoxes
+
+    Choose = Callable[[Closures, Keyframes], int]
+
+
+def explain(
+    folder: Path,
+    choose: Choose,
+    picture: Path | None = None,
+    log: Path | None = None,
+    words_only: bool = False,
+) -> dict[str, Any]:
+    """What happened to one closure of the run in `folder`: its row, sentences, and what the picture shows.
+
+    `picture` is the .png or .svg to write, `closure-K.png` in the run folder where None. The run's log is read for it,
+    or `log` where that has moved. Raises VplogError with one line.
+    """
+    record = run_record.read_run_json(folder / "run.json")
+    if not record.get("finished"):
+        raise ResultError(
+            f"The run in {folder} did not finish, and has no ledger yet. Run it again: "
+            f"vplog run {record.get('log')} -o {folder}"
+        )
+    if picture is not None and picture.suffix not in (".png", ".svg"):
+        raise ResultError(f"A picture is a .png or .svg, and {picture} is neither.")
+    try:
+        pipeline = Pipeline.read(_part(record, folder, "settings"), f"{folder}/run.json")
+    except SettingsError as error:
+        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    path = folder / "closures.parquet"
+    closures = tables.read_closures(path)
+    number = choose(closures, keyframes)
+    row = tables.read_closure(path, number)
+    siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
+    reason = str(_part(record, folder, "solution").get("reason", ""))
+    words = explain_words.tell(row, keyframes, world_from_body, siblings, pipeline, reason)
+    shown = None
+    if not words_only:
+        found = log or Path(str(record.get("log")))
+        if not found.exists():
+            raise ResultError(f"The log of the run, {found}, is not there any more. Say where it is with --log PATH.")
+        topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
+        opened, file = logs.open(found, topics), picture or folder / f"closure-{number}.png"
+        shown = _show(number, row, words, folder, record, pipeline, opened, file)
+    return {"run": str(folder), "closure": number, "row": row, **asdict(words), "picture": shown}
+
+
+def numbered(number: int) -> Choose:
+    """The closure in this row of the ledger."""
+    return lambda _closures, _keyframes: number
+
+
+def between(query: int, match: int) -> Choose:
+    """The closure of two keyframes, by their rows or their stamps in ns."""
+
+    def choose(closures: Closures, keyframes: Keyframes) -> int:
+        count = len(keyframes.stamp_ns)
+        rows = [one if one < count else int(np.searchsorted(keyframes.stamp_ns, one)) for one in (query, match)]
+        for one, at in zip((query, match), rows, strict=True):
+            if at >= count or (one >= count and keyframes.stamp_ns[at] != one):
+                raise ResultError(f"No keyframe has the row or stamp {one}. Rows are 0..{count - 1}; stamps are in ns.")
+        found = np.flatnonzero((closures.query == rows[0]) & (closures.match == rows[1]))
+        if not len(found):
+            known = closures.match[closures.query == rows[0]].tolist()
+            raise ResultError(
+                f"Keyframe {rows[1]} was not proposed for keyframe {rows[0]}. "
+                f"Proposed for it: {', '.join(map(str, known)) or 'none'}."
+            )
+        return int(found[0])
+
+    return choose
+
+
+def worst(closures: Closures, _keyframes: Keyframes) -> int:
+    """The closure that the solved trajectory is furthest from, in sigma."""
+    if not np.isfinite(closures.residual_after).any():
+        raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
+    return int(np.nanargmax(closures.residual_after))
+
+
+def _part(record: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
+    if not isinstance(record.get(name), dict):
+        raise ResultError(f"{folder}/run.json lacks {name}. Run `vplog run` again to write it anew.")
+    return record[name]
+
+
+def _show(
+    number: int, row: dict[str, Any], words: explain_words.Words, folder: Path, record: dict[str, Any],
+    pipeline: Pipeline, log: Any, picture: Path,
+) -> dict[str, Any]:  # fmt: skip
+    """Read both frames again, look for what they share, and draw it."""
+    stamps = np.array([row["match_stamp_ns"], row["query_stamp_ns"]], np.int64)
+    if not np.isin(stamps, log.stamps()).all():
+        raise ResultError(f"{log.name} has no frames of these stamps: is it the log of {folder}? Name it with --log.")
+    sides = []
+    for _, frame, features, why in extract_frames(log.frames(stamps), pipeline.features, 1):
+        if frame is None or features is None:
+            raise ResultError(why)
+        sides.append(Side(frame.image, features))
+    match, query = sides
+    agreement = find_agreement(query.features, match.features, row, log.camera(), pipeline.verify)
+    boxes, missing = _boxes(row, folder, record, pipeline)
+    draw(picture, View(number, row, words, query, match, agreement, boxes, missing))
+    return {
+        "file": str(picture),
+        "matches": len(agreement.agrees),
+        "agree": int(agreement.agrees.sum()),
+        "agree_with": agreement.model,
+        "references": [one.reference for one in boxes],
+        "without_boxes": missing,
+    }
+
+
+def _boxes(
+    row: dict[str, Any], folder: Path, record: dict[str, Any], pipeline: Pipeline
+) -> tuple[list[SharedBoxes], str]:
+    """What both views share on the library's references, or why that is not known."""
+    if not row["shared_references"]:
+        return [], f"{pipeline.places.kind} tells of no reference that both views share"
+    library = folder / "library"
+    if not (library / "library.json").is_file():
+        library = Path(str(_part(record, folder, "library").get("from")))
+    try:
+        state = pipeline.places.load(library, 1)
+        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+        if made_by != state.hash:
+            raise LibraryError(f"{library} is not the library of this run")
+        query, match = state.from_arrow(column.take([row["query"], row["match"]]))
+    except LibraryError as error:
+        return [], str(error).rstrip(".")
+    return find_boxes(state, query, match, row["shared_references"]), ""
