@@ -118,6 +118,16 @@ def test_every_matrix_is_symmetric_and_within_the_shares_of_the_model(scale: flo
     assert values.max() <= settings.worst_share**2 * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)], ids=["heading", "position"])
+def test_a_vain_part_is_said_even_beside_a_sound_one(part: slice) -> None:
+    covariance = SMALL.copy()
+    covariance[part, part] *= 1e-6
+    _, sound, _ = edge_covariance(odometry(SMALL + np.zeros((T, 1, 1))), STAMPS[::7], NoiseSettings())
+    _, vain, _ = edge_covariance(odometry(covariance + np.zeros((T, 1, 1))), STAMPS[::7], NoiseSettings())
+    assert not any("raised" in warning for warning in sound)
+    assert any("was not believed" in warning and "raised" in warning for warning in vain)
+
+
 def test_keyframes_outside_of_the_odometry_are_refused() -> None:
     with pytest.raises(GraphError, match="within the odometry"):
         edge_covariance(odometry(None), STAMPS[[0, 50]] - 1, NoiseSettings())

@@ -128,21 +128,24 @@ def edge_covariance(
             f"The odometry's covariance is unusable at {int((~usable).sum())} of {len(usable)} samples, "
             f"so {int(broken.sum())} edges take the drift model."
         )
-    share = np.sqrt(np.trace(covariance / np.diagonal(modelled, axis1=1, axis2=2)[:, None, :], axis1=1, axis2=2) / 6.0)
     most = np.inf
     if (np.ptp(variance, axis=0) <= 1e-9 * variance.max(0)).all():
         most = settings.worst_share
-    if np.median(share) < settings.best_share:
+    within, share = _within(covariance, modelled, settings.best_share, most)
+    # judged by the surest and the least sure direction of an edge: a sound heading must not hide a vain position
+    least, largest = np.median(share[:, 0]), np.median(share[:, -1])
+    if least < settings.best_share:
         warnings.append(
-            f"The odometry's covariance claims less drift than {settings.best_share * settings.drift_per_metre:.1%} of "
-            "the distance, which no odometry reaches, so it is raised to that."
+            f"The odometry's covariance was not believed: it claims {least:.1%} of the drift model's sigma "
+            f"({settings.drift_per_metre:.1%} of the distance, {np.degrees(settings.turn_per_metre):.3f} deg/m), which "
+            f"no odometry reaches, so it is raised to {settings.best_share:.0%} of it."
         )
-    if np.median(share) > most:
+    if largest > most:
         warnings.append(
-            f"The odometry's covariance is one constant, {np.median(share):.1f} times the drift model in sigma; "
-            f"it is lowered to {most:g} times."
+            f"The odometry's covariance was not believed: it is one constant, {largest:.1f} times the drift model in "
+            f"sigma, so it is lowered to {most:g} times."
         )
-    return _within(covariance, modelled, settings.best_share, most), warnings, source
+    return within, warnings, source
 
 
 def _unknown(what: str, settings: NoiseSettings) -> str:
@@ -218,10 +221,11 @@ def _difference(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     return np.where((least >= -1e-6 * most)[:, None, None], exact, plain)
 
 
-def _within(covariance: Floats, modelled: Floats, least: float, most: float) -> Floats:
-    """Symmetric, with every direction between these shares of the diagonal `modelled`, in sigma."""
+def _within(covariance: Floats, modelled: Floats, least: float, most: float) -> tuple[Floats, Floats]:
+    """Symmetric, with every direction between these shares of the diagonal `modelled`, in sigma; and the shares
+    (N-1, 6) that were there, increasing."""
     sigma = np.sqrt(np.diagonal(modelled, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     values, vectors = np.linalg.eigh((covariance + np.swapaxes(covariance, 1, 2)) / 2 / scale)
     result = (vectors * np.clip(values, least**2, most**2)[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale
-    return (result + np.swapaxes(result, 1, 2)) / 2
+    return (result + np.swapaxes(result, 1, 2)) / 2, np.sqrt(np.maximum(values, 0.0))
