@@ -220,18 +220,27 @@ class BobbState:
         for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
             if total[reference] <= 0.0:
                 break
-            part = slice(matches.start[reference], matches.start[reference + 1])
-            agreed = expected_votes.agreement(
-                matches.here[part], matches.there[part], matches.weight[part], s.agreement, s.agreement_floor
-            )
+            here, there, agreed = self.agreed(matches, reference)
             explained = float(agreed.sum(dtype=np.float64) * self.rarity[reference])
-            found.append((reference, explained, matches.here[part], matches.there[part], agreed))
+            found.append((reference, explained, here, there, agreed))
         found.sort(key=lambda one: -one[1])
         if s.own and matches.itself >= 0:
             best = found[0][1] if found else 1.0
-            everywhere = matches.points
-            found.insert(0, (matches.itself, best, everywhere, everywhere, np.ones(len(everywhere), np.float32)))
+            found.insert(0, (matches.itself, best, *self.agreed(matches, matches.itself)))
         return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]
+
+    def agreed(self, matches: Matches, reference: int) -> tuple[Float32s, Float32s, Float32s]:
+        """Where matches with a reference are (E, 2) in the image and (E, 2) in the reference, as shares of the sides,
+        and their weights (E,), those that agree in their motion counting more.
+
+        An image of the library matches itself in all its features.
+        """
+        if reference == matches.itself:
+            return matches.points, matches.points, np.ones(len(matches.points), np.float32)
+        s = self.settings
+        part = slice(matches.start[reference], matches.start[reference + 1])
+        here, there, weight = matches.here[part], matches.there[part], matches.weight[part]
+        return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
         return CodeIndex(*self._arrays(descriptors), self._overlaps(), len(self.matcher), self.settings.pairing)

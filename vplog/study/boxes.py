@@ -75,13 +75,8 @@ def voting_map(state: BoxState, features: Features, reference: int) -> Floats:
 def _expected(state: BobbState, features: Features, reference: int) -> Floats:
     """The expected vote at the middle of every cell, by the closed form of `expected_votes`."""
     s = state.settings
-    matches = state.matcher.match(features)
-    part = slice(matches.start[reference], matches.start[reference + 1])
-    there = matches.there[part].astype(np.float64)
-    weight = expected_votes.agreement(
-        matches.here[part], matches.there[part], matches.weight[part], s.agreement, s.agreement_floor
-    )
+    _, there, weight = state.agreed(state.matcher.match(features), reference)
     x, y = (np.arange(_MAP_COLUMNS) + 0.5) / _MAP_COLUMNS, (np.arange(_MAP_ROWS) + 0.5) / _MAP_ROWS
     along_x = (1.0 - np.abs(x[:, None] - there[:, 0])) ** (s.patches_x - 1)
     along_y = (1.0 - np.abs(y[:, None] - there[:, 1])) ** (s.patches_y - 1)
-    return np.einsum("ye,xe,e->yx", along_y, along_x, weight)
+    return np.einsum("ye,xe,e->yx", along_y, along_x, weight.astype(np.float64))

@@ -267,12 +267,16 @@ def _rank_axis(axes: Axes, values: list[float], from_zero: bool = False) -> None
 
 
 def _label_points(axes: Axes, rows: list[Found], score: str) -> None:
-    """A name right of each point, or left of it where another point or name would be in the way."""
+    """A name right of each point; where another point or name would be in the way, left of it, or above its line."""
     at = axes.transData.transform([(row["stored_bits"], row[score]) for row in rows])
     for number, row in enumerate(rows):
         right, up = (at - at[number]).T
         crowded = np.any((right > 0) & (right < 75) & (np.abs(up) < 14))  # px at 100 a inch: a name is that long
+        place: dict[str, Any] = {"xytext": (9, 0), "ha": "left", "va": "center"}
+        if crowded and row["packed_bits"] < row["stored_bits"]:
+            place = {"xytext": (0, 8), "ha": "right", "va": "bottom"}
+        elif crowded:
+            place = {"xytext": (-9, 0), "ha": "right", "va": "center"}
         axes.annotate(
-            as_text(row["method"]), (row["stored_bits"], row[score]), (-9 if crowded else 9, 0), va="center",
-            ha="right" if crowded else "left", textcoords="offset points", fontsize=9,
-        )  # fmt: skip
+            as_text(row["method"]), (row["stored_bits"], row[score]), textcoords="offset points", fontsize=9, **place
+        )
