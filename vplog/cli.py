@@ -16,8 +16,10 @@ from vplog.cli_print import (
     Progress,
     print_comparison,
     print_evaluation,
+    print_explanation,
     print_info,
     print_json,
+    print_optimised,
     print_run,
     print_study,
     say,
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
+_SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
+"""The kinds of graph/solve.py, here too since that imports numpy."""
 _DEMO_NEXT = "Look at it: Foxglove or rerun open result.mcap, evo reads trajectory.tum, DuckDB the .parquet files."
 
 
@@ -137,6 +141,8 @@ def run(arguments: argparse.Namespace) -> None:
             f"{len(arguments.logs)} logs were given, and a run takes one drive. Run each by itself, "
             "or share places between them with one --library."
         )
+    if arguments.gps:
+        arguments.set.append("gps.use=true")
     with Progress(arguments) as progress:
         done = run_pipeline(
             arguments.logs[0],
@@ -218,6 +224,33 @@ def study(arguments: argparse.Namespace) -> None:
         print_json(found)
     else:
         print_study(arguments.output, found)
+
+
+def explain(arguments: argparse.Namespace) -> None:
+    """One candidate closure of a run in words, and a picture of both frames."""
+    from vplog.explain import between, numbered, worst
+    from vplog.explain import explain as explain_closure
+
+    if arguments.worst:
+        choose = worst
+    else:
+        choose = numbered(*arguments.closure) if len(arguments.closure) == 1 else between(*arguments.closure)
+    told = explain_closure(arguments.run, choose, arguments.output, arguments.log, arguments.no_picture)
+    if arguments.json:
+        print_json(told)
+    else:
+        print_explanation(told)
+
+
+def optimize(arguments: argparse.Namespace) -> None:
+    """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
+    from vplog.optimize import optimize as optimize_graph
+
+    done = optimize_graph(arguments.graph, arguments.output, arguments.method)
+    if arguments.json:
+        print_json(done.record)
+    else:
+        print_optimised(done.record)
 
 
 def config(arguments: argparse.Namespace) -> None:
@@ -339,6 +372,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("logs", type=Path, nargs="+", metavar="LOG")
     output(sub, "run folder")
     sub.add_argument("--library", type=Path, metavar="LIB", help="reference library (default: made from the drive)")
+    sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=Path, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
@@ -347,6 +381,11 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("study", study, topics, threads, settings, truth)
     _add_study(sub)
     output(sub, "folder for study.json and the figures")
+    _add_explain(add("explain", explain))
+    sub = add("optimize", optimize)
+    sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
+    output(sub, "the graph at its solved poses, as g2o")
+    sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="how false closures are met (default: gnc)")
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
     sub = add("schemas", schemas)
@@ -398,6 +437,28 @@ def _add_study(sub: argparse.ArgumentParser) -> None:
         "--only", type=lambda text: text.split(","), metavar="E,E",
         help="pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)",
     )  # fmt: skip
+
+
+def _add_explain(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("run", type=Path, metavar="RUN")
+    which = sub.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        "--closure", type=_closure, metavar="K|QUERY:MATCH",
+        help="row of closures.parquet, or its two keyframes, by row or by stamp in ns",
+    )  # fmt: skip
+    which.add_argument("--worst", action="store_true", help="the closure that the solved trajectory is furthest from")
+    sub.add_argument(
+        "-o", "--output", type=Path, metavar="PICTURE.png", help="picture, .png or .svg (default: RUN/closure-K.png)"
+    )
+    sub.add_argument("--log", type=Path, metavar="LOG", help="the run's log, where it has moved since")
+    sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
+
+
+def _closure(text: str) -> tuple[int, ...]:
+    parts = text.split(":")
+    if len(parts) > 2:
+        raise argparse.ArgumentTypeError("must be K or QUERY:MATCH")
+    return tuple(int(part) for part in parts)
 
 
 def _counts(text: str) -> tuple[int, ...]:

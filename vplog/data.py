@@ -80,6 +80,8 @@ class Gps:
     altitude_m: Floats
     covariance: Floats
     """(T, 3, 3) m^2, east-north-up; NaN where unknown."""
+    antenna_m: Floats | None = None
+    """(3,) where the antenna is on the body, None where the log does not say."""
 
 
 @dataclass(frozen=True, eq=False)

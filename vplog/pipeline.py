@@ -11,13 +11,16 @@ import numpy as np
 from pydantic import model_validator
 
 from vplog import logs, record
-from vplog.data import Closures, EdgeKind, Keyframes, Reference, Verdict
+from vplog.back_end import about_gps, back_end
+from vplog.data import Closures, EdgeKind, Keyframes, Reference
 from vplog.errors import LibraryError, LogError, SettingsError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.features.sift import SiftSettings
 from vplog.features.store import FeatureStore
-from vplog.graph import build, consistency, correct
-from vplog.graph.noise import NoiseSettings, edge_covariance
+from vplog.graph import consistency
+from vplog.graph.noise import NoiseSettings
+from vplog.graph.refine import RefineSettings
+from vplog.graph.satellites import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
 from vplog.keyframes import KeyframeSettings, select_keyframes
 from vplog.loops.propose import ProposeSettings, candidate_stops, propose
@@ -76,6 +79,10 @@ class Pipeline(Settings):
     """Odometry noise."""
     solve: OptimiserSettings = GncSettings()
     """Robust solve of the pose graph."""
+    refine: RefineSettings = RefineSettings()
+    """What the constraints kept say of the odometry."""
+    gps: GpsSettings = GpsSettings()
+    """Satellite fixes as constraints."""
 
     @model_validator(mode="before")
     @classmethod
@@ -175,18 +182,15 @@ def run(
             )  # fmt: skip
             closures = name_shared(closures, state, descriptors)
         with watch.stage("solve"):
-            covariance, doubts, noise_source = edge_covariance(odometry, keyframes.stamp_ns, pipeline.noise)
-            graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
-            solution = consistency.keep_odometry_if_worse(graph, pipeline.solve(graph))
-            closures = judge(closures, graph, solution, rows)
-            trajectory = correct.correct_trajectory(odometry, keyframes, solution.world_from_body)
-            warnings += doubts + repairs
+            solved = back_end(log, odometry, keyframes, closures, pipeline)
+            closures, graph, solution = solved.closures, solved.refined.graph, solved.refined.solution
+            warnings += solved.warnings
         with watch.stage("write"):
             done = Run(keyframes, closures, graph, solution)
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
             column = state.to_arrow(descriptors)
             tables.write_descriptors(out / "descriptors.parquet", keyframes, [column], state.arrow_type, header)
-            write_results(out, done, odometry, trajectory, camera, header)
+            write_results(out, done, odometry, solved.trajectory, camera, header)
             if library is None:
                 state.save(out / "library")
         account = {
@@ -202,14 +206,16 @@ def run(
             },
             "descriptor_bits": state.bits,
             "counts": record.counts(log, odometry, keyframes, closures),
-            "noise": noise_source,
+            "noise": solved.noise_source,
             "solution": {
                 "error_before": solution.error_before,
                 "error_after": solution.error_after,
                 "iterations": solution.iterations,
                 "converged": solution.converged,
-                "reason": solution.reason if EdgeKind.LOOP in graph.kind else _NO_CLOSURE,
+                "reason": solution.reason if EdgeKind.LOOP in graph.kind or solved.fixes else _NO_CLOSURE,
             },
+            "odometry": {"sigma_factor": float(np.sqrt(solved.refined.noise)), "scale": solved.refined.scale},
+            "gps": about_gps(solved.fixes, solved.refined),
             "stages": watch.stages,
             "totals": watch.totals(),
             "warnings": log.warnings + warnings,
@@ -330,19 +336,6 @@ def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any
         return closures
     found = state.shared(descriptors, closures.query, closures.match)
     return replace(closures, shared_references=found.references, shared_overlap=found.overlap)
-
-
-def judge(closures: Closures, graph: PoseGraph, solution: Solution, rows: Ints) -> Closures:
-    """The ledger with what the solve made of the closures in the graph: residuals, weights, verdicts."""
-    loops = np.array([kind == EdgeKind.LOOP for kind in graph.kind], bool)
-    before, after, weight = (np.full(len(closures), np.nan) for _ in range(3))
-    before[rows] = consistency.residual_before(graph)[loops]
-    after[rows] = consistency.residual_sigma(graph, solution.world_from_body)[loops]
-    weight[rows] = solution.weight[loops]
-    verdict = list(closures.verdict)
-    for row in rows[weight[rows] < 0.5]:
-        verdict[row] = Verdict.REJECTED_BY_SOLVER
-    return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)
 
 
 def check_library(folder: Path | None, pipeline: Pipeline) -> None:

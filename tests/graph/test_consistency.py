@@ -10,7 +10,7 @@ from scipy import stats
 from vplog import geometry
 from vplog.data import EdgeKind
 from vplog.graph.consistency import chi2_quantile, keep_odometry_if_worse, residual_before, residual_sigma
-from vplog.graph.factors import edge_factors
+from vplog.graph.factors import Factors
 from vplog.graph.solve import GncSettings, LmSettings
 
 from .drive import ring, without_loops
@@ -25,7 +25,7 @@ def test_chi2_agrees_with_gtsam() -> None:
     values = gtsam.Values()
     for node, pose in enumerate(poses):
         values.insert(node, gtsam.Pose3(pose))
-    expected = [2.0 * factor.error(values) for factor in edge_factors(graph)]
+    expected = [2.0 * factor.error(values) for factor in Factors.of(graph).whole]
     np.testing.assert_allclose(residual_sigma(graph, poses) ** 2, expected, rtol=1e-8)
 
 

@@ -1,7 +1,8 @@
-"""Keyframes, odometry noise and verified closures become a pose graph."""
+"""Keyframes, odometry noise and verified closures become a pose graph; graphs from anywhere are checked."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
     Bools = NDArray[np.bool_]
 
+AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
+"""Rows and columns of (6, 6) matrices that a graph of this dimension uses."""
+_FURTHEST_M = 1e8
+"""m; frames of drives (UTM, ECEF) stay below 1e7, and from 1e8 on the last bit of a double is coarser than 10 nm."""
 _LEAST_SHARE = 1e-10
 """Least eigenvalue of an information matrix as a share of its largest: GTSAM factorises them, so none may be zero."""
 _NOISE = 1e-9
@@ -88,30 +93,35 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     shapes = (len(graph.b), len(graph.kind), *graph.a_from_b.shape, *graph.information.shape)
     if shapes != (edges, edges, edges, 4, 4, edges, 6, 6) or graph.world_from_body.shape != (n, 4, 4) or n == 0:
         raise GraphError(f"The graph's arrays do not fit each other: {n} poses, {edges} edges, shapes {shapes}.")
+    if graph.dimension not in AXES:
+        raise GraphError(f"The graph has dimension {graph.dimension}; it must be 2 or 3.")
     wrong = np.flatnonzero((graph.a < 0) | (graph.b < 0) | (graph.a >= n) | (graph.b >= n) | (graph.a == graph.b))
     if len(wrong):
         edge = wrong[0]
         raise GraphError(f"Edge {edge} joins {graph.a[edge]} and {graph.b[edge]}; there are poses 0..{n - 1}.")
-    _check_poses(graph.world_from_body, "Pose {row}")
-    _check_poses(graph.a_from_b, "Edge {row}")
-    _check_matrices(graph.information, "information", graph.a, graph.b)
-    lost = _unconnected(n, graph.a, graph.b)
+    _check_poses(graph.world_from_body, "Pose {row}", graph.dimension)
+    _check_poses(graph.a_from_b, "Edge {row}", graph.dimension)
+    information = informed(graph)
+    _check_matrices(information, "information", graph.a, graph.b)
+    part = parts(graph)
+    lost = np.flatnonzero(part)
     if len(lost):
         raise GraphError(f"No edge leads from pose 0 to pose {lost[0]} ({len(lost)} of {n} poses are cut off).")
 
     # scaled to a unit diagonal first, so that radians and metres are compared as likes
-    diagonal = np.diagonal(graph.information, axis1=1, axis2=2)
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, diagonal.max(1, keepdims=True)))
     scale = scale[:, :, None] * scale[:, None, :]
-    values, vectors = np.linalg.eigh((graph.information + np.swapaxes(graph.information, 1, 2)) / 2 / scale)
+    values, vectors = np.linalg.eigh((information + np.swapaxes(information, 1, 2)) / 2 / scale)
     least = _LEAST_SHARE * values[:, -1]
     poor = values[:, 0] < least
     if not poor.any():
         return graph, []
     negative = np.flatnonzero(values[:, 0] < -_NOISE * values[:, -1])
-    information = graph.information.copy()
     fixed = (vectors * np.maximum(values, least[:, None])[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale
-    information[poor] = fixed[poor]
+    axes = np.array(AXES[graph.dimension])
+    repaired = graph.information.copy()
+    repaired[np.flatnonzero(poor)[:, None, None], axes[:, None], axes] = fixed[poor]
     warnings = []
     if len(negative):
         edge = negative[0]
@@ -119,13 +129,18 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
             f"The information of {len(negative)} edges is not positive (first: edge {edge}, {graph.a[edge]} to "
             f"{graph.b[edge]}, eigenvalue {values[edge, 0]:.3g} of a unit diagonal); the negative part was cut off."
         )
-    return (
-        PoseGraph(graph.world_from_body, graph.a, graph.b, graph.a_from_b, information, graph.kind),
-        warnings,
-    )
+    return replace(graph, information=repaired), warnings
 
 
-def _check_poses(poses: Floats, name: str) -> None:
+def informed(graph: PoseGraph) -> Floats:
+    """The information of the axes that the graph uses: (E, 6, 6), or (E, 3, 3) of yaw, x, y for a planar one."""
+    if graph.dimension == 3:
+        return graph.information
+    axes = AXES[graph.dimension]
+    return graph.information[:, axes][:, :, axes]
+
+
+def _check_poses(poses: Floats, name: str, dimension: int) -> None:
     bad = np.flatnonzero(~np.isfinite(poses).all((1, 2)))
     if len(bad):
         where = name.format(row=bad[0])
@@ -138,6 +153,14 @@ def _check_poses(poses: Floats, name: str) -> None:
     if len(bad):
         where = name.format(row=bad[0])
         raise GraphError(f"{where} is no rigid pose: R R^T is off the identity by {off[bad[0]]:.3g}.")
+    far = np.flatnonzero((np.abs(poses[:, :3, 3]) > _FURTHEST_M).any(1))
+    if len(far):
+        where = name.format(row=far[0])
+        raise GraphError(f"{where} is {np.abs(poses[far[0], :3, 3]).max():.3g} m out; nothing on Earth is so far away.")
+    if dimension == 2:
+        tilted = np.flatnonzero((np.abs(rotation[:, 2, 2] - 1) > 1e-5) | (poses[:, 2, 3] != 0))
+        if len(tilted):
+            raise GraphError(f"{name.format(row=tilted[0])} leaves the plane, and the graph is planar.")
 
 
 def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | Ints) -> None:
@@ -154,9 +177,9 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
         )
 
 
-def _unconnected(n: int, a: Int32s, b: Int32s) -> Ints:
-    """Poses that no path of edges joins to pose 0."""
-    root = list(range(n))
+def parts(graph: PoseGraph) -> Ints:
+    """Number (N,) of the connected part that each pose belongs to, in order of their first poses."""
+    root = list(range(len(graph.world_from_body)))
 
     def find(node: int) -> int:
         while root[node] != node:
@@ -164,7 +187,7 @@ def _unconnected(n: int, a: Int32s, b: Int32s) -> Ints:
             node = root[node]
         return node
 
-    for left, right in zip(a.tolist(), b.tolist(), strict=True):
-        root[find(left)] = find(right)
-    start = find(0)
-    return np.array([node for node in range(n) if find(node) != start], np.int64)
+    for left, right in zip(graph.a.tolist(), graph.b.tolist(), strict=True):
+        left, right = sorted((find(left), find(right)))  # noqa: PLW2901 (their roots, the first pose of each)
+        root[right] = left
+    return np.unique([find(node) for node in range(len(root))], return_inverse=True)[1].astype(np.int64)

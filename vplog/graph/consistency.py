@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog import geometry
 from vplog.data import EdgeKind
+from vplog.graph.build import AXES, informed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Floats, Ints, PoseGraph, Solution
+    from vplog.data import Floats, Int32s, Ints, PoseGraph, Solution
 
     Bools = NDArray[np.bool_]
 
@@ -22,11 +23,25 @@ _SURE = 0.999999
 """Probability with which odometry as good as its noise says passes keep_odometry_if_worse: 6.2 sigma for one loop."""
 
 
-def residual_sigma(graph: PoseGraph, world_from_body: Floats) -> Floats:
-    """Mahalanobis distance (E,) of each edge to the poses (N, 4, 4): sqrt(e^T information e), e as GTSAM's Pose3."""
-    a_from_b = geometry.between(world_from_body[graph.a], world_from_body[graph.b])
-    error = geometry.log(geometry.between(graph.a_from_b, a_from_b))
-    return np.sqrt(np.maximum(np.einsum("ei,eij,ej->e", error, graph.information, error), 0.0))
+def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:
+    """Mahalanobis distance of each edge (E,), or of those named, to the poses (N, 4, 4), e as GTSAM's Pose3 or Pose2.
+
+    sqrt(e^T information e). A planar motion has the same logarithm in the plane as in space, so one formula serves.
+    """
+    part = slice(None) if edges is None else edges
+    measured = geometry.between(world_from_body[graph.a[part]], world_from_body[graph.b[part]])
+    error = geometry.log(geometry.between(graph.a_from_b[part], measured))
+    return np.sqrt(np.maximum(np.einsum("ei,eij,ej->e", error, graph.information[part], error), 0.0))
+
+
+def degrees_of_freedom(graph: PoseGraph) -> int:
+    """Of one edge: 6, or 3 in the plane."""
+    return len(AXES[graph.dimension])
+
+
+def is_loop(graph: PoseGraph) -> Bools:
+    """Edges (E,) that are not odometry, the ones that may be false."""
+    return np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind], bool)
 
 
 def residual_before(graph: PoseGraph) -> Floats:
@@ -40,56 +55,100 @@ def residual_before(graph: PoseGraph) -> Floats:
     loops = np.flatnonzero([kind == EdgeKind.LOOP for kind in graph.kind])
     if len(loops) == 0:
         return result
-    poses, leads = odometry_chain(graph)
-    step = np.linalg.inv(graph.information[leads])
-    step[leads < 0] = 0.0
-    # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
-    moved = geometry.adjoint(geometry.between(poses[:1], poses))
-    total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
-    part = np.cumsum(leads < 0)
-
-    a, b = graph.a[loops], graph.b[loops]
-    back = geometry.adjoint(geometry.between(poses[b], poses[:1]))
-    sign = np.where(a < b, 1.0, -1.0)[:, None, None]  # a loop may be written either way round
-    covariance = back @ (sign * (total[b] - total[a])) @ np.swapaxes(back, 1, 2)
-    covariance = covariance + np.linalg.inv(graph.information[loops])
-    error = geometry.log(geometry.between(graph.a_from_b[loops], geometry.between(poses[a], poses[b])))
-    chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
-    result[loops] = np.where(part[a] == part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
+    result[loops] = OdometryChain.of(graph).distance(loops, graph)
     return result
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryChain:
+    """Where the odometry alone leads, and how far it may be off between any two poses."""
+
+    poses: Floats
+    """(N, 4, 4)."""
+    part: Ints
+    """(N,) number of the unbroken piece of odometry that a pose is on."""
+    total: Floats
+    """(N, d, d) covariance summed from the first pose on, about the first pose; d = 6, or 3 in the plane."""
+    step: Floats
+    """(N, d) variance of the odometry edge that leads to each pose, in its frame; 0 where none does."""
+    axes: list[int]
+
+    @classmethod
+    def of(cls, graph: PoseGraph) -> OdometryChain:
+        poses, leads = odometry_chain(graph)
+        axes = AXES[graph.dimension]
+        step = np.linalg.inv(informed(graph)[leads])
+        # noise is told in the frame of an edge's b: moved to the later pose where that is a
+        back = np.flatnonzero((leads >= 0) & (graph.a[leads] > graph.b[leads]))
+        if len(back):
+            turned = geometry.adjoint(graph.a_from_b[leads[back]])[:, axes][:, :, axes]
+            step[back] = turned @ step[back] @ np.swapaxes(turned, 1, 2)
+        step[leads < 0] = 0.0
+        # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
+        moved = geometry.adjoint(geometry.between(poses[:1], poses))[:, axes][:, :, axes]
+        total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
+        return cls(poses, np.cumsum(leads < 0), total, np.diagonal(step, axis1=1, axis2=2), axes)
+
+    def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
+        """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
+        a, b = graph.a[loops], graph.b[loops]
+        covariance = self.covariance(a, b) + np.linalg.inv(informed(graph)[loops])
+        error = geometry.log(geometry.between(graph.a_from_b[loops], geometry.between(self.poses[a], self.poses[b])))
+        error = error[:, self.axes]
+        chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+        return np.where(self.part[a] == self.part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
+
+    def walked(self, unit: Floats) -> Floats:
+        """(N,) noise gathered from the first pose on, in multiples of variances (d,), mean over the axes.
+
+        Differences tell how much noise there is between two poses, but for what turns do to positions. Between two
+        pieces of odometry there is more of it than anything is compared with.
+        """
+        return np.cumsum((self.step / unit).mean(1) + np.where(np.diff(self.part, prepend=1) > 0, 1e12, 0.0))
+
+    def covariance(self, a: Int32s, b: Int32s) -> Floats:
+        """(L, d, d) of a_from_b by odometry, in the frame of b, to first order."""
+        back = geometry.adjoint(geometry.between(self.poses[b], self.poses[:1]))[:, self.axes][:, :, self.axes]
+        sign = np.where(a < b, 1.0, -1.0)[:, None, None]  # a loop may be written either way round
+        return back @ (sign * (self.total[b] - self.total[a])) @ np.swapaxes(back, 1, 2)
 
 
 def odometry_chain(graph: PoseGraph) -> tuple[Floats, Ints]:
     """Poses (N, 4, 4) by the odometry edges alone, and the odometry edge (N,) that leads to each pose, -1 for none.
 
-    A pose without an edge from its predecessor (a second robot, a gap) stays at its initial place.
+    An edge may be written either way round. A pose without an edge from its predecessor (a second robot, a gap) stays
+    at its initial place.
     """
-    edges = np.flatnonzero([kind == EdgeKind.ODOMETRY for kind in graph.kind])
-    edges = edges[graph.b[edges] == graph.a[edges] + 1][::-1]  # reversed: the first of several wins
+    edges = np.flatnonzero(~is_loop(graph))
+    edges = edges[np.abs(graph.b[edges] - graph.a[edges]) == 1][::-1]  # reversed: the first of several wins
     leads = np.full(len(graph.world_from_body), -1)
-    leads[graph.b[edges]] = edges
+    leads[np.maximum(graph.a[edges], graph.b[edges])] = edges
+    step = graph.a_from_b[leads]
+    back = (leads >= 0) & (graph.a[leads] > graph.b[leads])
+    step[back] = geometry.inverse(step[back])
     poses = np.array(graph.world_from_body)
     for node in np.flatnonzero(leads >= 0):
-        poses[node] = poses[node - 1] @ graph.a_from_b[leads[node]]
+        poses[node] = poses[node - 1] @ step[node]
     return poses, leads
 
 
 def far_from_odometry(graph: PoseGraph, probability: float) -> Bools:
     """Loops (E,) whose distance to the odometry alone is beyond what noise reaches with this probability."""
-    bound = chi2_quantile(probability, 6)
+    bound = chi2_quantile(probability, degrees_of_freedom(graph))
     return np.asarray(np.nan_to_num(residual_before(graph)) ** 2 > bound)
 
 
 def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
     """The solution, or the odometry poses where the solution bends the odometry more than its noise allows.
 
-    Odometry alone has no residual. Each of the L closures kept can bend it by its 6 degrees of freedom, and if all are
+    Odometry alone has no residual. Each of the L closures kept can bend it by its 6 (planar: 3) degrees of freedom, and if all are
     true, the sum of chi-squares over the M odometry edges stays below the 0.999999 quantile of chi-square with
-    6 min(L, M) degrees of freedom. Beyond it either false closures were believed or the noise is far too small: in
+    6 (3) min(L, M) degrees of freedom. Beyond it either false closures were believed or the noise is far too small: in
     both cases the poses cannot be trusted.
     """
-    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind])
-    dof = 6 * min(int(odometry.sum()), int((solution.weight[~odometry] > 0.5).sum()))
+    odometry = ~is_loop(graph)
+    each = degrees_of_freedom(graph)
+    dof = each * min(int(odometry.sum()), int((solution.weight[~odometry] > 0.5).sum()))
     if dof == 0:
         return solution
     chi2 = float((residual_sigma(graph, solution.world_from_body)[odometry] ** 2).sum())
@@ -102,22 +161,25 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
         weight=np.where(odometry, 1.0, 0.0),
         error_before=0.0,
         error_after=0.0,
-        reason=f"Odometry was kept: {dof // 6} closures bend it to a chi-square of {chi2:.4g} where its noise allows "
+        reason=f"Odometry was kept: {dof // each} closures bend it to a chi-square of {chi2:.4g} where its noise allows "
         f"{bound:.4g}, so some are false or the noise is too small.",
     )
 
 
 def chi2_quantile(probability: float, dof: int) -> float:
-    """Value that chi-square with an even `dof` stays below with this probability.
+    """Value that chi-square with `dof` degrees of freedom stays below with this probability.
 
-    Its upper tail is that of a Poisson count: P(chi2 > x) = sum over i < dof / 2 of exp(-x / 2) (x / 2)^i / i!
-    (Abramowitz and Stegun, 26.4.21), inverted by bisection.
+    The upper tail is a finite sum for whole degrees, P(chi2 > x) = [erfc(sqrt(x / 2))] + sum of
+    exp(-x / 2) (x / 2)^s / Gamma(s + 1) over s = 0, 1, .. < dof / 2 for even `dof`, over s = 1/2, 3/2, .. < dof / 2
+    with the bracket for odd (Abramowitz and Stegun, 26.4.4 and 26.4.5). Inverted by bisection.
     """
-    count = np.arange(dof // 2)
-    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(count[1:]))])
+    odd = dof % 2 == 1
+    power = np.arange(dof // 2) + (0.5 if odd else 0.0)
+    log_gamma = math.lgamma(power[0] + 1.0) + np.concatenate([[0.0], np.cumsum(np.log(power[1:]))]) if dof > 1 else power
 
     def tail(x: float) -> float:
-        return float(np.exp(count * math.log(x / 2.0) - log_factorial - x / 2.0).sum())
+        total = float(np.exp(power * math.log(x / 2.0) - log_gamma - x / 2.0).sum())
+        return total + (math.erfc(math.sqrt(x / 2.0)) if odd else 0.0)
 
     low, high = 1e-9, 2.0 * dof + 100.0  # beyond every probability that a float can tell from 1
     while high - low > 1e-12 * high:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 
 from vplog import geometry
 from vplog.errors import GraphError
+from vplog.graph.build import informed
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, PoseGraph
+    from vplog.data import Floats, Ints, PoseGraph
 
 _GAUGE_SIGMA = 1e-6
 """rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""
+_PLANAR = [1, 2, 0]
+"""GTSAM has x, y, yaw; the planar rows here are yaw, x, y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,70 +30,142 @@ class Fit:
     converged: bool
 
 
-def edge_factors(graph: PoseGraph) -> list[gtsam.BetweenFactorPose3]:
-    """One factor per edge with its full information."""
-    information = gtsam.noiseModel.Gaussian.Information
-    return [
-        gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(measured), information(matrix))
-        for a, b, measured, matrix in zip(
-            graph.a.tolist(), graph.b.tolist(), graph.a_from_b, graph.information, strict=True
-        )
-    ]
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """The edges of a graph as GTSAM's factors, with pose 0 as the origin of everything."""
 
+    graph: PoseGraph
+    information: Floats
+    """(E, d, d) in GTSAM's order of axes; d = 6, or 3 in the plane."""
+    whole: list[Any]
+    """BetweenFactorPose3 or Pose2 of each edge with its full information."""
 
-def factor_graph(
-    graph: PoseGraph, factors: list[gtsam.BetweenFactorPose3], weight: Floats, world_from_first: Floats
-) -> gtsam.NonlinearFactorGraph:
-    """The edges of positive weight (E,), their information times the weight, and the gauge at pose 0.
+    @classmethod
+    def of(cls, graph: PoseGraph) -> Factors:
+        """One factor per edge. Edges of equal information share a noise model, as in most files all do."""
+        information = informed(graph)
+        if graph.dimension == 2:
+            information = information[:, _PLANAR][:, :, _PLANAR]
+        shared: dict[bytes, Any] = {}
+        noise = []
+        for matrix in np.ascontiguousarray(information):
+            name = matrix.tobytes()
+            if name not in shared:
+                shared[name] = gtsam.noiseModel.Gaussian.Information(matrix)
+            noise.append(shared[name])
+        between = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
+        parts = zip(graph.a.tolist(), graph.b.tolist(), as_gtsam(graph.a_from_b, graph.dimension), noise, strict=True)
+        return cls(graph, information, [between(a, b, measured, model) for a, b, measured, model in parts])
 
-    `factors` are edge_factors(graph): those of weight 1 are taken as they are, which is most of them at every stage.
-    """
-    result = gtsam.NonlinearFactorGraph()
-    gauge = gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)
-    result.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world_from_first), gauge))
-    for edge in np.flatnonzero(weight > 0).tolist():
-        factor = factors[edge]
-        if weight[edge] != 1.0:
-            noise = gtsam.noiseModel.Gaussian.Information(graph.information[edge] * weight[edge])
-            factor = gtsam.BetweenFactorPose3(int(graph.a[edge]), int(graph.b[edge]), factor.measured(), noise)
-        result.add(factor)
-    return result
+    def weighted(self, weight: Floats) -> gtsam.NonlinearFactorGraph:
+        """The edges of positive weight (E,), their information times the weight, and the gauge at pose 0.
+
+        Those of weight 1 are taken as they are, which is most of them at every stage.
+        """
+        result = self.gauged()
+        scaled = np.flatnonzero((weight > 0) & (weight != 1))
+        # the factor of L^T, upper triangular, is what GTSAM keeps of an information L L^T
+        roots = np.swapaxes(np.linalg.cholesky(self.information[scaled] * weight[scaled, None, None]), 1, 2)
+        root = dict(zip(scaled.tolist(), np.ascontiguousarray(roots), strict=True))
+        between = gtsam.BetweenFactorPose2 if self.graph.dimension == 2 else gtsam.BetweenFactorPose3
+        for edge in np.flatnonzero(weight > 0).tolist():
+            factor = self.whole[edge]
+            if edge in root:
+                noise = gtsam.noiseModel.Gaussian.SqrtInformation(root[edge], False)
+                factor = between(int(self.graph.a[edge]), int(self.graph.b[edge]), factor.measured(), noise)
+            result.add(factor)
+        return result
+
+    def robust(self, loops: Ints, estimator: Any) -> gtsam.NonlinearFactorGraph:
+        """All edges, the loops among them under a robust estimator of GTSAM, and the gauge at pose 0."""
+        result, robust = self.gauged(), set(loops.tolist())
+        between = gtsam.BetweenFactorPose2 if self.graph.dimension == 2 else gtsam.BetweenFactorPose3
+        for edge, factor in enumerate(self.whole):
+            if edge not in robust:
+                result.add(factor)
+                continue
+            noise = gtsam.noiseModel.Robust.Create(estimator, factor.noiseModel())
+            result.add(between(int(self.graph.a[edge]), int(self.graph.b[edge]), factor.measured(), noise))
+        return result
+
+    def gauged(self) -> gtsam.NonlinearFactorGraph:
+        """No edges yet, and pose 0 held at the origin."""
+        result = gtsam.NonlinearFactorGraph()
+        if self.graph.dimension == 2:
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, _GAUGE_SIGMA)
+            result.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), noise))
+        else:
+            noise = gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)
+            result.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), noise))
+        return result
 
 
 def least_squares(
-    graph: PoseGraph,
-    factors: list[gtsam.BetweenFactorPose3],
-    weight: Floats,
-    start: Floats,
-    max_iterations: int,
-    tolerance: float,
+    factors: Factors, weighted: gtsam.NonlinearFactorGraph, start: Floats, max_iterations: int, tolerance: float
 ) -> Fit:
-    """Levenberg-Marquardt from poses `start` (N, 4, 4) on the weighted edge_factors(graph), pose 0 fixed.
+    """The least error of a graph of these factors from poses `start` (N, 4, 4), pose 0 staying where it is.
 
-    Ends when a step gains less than `tolerance` of the error. Raises GraphError where the poses are not determined.
+    Gauss-Newton as long as its steps help, which is half the work of Levenberg-Marquardt, then that. Ends when a step
+    gains less than `tolerance` of the error. Raises GraphError where the poses are not determined.
     """
-    values = gtsam.Values()
-    for node, pose in enumerate(start):
-        values.insert(node, gtsam.Pose3(pose))
-    settings = gtsam.LevenbergMarquardtParams()
-    settings.setMaxIterations(max_iterations)
-    settings.setRelativeErrorTol(tolerance)
-    settings.setAbsoluteErrorTol(tolerance)
+    values = as_values(geometry.between(start[:1], start), factors.graph.dimension)
+    steps, converged = 0, False
     try:
-        optimiser = gtsam.LevenbergMarquardtOptimizer(factor_graph(graph, factors, weight, start[0]), values, settings)
-        poses = as_array(optimiser.optimize(), len(start))
+        quick = gtsam.GaussNewtonOptimizer(weighted, values, gtsam.GaussNewtonParams())
+        least = quick.error()
+        while steps < max_iterations and not converged:
+            quick.iterate()
+            steps += 1
+            gain = least - quick.error()
+            converged = abs(gain) <= tolerance * max(least, 1.0)
+            if not (gain >= 0 or converged):  # NaN too
+                break
+            # a copy: what the optimiser returns is its own, and is gone after its next step
+            values, least = gtsam.Values(quick.values()), quick.error()
+    except RuntimeError:  # too weakly determined for an undamped step
+        steps, converged = 0, False
+    try:
+        if not converged and steps < max_iterations:
+            settings = gtsam.LevenbergMarquardtParams()
+            settings.setMaxIterations(max_iterations - steps)
+            settings.setRelativeErrorTol(tolerance)
+            settings.setAbsoluteErrorTol(tolerance)
+            careful = gtsam.LevenbergMarquardtOptimizer(weighted, values, settings)
+            values = careful.optimize()
+            steps += int(careful.iterations())
+            converged = steps < max_iterations
+        poses = as_array(values, factors.graph.dimension)
     except RuntimeError as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
         raise GraphError(f"The pose graph cannot be solved ({first}). Check the information of its edges.") from None
     if not np.isfinite(poses).all():
         raise GraphError("The pose graph's solution is not finite. Check the information of its edges.")
-    iterations = int(optimiser.iterations())
-    return Fit(anchored(poses, start[0]), iterations, iterations < max_iterations)
+    return Fit(anchored(poses, start[0]), steps, converged)
 
 
-def as_array(values: gtsam.Values, n: int) -> Floats:
-    """(N, 4, 4) of the poses 0..n-1."""
-    return np.array([values.atPose3(node).matrix() for node in range(n)])
+def as_gtsam(poses: Floats, dimension: int) -> list[Any]:
+    """Pose3, or Pose2 of planar poses."""
+    if dimension == 3:
+        return [gtsam.Pose3(pose) for pose in poses]
+    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    return [gtsam.Pose2(*row) for row in np.stack([poses[:, 0, 3], poses[:, 1, 3], yaw], axis=1).tolist()]
+
+
+def as_values(poses: Floats, dimension: int) -> gtsam.Values:
+    values = gtsam.Values()
+    for node, pose in enumerate(as_gtsam(poses, dimension)):
+        values.insert(node, pose)
+    return values
+
+
+def as_array(values: gtsam.Values, dimension: int) -> Floats:
+    """(N, 4, 4) of the poses 0..N-1."""
+    if dimension == 3:
+        rows = gtsam.utilities.extractPose3(values)  # (N, 12): rotation by rows, then translation
+        return geometry.pose(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
+    x, y, yaw = gtsam.utilities.extractPose2(values).T
+    zero = np.zeros(len(x))
+    return geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), np.stack([x, y, zero], axis=1))
 
 
 def anchored(poses: Floats, world_from_first: Floats) -> Floats:

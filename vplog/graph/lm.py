@@ -10,13 +10,11 @@ from pydantic import Field
 from vplog.data import Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.factors import edge_factors, least_squares
+from vplog.graph.factors import Factors, least_squares
 from vplog.graph.initialise import initial_poses
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    import gtsam
-
     from vplog.data import Floats, PoseGraph
 
 
@@ -33,24 +31,17 @@ class LmSettings(Settings):
     def __call__(self, graph: PoseGraph) -> Solution:
         """Solve. Raises GraphError where the graph is none or its poses are not determined."""
         graph, _ = checked(graph)
-        factors = edge_factors(graph)
+        factors = Factors.of(graph)
         weight = np.ones(len(graph.a))
-        return solve_kept(
-            graph, factors, weight, initial_poses(graph, factors, weight), self.max_iterations, self.tolerance, ""
-        )
+        return solve_kept(factors, weight, initial_poses(factors, weight), self.max_iterations, self.tolerance, "")
 
 
 def solve_kept(
-    graph: PoseGraph,
-    factors: list[gtsam.BetweenFactorPose3],
-    weight: Floats,
-    start: Floats,
-    max_iterations: int,
-    tolerance: float,
-    found: str,
+    factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float, found: str
 ) -> Solution:
     """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
-    fit = least_squares(graph, factors, weight, start, max_iterations, tolerance)
+    graph = factors.graph
+    fit = least_squares(factors, factors.weighted(weight), start, max_iterations, tolerance)
     end = "converged" if fit.converged else "stopped at the limit"
     return Solution(
         world_from_body=fit.world_from_body,

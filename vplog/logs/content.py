@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from vplog.logs.containers import Notes, plural
@@ -119,5 +119,7 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
     odometry = read.poses.finish(notes) if read.poses else None
     body = read.poses.child if read.poses else ""
     gps = read.fixes.finish(notes) if read.fixes else None
+    if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
+        gps = replace(gps, antenna_m=placed[:3, 3])
     paired = [None if pair < 0 else depth_places[pair] for pair in pairs]
     return Content(stamp_ns, places, paired, read.calibration, odometry, body, gps, tree)

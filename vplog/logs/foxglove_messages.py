@@ -110,7 +110,7 @@ def _pose(m: Any) -> Record:
 def _fix(m: Any) -> Record:
     known = m.position_covariance_type != LocationFix.PositionCovarianceType.UNKNOWN
     covariance = _matrix(m.position_covariance, (3, 3)) if known else np.full((3, 3), np.nan)
-    return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance)
+    return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance, m.frame_id)
 
 
 def _transform(m: Any) -> TransformMessage:

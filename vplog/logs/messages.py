@@ -66,6 +66,8 @@ class FixMessage:
     altitude_m: float
     covariance: Floats
     """(3, 3) m^2 east-north-up; NaN where its type says unknown."""
+    frame: str
+    """Of the antenna."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,8 +96,9 @@ def _fix(message: Any) -> Record:
     if message.position_covariance_type == _UNKNOWN_COVARIANCE:
         covariance = np.full((3, 3), np.nan)
     return FixMessage(
-        _stamp(message), message.status.status >= 0, message.latitude, message.longitude, message.altitude, covariance
-    )
+        _stamp(message), message.status.status >= 0, message.latitude, message.longitude, message.altitude, covariance,
+        message.header.frame_id,
+    )  # fmt: skip
 
 
 def _transforms(message: Any) -> Record:

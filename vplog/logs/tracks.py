@@ -95,6 +95,8 @@ class FixTrack:
         self._topic = topic
         self._stamps = Stamps()
         self._fixes: list[FixMessage] = []
+        self.frame = ""
+        """Of the antenna, by the first fix."""
         self._dropped = 0
 
     def add(self, message: FixMessage, log_ns: int) -> None:
@@ -102,6 +104,7 @@ class FixTrack:
         if not (message.valid and np.isfinite(here).all() and abs(here[0]) <= 90 and abs(here[1]) <= 360):
             self._dropped += 1
             return
+        self.frame = self.frame or message.frame
         self._stamps.add(message.stamp_ns, log_ns)
         self._fixes.append(message)
 

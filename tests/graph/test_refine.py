@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.graph.drive import CLOSURE_SIGMA, Drive, position_error, ring, without_loops
+from vplog import geometry
+from vplog.data import EdgeKind, Gps, Keyframes, Odometry, PoseGraph
+from vplog.errors import GraphError
+from vplog.geodesy import local_enu
+from vplog.graph.consistency import residual_sigma
+from vplog.graph.lm import LmSettings
+from vplog.graph.refine import Refined, RefineSettings, refine
+from vplog.graph.satellites import Fixes, GpsSettings, antennas, fixes_on
+
+DEGREE_M = 111_195.0
+"""m of a degree on a sphere of 6371 km: for making fixes, not for reading them."""
+
+
+def misread(drive: Drive, metres: float = 1.0, covariance: float = 1.0) -> Drive:
+    """The drive with odometry whose metres are too long by a factor, and a covariance too large by another."""
+    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in drive.graph.kind])
+    a_from_b, information = drive.graph.a_from_b.copy(), drive.graph.information.copy()
+    a_from_b[odometry, :3, 3] *= metres
+    information[odometry] /= covariance
+    poses = np.array(drive.keyframes.odom_from_body)
+    for k, step in enumerate(a_from_b[odometry]):
+        poses[k + 1] = poses[k] @ step
+    graph = replace(drive.graph, world_from_body=poses, a_from_b=a_from_b, information=information)
+    stamps = drive.keyframes.stamp_ns
+    return replace(
+        drive, graph=graph, keyframes=Keyframes("ring", stamps, poses), odometry=Odometry(stamps, poses, None)
+    )
+
+
+def refined(graph: PoseGraph, fixes: Fixes | None = None, of_loops: bool = False) -> Refined:
+    of_odometry = np.array([kind == EdgeKind.ODOMETRY or of_loops for kind in graph.kind])
+    return refine(graph, LmSettings()(graph), of_odometry, RefineSettings(), fixes, GpsSettings())
+
+
+def satellites(drive: Drive, sigma_m: float = 1.0, antenna_m: tuple[float, float, float] | None = None) -> Gps:
+    """A fix at every keyframe, with noise, in a frame that is turned against the odometry's."""
+    n = len(drive.true)
+    arm = np.zeros(3) if antenna_m is None else np.array(antenna_m)
+    place = drive.true[:, :3, 3] + drive.true[:, :3, :3] @ arm
+    turned = place @ geometry.so3_exp(np.array([[0.0, 0.0, 2.0]]))[0].T
+    noisy = turned + np.random.default_rng(7).normal(size=(n, 3)) * sigma_m
+    return Gps(
+        drive.keyframes.stamp_ns, 48.0 + noisy[:, 1] / DEGREE_M,
+        8.0 + noisy[:, 0] / (DEGREE_M * np.cos(np.radians(48.0))), 300.0 + noisy[:, 2],
+        np.broadcast_to(np.eye(3) * sigma_m**2, (n, 3, 3)).copy(), None if antenna_m is None else arm,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("covariance", [1 / 64, 1.0, 64.0], ids=str)
+def test_the_noise_is_found_whatever_the_log_claims(covariance: float) -> None:
+    drive = ring(240, 80)
+    plain, found = refined(drive.graph), refined(misread(drive, covariance=covariance).graph)
+    assert found.noise * covariance == pytest.approx(plain.noise, rel=0.15)
+    assert 0.5 < plain.noise < 2.0
+    np.testing.assert_allclose(
+        found.solution.world_from_body[:, :3, 3], plain.solution.world_from_body[:, :3, 3], atol=0.02
+    )
+
+
+def seen_from_afar(seed: int = 3) -> Drive:
+    """The ring with closures between views some eight metres apart, as a camera with depth has them."""
+    drive, random = ring(240, 80), np.random.default_rng(seed)
+    loops = np.array([kind == EdgeKind.LOOP for kind in drive.graph.kind])
+    a = np.clip(drive.graph.a + random.choice([-9, -7, 7, 9], len(loops)), 0, 239)[loops]
+    b = drive.graph.b[loops]
+    a_from_b = geometry.between(drive.true[a], drive.true[b]) @ geometry.exp(
+        random.normal(size=(len(b), 6)) * CLOSURE_SIGMA
+    )
+    graph = drive.graph
+    ends, poses = graph.a.copy(), graph.a_from_b.copy()
+    ends[loops], poses[loops] = a, a_from_b
+    return replace(drive, graph=replace(graph, a=ends, a_from_b=poses))
+
+
+@pytest.mark.parametrize("metres", [0.98, 1.0, 1.03], ids=str)
+def test_metres_that_are_too_long_are_found_by_closures_with_metres_of_their_own(metres: float) -> None:
+    drive = misread(seen_from_afar(), metres)
+    before = LmSettings()(drive.graph).world_from_body
+    found = refined(drive.graph)
+    assert found.scale * metres == pytest.approx(1.0, abs=0.006)
+    assert position_error(found.solution.world_from_body, drive.true) < 1.1 * position_error(before, drive.true)
+
+
+def test_metres_are_left_alone_where_nothing_else_has_any() -> None:
+    """Closures with the odometry's own scale say nothing of it, and must not shrink the world to agree better."""
+    drive = misread(seen_from_afar(), 1.03)
+    graph = drive.graph
+    loops = np.array([kind == EdgeKind.LOOP for kind in graph.kind])
+    a_from_b = graph.a_from_b.copy()
+    a_from_b[loops, :3, 3] *= 1.03
+    assert refined(replace(graph, a_from_b=a_from_b), of_loops=True).scale == pytest.approx(1.0, abs=0.002)
+
+
+def test_odometry_that_nothing_checks_is_left_as_it_is() -> None:
+    drive = ring(60, 5)
+    alone = without_loops(drive.graph)
+    found = refined(alone)
+    assert (found.noise, found.scale) == (1.0, 1.0)
+    assert found.graph is alone
+    few = refined(ring(60, 3).graph)  # 18 degrees of freedom at most, fewer than an estimate takes
+    assert few.noise == 1.0
+
+
+def test_gps_fixes_scale_place_and_heading() -> None:
+    drive = misread(ring(240, 0), 1.02)
+    fixes = fixes_on(satellites(drive, antenna_m=(0.5, 0.0, 1.0)), drive.odometry, drive.keyframes, GpsSettings())
+    found = refined(drive.graph, fixes)
+    assert found.scale * 1.02 == pytest.approx(1.0, abs=0.01)
+    assert found.believed.mean() > 0.95
+    assert found.world_from_enu is not None
+    there = (fixes.enu_m @ found.world_from_enu[:3, :3].T) + found.world_from_enu[:3, 3]
+    off = np.linalg.norm(antennas(found.solution.world_from_body, fixes) - there, axis=1)
+    assert np.median(off) < 2.0
+    plain = LmSettings()(drive.graph).world_from_body
+
+    def aligned(poses: np.ndarray) -> float:
+        a, b = poses[:, :3, 3] - poses[:, :3, 3].mean(0), drive.true[:, :3, 3] - drive.true[:, :3, 3].mean(0)
+        left, _, right = np.linalg.svd(b.T @ a)
+        return float(np.sqrt(((a @ (left @ right).T - b) ** 2).sum(1).mean()))
+
+    assert aligned(found.solution.world_from_body) < 0.5 * aligned(plain)
+
+
+def test_fixes_that_jump_are_not_believed() -> None:
+    drive = ring(240, 20)
+    gps = satellites(drive)
+    jumps = np.zeros(len(gps.stamp_ns), bool)
+    jumps[[5, 40, 41, 42, 43, 120, 200, 201]] = True
+    moved = replace(gps, latitude_deg=gps.latitude_deg + jumps * 40.0 / DEGREE_M)
+    fixes = fixes_on(moved, drive.odometry, drive.keyframes, GpsSettings())
+    found = refined(drive.graph, fixes)
+    assert not found.believed[jumps].any()
+    assert found.believed[~jumps].mean() > 0.95
+    clean = refined(drive.graph, fixes_on(gps, drive.odometry, drive.keyframes, GpsSettings()))
+    np.testing.assert_allclose(
+        found.solution.world_from_body[:, :3, 3], clean.solution.world_from_body[:, :3, 3], atol=0.5
+    )
+
+
+@pytest.mark.parametrize("covariance", [np.nan, 0.0, -1.0], ids=["nan", "zero", "negative"])
+def test_unknown_covariance_is_assumed_and_said(covariance: float) -> None:
+    drive = ring(60, 5)
+    gps = satellites(drive)
+    gps = replace(gps, covariance=np.full((60, 3, 3), covariance))
+    fixes = fixes_on(gps, drive.odometry, drive.keyframes, GpsSettings())
+    np.testing.assert_allclose(fixes.covariance, np.broadcast_to(np.diag([9.0, 9.0, 36.0]), (60, 3, 3)))
+    assert any("60 of 60 GPS fixes have no usable covariance" in warning for warning in fixes.warnings)
+
+
+def test_fixes_share_the_say_of_a_keyframe() -> None:
+    drive = ring(60, 5)
+    gps = satellites(drive)
+    every = np.repeat(np.arange(60), 3)
+    often = Gps(
+        gps.stamp_ns[every] + np.tile([-1_000_000, 0, 1_000_000], 60), gps.latitude_deg[every],
+        gps.longitude_deg[every], gps.altitude_m[every], gps.covariance[every],
+    )  # fmt: skip
+    fixes = fixes_on(often, drive.odometry, drive.keyframes, GpsSettings())
+    inside = fixes.row[(fixes.row > 0) & (fixes.row < 59)]
+    assert (np.bincount(inside)[1:59] == 3).all()
+    np.testing.assert_allclose(fixes.covariance[fixes.row == 30], np.broadcast_to(3.0 * np.eye(3), (3, 3, 3)))
+
+
+def test_too_little_gps_is_one_clear_error() -> None:
+    drive = ring(60, 5)
+    with pytest.raises(GraphError, match="no GPS fixes"):
+        fixes_on(None, drive.odometry, drive.keyframes, GpsSettings())
+    late = satellites(drive)
+    late = replace(late, stamp_ns=late.stamp_ns + 10**12)
+    with pytest.raises(GraphError, match="0 of 60 GPS fixes"):
+        fixes_on(late, drive.odometry, drive.keyframes, GpsSettings())
+
+
+def test_residuals_of_the_refined_graph_are_those_of_its_noise() -> None:
+    found = refined(misread(ring(240, 80), covariance=50.0).graph)
+    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in found.graph.kind])
+    chi2 = residual_sigma(found.graph, found.solution.world_from_body)[odometry] ** 2
+    assert 0.1 < chi2.mean() < 6.0  # 6 degrees an edge, most of which the edge itself takes
+
+
+def test_local_enu_holds_an_origin() -> None:
+    local = local_enu(satellites(ring(30, 2)))
+    np.testing.assert_array_equal(local.enu_m[0], 0.0)
+    assert local.origin[0] == pytest.approx(48.0, abs=0.001)

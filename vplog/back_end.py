@@ -1,0 +1,106 @@
+"""From odometry and verified closures to the trajectory: build, solve, hold against the odometry, refine, judge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vplog.data import EdgeKind, Verdict
+from vplog.graph import build, consistency, correct
+from vplog.graph.noise import edge_covariance
+from vplog.graph.refine import refine
+from vplog.graph.satellites import fixes_on
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Closures, Ints, Keyframes, Odometry, PoseGraph, Trajectory
+    from vplog.graph.noise import NoiseSettings
+    from vplog.graph.refine import Refined, RefineSettings
+    from vplog.graph.satellites import Fixes, GpsSettings
+    from vplog.graph.solve import OptimiserSettings
+    from vplog.stages import Log
+
+
+class BackEnd(Protocol):
+    """The settings that these steps take."""
+
+    @property
+    def noise(self) -> NoiseSettings: ...
+    @property
+    def solve(self) -> OptimiserSettings: ...
+    @property
+    def refine(self) -> RefineSettings: ...
+    @property
+    def gps(self) -> GpsSettings: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What came of a drive's constraints."""
+
+    closures: Closures
+    """The ledger, judged."""
+    refined: Refined
+    fixes: Fixes | None
+    """GPS, where it was asked for."""
+    trajectory: Trajectory
+    noise_source: str
+    """Of the odometry's noise, as `edge_covariance` names it."""
+    warnings: list[str]
+
+
+def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures, settings: BackEnd) -> Solved:
+    """The best trajectory of a drive. Raises GraphError where there is none."""
+    covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
+    graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
+    solution = consistency.keep_odometry_if_worse(graph, settings.solve(graph))
+    fixes = fixes_on(log.gps(), odometry, keyframes, settings.gps) if settings.gps.use else None
+    refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
+    return Solved(
+        judge(closures, graph, refined, rows),
+        refined,
+        fixes,
+        correct.correct_trajectory(odometry, keyframes, refined.solution.world_from_body),
+        source,
+        doubts + repairs + (fixes.warnings if fixes else []),
+    )
+
+
+def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
+    """(E,) edges whose metres are the odometry's: its own, and closures (ledger `rows`) with its scale."""
+    result = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    result[~result] = [closures.scale[row] == "odometry" for row in rows.tolist()]
+    return result
+
+
+def about_gps(fixes: Fixes | None, refined: Refined) -> dict[str, Any] | None:
+    """What run.json says of GPS: how many fixes were kept, and where on earth the trajectory's frame is."""
+    if fixes is None or refined.world_from_enu is None:
+        return None
+    latitude, longitude, altitude = fixes.origin
+    return {
+        "fixes": len(fixes),
+        "kept": int(refined.believed.sum()),
+        "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude},
+        "world_from_enu": refined.world_from_enu.tolist(),
+    }
+
+
+def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) -> Closures:
+    """The ledger with what the solve made of the closures in the graph: residuals, weights, verdicts.
+
+    Residuals before are to the odometry as it was assumed to be, those after to the odometry as it turned out.
+    """
+    solution = refined.solution
+    loops = np.array([kind == EdgeKind.LOOP for kind in graph.kind], bool)
+    before, after, weight = (np.full(len(closures), np.nan) for _ in range(3))
+    before[rows] = consistency.residual_before(graph)[loops]
+    after[rows] = consistency.residual_sigma(refined.graph, solution.world_from_body)[loops]
+    weight[rows] = solution.weight[loops]
+    verdict = list(closures.verdict)
+    for row in rows[weight[rows] < 0.5]:
+        verdict[row] = Verdict.REJECTED_BY_SOLVER
+    return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)

@@ -1,0 +1,113 @@
+"""Pairwise consistency maximisation: the largest set of closures that agree with each other two by two.
+
+Mangelson, Dominic, Eustice, Vasudevan: Pairwise Consistent Measurement Set Maximization for Robust Multi-Robot Map
+Merging, ICRA 2018. Needs no start, and works where odometry does not join the ends of a closure, as between robots.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vplog import geometry
+from vplog.data import Solution
+from vplog.graph.build import AXES, checked, informed
+from vplog.graph.clique import largest_clique
+from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
+from vplog.graph.factors import Factors
+from vplog.graph.initialise import initial_poses
+from vplog.graph.lm import solve_kept
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Ints, PoseGraph
+
+    Bools = NDArray[np.bool_]
+
+
+class PcmSettings(Settings):
+    """Largest set of pairwise consistent closures, then least squares."""
+
+    kind: Literal["pcm"] = "pcm"
+    """Name of the method."""
+    pair_probability: float = Field(default=0.99, gt=0, lt=1)
+    """Two true closures are found consistent with this probability: chi-square of 6 degrees up to that quantile."""
+    gate_probability: float = Field(default=0.999999, gt=0, lt=1)
+    """A closure further from the odometry alone than this quantile (6.2 sigma) is out from the start."""
+    most_closures: int = Field(default=3000, ge=1)
+    """Of more closures, those nearest to the odometry are compared: 3000 have 4.5 million pairs, some 20 s."""
+    clique_steps: int = Field(default=100_000, ge=1)
+    """Branches of the exact search for the largest set, some seconds; the best one so far is taken after that."""
+    max_iterations: int = Field(default=100, ge=1)
+    """Steps after which the last solve gives up."""
+    tolerance: float = Field(default=1e-9, gt=0)
+    """The last solve has converged when a step gains less than this share of the error."""
+
+    def __call__(self, graph: PoseGraph) -> Solution:
+        """Solve. Weights are 1 for odometry, 0 or 1 for loops. Raises GraphError where the graph cannot be solved."""
+        graph, _ = checked(graph)
+        factors = Factors.of(graph)
+        loops = np.flatnonzero(is_loop(graph))
+        weight = np.ones(len(graph.a))
+        found = ""
+        if len(loops):
+            weight[loops] = 0.0
+            near = loops[~far_from_odometry(graph, self.gate_probability)[loops]]
+            kept, exact = self.consistent(graph, near)
+            weight[kept] = 1.0
+            found = (
+                f"{len(kept)} of {len(loops)} closures were kept, the largest consistent set "
+                f"{'there is' if exact else 'found'}; {len(loops) - len(near)} were too far from the odometry. "
+            )
+        start = initial_poses(factors, weight)
+        return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, found)
+
+    def consistent(self, graph: PoseGraph, loops: Ints) -> tuple[Ints, bool]:
+        """The largest set among the edges `loops` found, in order, and whether there is none larger."""
+        chosen = loops
+        if len(loops) > self.most_closures:
+            apart = OdometryChain.of(graph).distance(loops, graph)
+            chosen = np.sort(loops[np.argsort(apart, kind="stable")[: self.most_closures]])
+        bound = chi2_quantile(self.pair_probability, degrees_of_freedom(graph))
+        members, exact = largest_clique(consistency(graph, chosen, bound), self.clique_steps)
+        return chosen[members], exact and len(chosen) == len(loops)
+
+
+def consistency(graph: PoseGraph, loops: Ints, bound: float) -> Bools:
+    """(K, K) whether each two of the closures agree: the way round both, by odometry, comes back to where it began.
+
+    A closure a, b claims that the world is displaced by D = X_a z X_b^-1 between two visits, X the odometry; two agree
+    where D_i^-1 D_j is the identity but for the noise of both and of the odometry from a_i to a_j and from b_i to b_j,
+    Mahalanobis distance squared up to `bound` (eq. 3). Closures between other pieces of odometry say nothing about
+    each other, which counts as agreement.
+    """
+    axes = AXES[graph.dimension]
+    chain = OdometryChain.of(graph)
+    # written from the earlier to the later pose, so that two that are written either way round compare
+    a, b = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
+    back = (graph.a[loops] > graph.b[loops])[:, None, None]
+    measured = np.where(back, geometry.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
+    poses = geometry.between(chain.poses[:1], chain.poses)
+    displaced = poses[a] @ measured @ geometry.inverse(poses[b])
+    at_end = geometry.adjoint(poses[graph.b[loops]])[:, axes][:, :, axes]
+    noise = at_end @ np.linalg.inv(informed(graph)[loops]) @ np.swapaxes(at_end, 1, 2)
+    # what happens before the displacement, seen after it: the walk to a, and the noise of a closure written backwards
+    after = geometry.adjoint(geometry.inverse(displaced))[:, axes][:, :, axes]
+    noise = np.where(back, after @ noise @ np.swapaxes(after, 1, 2), noise)
+    piece = np.stack([chain.part[a], chain.part[b]], axis=1)
+    result = np.ones((len(loops), len(loops)), bool)
+    for this in range(len(loops) - 1):
+        other = np.flatnonzero((piece[this + 1 :] == piece[this]).all(1)) + this + 1
+        error = geometry.log(geometry.between(displaced[this], displaced[other]))[:, axes]
+        walk_a, walk_b = (
+            np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None] * (chain.total[end[other]] - chain.total[end[this]])
+            for end in (a, b)
+        )
+        covariance = noise[this] + noise[other] + walk_b + after[this] @ walk_a @ after[this].T
+        chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+        result[this, other] = result[other, this] = chi2 <= bound
+    return result

@@ -1,0 +1,214 @@
+"""After the robust solve: how noisy the odometry really was, and by what share its metres are too long or short.
+
+A log's covariance is a figure in a driver more often than an estimate, and wheels and cameras miss the scale by one or
+two percent all the way. Once closures (and GPS) are known to be sound, both can be read off how far the odometry had
+to bend for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from vplog.graph.consistency import chi2_quantile, is_loop, residual_sigma
+from vplog.graph.factors import Factors, least_squares
+from vplog.graph.marginals import edge_covariances
+from vplog.graph.satellites import Fixes, believe, chi2_of_fixes, with_fixes, world_from_enu
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Floats, PoseGraph, Solution
+    from vplog.graph.satellites import GpsSettings
+
+    Bools = NDArray[np.bool_]
+
+_STEP = 1e-4
+"""Of the scale, for differences: far above rounding, far below what any drive tells."""
+_LONGEST = 0.05
+"""Largest change of the scale in one round."""
+
+
+class RefineSettings(Settings):
+    """What is learned of the odometry from the constraints that were kept."""
+
+    noise: bool = True
+    """Estimate by what factor the odometry's covariance is too large or too small."""
+    scale: bool = True
+    """Estimate by what factor the odometry's metres are too short."""
+    scale_sigma: float = Field(default=0.02, gt=0)
+    """How far the scale is expected from 1: wheel and visual odometry lose 1-2 % of the way."""
+    least_redundancy: float = Field(default=30.0, gt=0)
+    """Degrees of freedom with which the constraints must check the odometry before its noise is judged by them: an
+    estimate from 30 is good to a quarter."""
+    most_change: float = Field(default=1e4, ge=1)
+    """The covariance is changed by no more than this factor: a hundredfold sigma."""
+    max_rounds: int = Field(default=12, ge=1)
+    """Rounds after which it gives up; drives take 3-6."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A solution with what it says of the sensors."""
+
+    graph: PoseGraph
+    """As solved: metres of the odometry multiplied by `scale`, its covariance by `noise`."""
+    solution: Solution
+    noise: float
+    """Factor of the odometry's covariance, 1 where it was not judged."""
+    scale: float
+    """Factor of the odometry's metres, 1 where it was not judged."""
+    believed: Floats
+    """(F,) 1 for the GPS fixes that were kept, 0 for the others; empty without GPS."""
+    world_from_enu: Floats | None
+    """(4, 4) from the plane of the first fix, None without GPS."""
+
+
+def refine(
+    graph: PoseGraph,
+    solution: Solution,
+    of_odometry: Bools,
+    settings: RefineSettings,
+    fixes: Fixes | None = None,
+    gps: GpsSettings | None = None,
+) -> Refined:
+    """Solve again with what the constraints kept say of the odometry, and with GPS where there is any.
+
+    `of_odometry` (E,) marks edges whose metres are the odometry's: its own, and closures whose scale is taken from it.
+    The weights of edges stay as they are. Raises GraphError where too few fixes agree.
+    """
+    weight, poses, believed = solution.weight, solution.world_from_body, np.zeros(0)
+    loops = is_loop(graph)
+    checked = bool((weight[loops] > 0).any())
+    if fixes is not None and gps is not None:
+        poses, believed = believe(Factors.of(graph), weight, poses, fixes, gps)
+        checked = True
+    if not checked or not (settings.noise or settings.scale):
+        return _told(graph, solution, poses, 1.0, 1.0, fixes, believed)
+
+    noise, scale, present, before = 1.0, 1.0, graph, (1.0, 1.0)
+    for _ in range(settings.max_rounds):
+        present = rescaled(graph, of_odometry, ~loops, noise, scale)
+        factors = Factors.of(present)
+        weighted = _weighted(factors, weight, poses, fixes, believed)
+        poses = least_squares(factors, weighted, poses, 20, 1e-6).world_from_body
+        before = noise, scale
+        if settings.noise:
+            noise *= _misjudged(factors, weight, weighted, poses, ~loops, settings.least_redundancy)
+            noise = float(np.clip(noise, 1.0 / settings.most_change, settings.most_change))
+        if settings.scale:
+            scale += _scale_step(graph, weight, of_odometry, ~loops, noise, scale, poses, fixes, believed, settings)
+        if abs(np.log(noise / before[0])) < 0.05 and abs(scale - before[1]) < _STEP:
+            break
+    return _told(present, solution, poses, before[0], before[1], fixes, believed)
+
+
+def rescaled(graph: PoseGraph, of_odometry: Bools, odometry: Bools, noise: float, scale: float) -> PoseGraph:
+    """The graph with metres of some edges (E,) multiplied by `scale`, and the covariance of odometry by `noise`.
+
+    What is multiplied has its noise multiplied too. With the noise left alone every constraint would be met best by a
+    world of no size, and the estimate would be too small.
+    """
+    a_from_b, information = graph.a_from_b.copy(), graph.information.copy()
+    a_from_b[of_odometry, :3, 3] *= scale
+    information[of_odometry, 3:] /= scale
+    information[of_odometry, :, 3:] /= scale
+    information[odometry] /= noise
+    return replace(graph, a_from_b=a_from_b, information=information)
+
+
+def _weighted(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes | None, believed: Floats) -> Any:
+    if fixes is None:
+        return factors.weighted(weight)
+    return with_fixes(factors, weight, poses, fixes, believed)
+
+
+def _misjudged(
+    factors: Factors, weight: Floats, weighted: Any, poses: Floats, odometry: Bools, least_redundancy: float
+) -> float:
+    """By what factor the odometry's covariance is too small: its chi-square over its share of the redundancy.
+
+    Variance components (Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1979): the
+    redundancy of an edge is its degrees of freedom less the trace of its information times what the solution leaves
+    open of it.
+    """
+    graph, edges = factors.graph, np.flatnonzero(odometry)
+    open_ = edge_covariances(factors, weight, poses, edges, weighted)
+    size = open_.shape[1]
+    axes = slice(None) if size == 6 else [2, 3, 4]
+    information = graph.information[edges][:, axes][:, :, axes]
+    redundancy = size * len(edges) - float(np.einsum("eij,eji->", information, open_))
+    if redundancy < least_redundancy:
+        return 1.0
+    chi2 = float((residual_sigma(graph, poses)[edges] ** 2).sum())
+    return max(chi2, 1e-9) / redundancy
+
+
+def _scale_step(
+    graph: PoseGraph,
+    weight: Floats,
+    of_odometry: Bools,
+    odometry: Bools,
+    noise: float,
+    scale: float,
+    poses: Floats,
+    fixes: Fixes | None,
+    believed: Floats,
+    settings: RefineSettings,
+) -> float:
+    """A secant step towards the scale of least error, poses following it: by the slope here and a step aside.
+
+    At the best poses for a scale the error does not change with the poses, so its slope is that with the poses fixed.
+    """
+
+    def slope(at: float, start: Floats) -> float:
+        factors = Factors.of(rescaled(graph, of_odometry, odometry, noise, at))
+        weighted = _weighted(factors, weight, start, fixes, believed)
+        best = least_squares(factors, weighted, start, 20, 1e-8).world_from_body
+        errors = [
+            float((weight * residual_sigma(rescaled(graph, of_odometry, odometry, noise, at + side), best) ** 2).sum())
+            for side in (-_STEP, _STEP)
+        ]
+        return (errors[1] - errors[0]) / (4.0 * _STEP) + (at - 1.0) / settings.scale_sigma**2
+
+    aside = settings.scale_sigma / 4.0
+    here, there = slope(scale, poses), slope(scale + aside, poses)
+    curve = (there - here) / aside
+    if curve <= 0.0:  # nothing to find: the prior alone would curve it upwards
+        return 0.0
+    return float(np.clip(-here / curve, -_LONGEST, _LONGEST))
+
+
+def _told(
+    graph: PoseGraph,
+    solution: Solution,
+    poses: Floats,
+    noise: float,
+    scale: float,
+    fixes: Fixes | None,
+    believed: Floats,
+) -> Refined:
+    """The refined solution, its reason saying what was learned."""
+    world, said = None, []
+    if noise != 1.0:
+        said.append(f"The odometry's noise is {np.sqrt(noise):.2g} times what was assumed, by the constraints kept.")
+    if scale != 1.0:
+        said.append(f"Its metres are {abs(1.0 / scale - 1.0):.2%} too {'long' if scale < 1.0 else 'short'}.")
+    if fixes is not None:
+        world = world_from_enu(poses, fixes, np.maximum(believed, 1e-9))
+        chi2 = chi2_of_fixes(poses, fixes, world)[believed > 0]
+        beyond = int((chi2 > chi2_quantile(0.99, 3)).sum())
+        said.append(
+            f"{int(believed.sum())} of {len(fixes)} GPS fixes were kept, {beyond} of them beyond 99 % of their noise."
+        )
+    error = float(0.5 * (solution.weight * residual_sigma(graph, poses) ** 2).sum())
+    refined = replace(
+        solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *said])
+    )
+    return Refined(graph, refined, noise, scale, believed, world)

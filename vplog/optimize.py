@@ -1,0 +1,135 @@
+"""`vplog optimize`: a pose graph from anywhere is read, checked, solved, held against its odometry, and written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from vplog.data import EdgeKind, PoseGraph, Solution
+from vplog.errors import GraphError
+from vplog.geometry import inverse
+from vplog.graph.build import checked, parts
+from vplog.graph.consistency import keep_odometry_if_worse
+from vplog.graph.solve import OptimiserSettings
+from vplog.results.g2o import read_g2o, write_g2o
+from vplog.timing import Watch
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Floats, Ints
+    from vplog.results.g2o import GraphFile
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised:
+    """A solved file."""
+
+    file: GraphFile
+    solution: Solution
+    record: dict[str, Any]
+    """What `--json` prints."""
+
+
+def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
+    """Solve the graph of a g2o file and write it with its new poses to `out`, all edges kept, rejected ones too.
+
+    Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
+    where it is. Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
+    """
+    optimiser = TypeAdapter(OptimiserSettings).validate_python({"kind": method})
+    watch = Watch()
+    with watch.stage("read"):
+        file = read_g2o(path)
+    graph, ids = file.graph, file.ids
+    part = parts(graph)
+    warnings = list(file.warnings)
+    if part.any():
+        firsts = ", ".join(str(ids[np.argmax(part == k)]) for k in range(min(int(part.max()) + 1, 5)))
+        warnings.append(
+            f"The graph is in {int(part.max()) + 1} parts that no edge joins (they begin at {firsts}"
+            f"{', ..' if part.max() > 4 else ''}); each was solved by itself and stays where its first pose is."
+        )
+    with watch.stage("solve"):
+        solution, repairs = solve_parts(graph, part, optimiser, ids)
+        if part[file.held] == 0 and file.held:
+            solution = _holding(solution, graph, part == 0, file.held)
+    with watch.stage("write"):
+        write_g2o(out, graph, solution.world_from_body, ids, file.held)
+    return Optimised(file, solution, _record(path, out, method, file, solution, warnings + repairs, watch))
+
+
+def solve_parts(
+    graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints
+) -> tuple[Solution, list[str]]:
+    """The solution of each part (N,) of a graph by itself, put together, and warnings of what was repaired."""
+    poses, weight = np.array(graph.world_from_body), np.ones(len(graph.a))
+    solutions, warnings = [], []
+    for number in range(int(part.max()) + 1):
+        rows, edges = np.flatnonzero(part == number), np.flatnonzero(part[graph.a] == number)
+        if len(rows) == 1:
+            continue
+        alone = PoseGraph(
+            graph.world_from_body[rows],
+            np.searchsorted(rows, graph.a[edges]).astype(np.int32),
+            np.searchsorted(rows, graph.b[edges]).astype(np.int32),
+            graph.a_from_b[edges],
+            graph.information[edges],
+            [graph.kind[edge] for edge in edges],
+            graph.dimension,
+        )
+        alone, repairs = checked(alone)
+        solution = keep_odometry_if_worse(alone, optimiser(alone))
+        where = f"Part that begins at {ids[rows[0]]}: " if len(rows) < len(part) else ""
+        warnings += [where + text for text in repairs]
+        poses[rows], weight[edges] = solution.world_from_body, solution.weight
+        solutions.append(replace(solution, reason=where + solution.reason))
+    if not solutions:
+        raise GraphError("No edge joins two poses, so there is nothing to solve.")
+    return Solution(
+        poses,
+        weight,
+        sum(one.error_before for one in solutions),
+        sum(one.error_after for one in solutions),
+        max(one.iterations for one in solutions),
+        all(one.converged for one in solutions),
+        " ".join(one.reason for one in solutions),
+    ), warnings
+
+
+def _holding(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:
+    """The solution moved as one so that this row is where the graph has it."""
+    poses = np.array(solution.world_from_body)
+    poses[part] = graph.world_from_body[row] @ inverse(poses[row]) @ poses[part]
+    return replace(solution, world_from_body=poses)
+
+
+def _record(
+    path: Path, out: Path, method: str, file: GraphFile, solution: Solution, warnings: list[str], watch: Watch
+) -> dict[str, Any]:
+    graph = file.graph
+    loop = np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind])
+    rejected = np.flatnonzero(solution.weight < 0.5)
+    return {
+        "graph": str(path),
+        "output": str(out),
+        "method": method,
+        "dimension": graph.dimension,
+        "poses": len(file.ids),
+        "edges": len(graph.a),
+        "loops": int(loop.sum()),
+        "kept": int(loop.sum()) - len(rejected),
+        "rejected": len(rejected),
+        "rejected_edges": np.stack([file.ids[graph.a[rejected]], file.ids[graph.b[rejected]]], axis=1).tolist(),
+        "error_before": solution.error_before,
+        "error_after": solution.error_after,
+        "iterations": solution.iterations,
+        "converged": solution.converged,
+        "odometry_kept": "Odometry was kept" in solution.reason,
+        "reason": solution.reason,
+        "seconds": {name: round(stage["seconds"], 3) for name, stage in watch.stages.items()},
+        "warnings": warnings,
+    }
