@@ -229,7 +229,7 @@ def test_accepted_closures_are_whole_and_the_others_are_not_in_the_graph(finishe
 
 def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, tmp_path: Path) -> None:
     """A gate this narrow turns away closures that are right."""
-    strict = load_pipeline("default", [*QUICK, "solve.gate_probability=0.001"])
+    strict = load_pipeline("default", [*QUICK, "solve.kind=pcm", "solve.gate_probability=0.001"])
     ledger = run(drive.log, tmp_path, strict, threads=4).closures
     rejected = np.array([verdict == Verdict.REJECTED_BY_SOLVER for verdict in ledger.verdict])
     assert rejected.any()

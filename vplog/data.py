@@ -241,8 +241,8 @@ class PoseGraph:
     """(E, 6, 6), in the frame of b."""
     kind: list[EdgeKind]
     dimension: int = 3
-    """3, or 2 for a planar graph: all poses and edges then are turns about z and shifts along x and y, and only rows and
-    columns 2, 3, 4 of `information` (yaw, x, y) are used, the others being zero."""
+    """3, or 2 for a planar graph: all poses and edges then are turns about z and shifts along x and y, and only rows
+    and columns 2, 3, 4 of `information` (yaw, x, y) are used, the others being zero."""
 
 
 @dataclass(frozen=True, eq=False)

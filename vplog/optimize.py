@@ -45,7 +45,7 @@ def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
     with watch.stage("read"):
         file = read_g2o(path)
     graph, ids = file.graph, file.ids
-    part = parts(graph)
+    part = parts(len(ids), graph.a, graph.b)
     warnings = list(file.warnings)
     if part.any():
         firsts = ", ".join(str(ids[np.argmax(part == k)]) for k in range(min(int(part.max()) + 1, 5)))

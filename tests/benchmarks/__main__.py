@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks [mining describe discovery search growth] [--json]`, from the top of the checkout.
+"""`python -m tests.benchmarks [mining describe discovery search growth graphs] [--json]`, from the top of the checkout.
 
 Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
 """
@@ -17,6 +17,7 @@ from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 
 from .discovery import discovery
+from .graphs import graphs
 from .images import drives
 from .mining import describing, mining
 from .search import free_memory_gb, growth, search
@@ -58,12 +59,13 @@ def main() -> int:
 
 
 def _arguments() -> argparse.Namespace:
-    kinds = ("mining", "describe", "discovery", "search", "growth")
+    kinds = ("mining", "describe", "discovery", "search", "growth", "graphs")
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("what", nargs="*", metavar="WHAT", help=f"of {', '.join(kinds)}; all where none is named")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")
     parser.add_argument("--images", type=int, default=20, help="images of each drive")
+    parser.add_argument("--seeds", type=int, default=3, help="of the false closures put into pose graphs")
     parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.what) - set(kinds))
@@ -91,6 +93,8 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "growth" in what:
         possible = [size for size in SIZES if size < SIZES[-1] or free_memory_gb() >= LARGEST_NEEDS_GB]
         yield from growth(tuple(possible), BobbSettings(), 20)
+    if "graphs" in what:
+        yield from graphs(arguments.seeds, rounds)
 
 
 def _pipelines() -> Iterator[tuple[str, Pipeline]]:

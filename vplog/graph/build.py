@@ -103,8 +103,7 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     _check_poses(graph.a_from_b, "Edge {row}", graph.dimension)
     information = informed(graph)
     _check_matrices(information, "information", graph.a, graph.b)
-    part = parts(graph)
-    lost = np.flatnonzero(part)
+    lost = np.flatnonzero(parts(n, graph.a, graph.b))
     if len(lost):
         raise GraphError(f"No edge leads from pose 0 to pose {lost[0]} ({len(lost)} of {n} poses are cut off).")
 
@@ -177,9 +176,11 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
         )
 
 
-def parts(graph: PoseGraph) -> Ints:
-    """Number (N,) of the connected part that each pose belongs to, in order of their first poses."""
-    root = list(range(len(graph.world_from_body)))
+def parts(n: int, a: Int32s | Ints, b: Int32s | Ints) -> Ints:
+    """Number (N,) of the connected part that each of n poses belongs to by the edges a, b, in order of first poses."""
+    if len(np.unique(np.minimum(a, b)[np.abs(a - b) == 1])) == n - 1:  # a chain through all, as drives are
+        return np.zeros(n, np.int64)
+    root = list(range(n))
 
     def find(node: int) -> int:
         while root[node] != node:
@@ -187,7 +188,7 @@ def parts(graph: PoseGraph) -> Ints:
             node = root[node]
         return node
 
-    for left, right in zip(graph.a.tolist(), graph.b.tolist(), strict=True):
+    for left, right in zip(a.tolist(), b.tolist(), strict=True):
         left, right = sorted((find(left), find(right)))  # noqa: PLW2901 (their roots, the first pose of each)
         root[right] = left
-    return np.unique([find(node) for node in range(len(root))], return_inverse=True)[1].astype(np.int64)
+    return np.unique([find(node) for node in range(n)], return_inverse=True)[1].astype(np.int64)

@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 
 class CauchySettings(Settings):
-    """Least squares with closures under the Cauchy kernel: weight k^2 / (k^2 + r^2)."""
+    """Least squares with the weight of a closure k^2 / (k^2 + r^2)."""
 
     kind: Literal["cauchy"] = "cauchy"
     """Name of the method."""
     inlier_probability: float = Field(default=0.99, gt=0, lt=1)
-    """A closure has half its weight (half the weight at r = k) at the distance that a true one exceeds with the
-    remaining probability: chi-square of 6 degrees 16.8."""
+    """A closure has half its weight, which is at r = k, at this quantile of a true one's chi-square
+    (16.8 of 6 degrees)."""
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which it gives up."""
-    tolerance: float = Field(default=1e-9, gt=0)
+    tolerance: float = Field(default=1e-6, gt=0)
     """It has converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:

@@ -1,6 +1,6 @@
 """Dynamic covariance scaling: near closures count in full, far ones ever less.
 
-Agarwal, Tipaldi, Spinello, Stachniss, Burgard: Robust Map Optimization Using Dynamic Covariance Scaling, ICRA 2013, eq. 16.
+Agarwal, Tipaldi, Spinello, Stachniss, Burgard: Robust Map Optimization Using Dynamic Covariance Scaling, ICRA 2013.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 
 class DcsSettings(Settings):
-    """Least squares with closures under the dynamic covariance scaling kernel: weight 1 up to r^2 = phi, beyond (2 phi / (phi + r^2))^2."""
+    """Least squares with the weight of a closure 1 up to r^2 = phi, beyond it (2 phi / (phi + r^2))^2, eq. 16."""
 
     kind: Literal["dcs"] = "dcs"
     """Name of the method."""
     inlier_probability: float = Field(default=0.99, gt=0, lt=1)
-    """A closure has half its weight (half the weight at r^2 = (2 sqrt(2) - 1) phi) at the distance that a true one exceeds with the
-    remaining probability: chi-square of 6 degrees 16.8."""
+    """A closure has half its weight, which is at r^2 = (2 sqrt(2) - 1) phi, at this quantile of a true one's chi-square
+    (16.8 of 6 degrees)."""
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which it gives up."""
-    tolerance: float = Field(default=1e-9, gt=0)
+    tolerance: float = Field(default=1e-6, gt=0)
     """It has converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:

@@ -9,8 +9,9 @@ import gtsam
 import numpy as np
 
 from vplog import geometry
+from vplog.data import EdgeKind
 from vplog.errors import GraphError
-from vplog.graph.build import informed
+from vplog.graph.build import informed, parts
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints, PoseGraph
@@ -39,6 +40,8 @@ class Factors:
     """(E, d, d) in GTSAM's order of axes; d = 6, or 3 in the plane."""
     whole: list[Any]
     """BetweenFactorPose3 or Pose2 of each edge with its full information."""
+    piece: Ints
+    """(N,) number of the piece of odometry that each pose is on, in order of their first poses."""
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Factors:
@@ -54,15 +57,17 @@ class Factors:
                 shared[name] = gtsam.noiseModel.Gaussian.Information(matrix)
             noise.append(shared[name])
         between = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
-        parts = zip(graph.a.tolist(), graph.b.tolist(), as_gtsam(graph.a_from_b, graph.dimension), noise, strict=True)
-        return cls(graph, information, [between(a, b, measured, model) for a, b, measured, model in parts])
+        ends = zip(graph.a.tolist(), graph.b.tolist(), as_gtsam(graph.a_from_b, graph.dimension), noise, strict=True)
+        factors = [between(a, b, measured, model) for a, b, measured, model in ends]
+        odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+        return cls(graph, information, factors, parts(len(graph.world_from_body), graph.a[odometry], graph.b[odometry]))
 
     def weighted(self, weight: Floats) -> gtsam.NonlinearFactorGraph:
         """The edges of positive weight (E,), their information times the weight, and the gauge at pose 0.
 
         Those of weight 1 are taken as they are, which is most of them at every stage.
         """
-        result = self.gauged()
+        result = self.gauged(self.loose(weight))
         scaled = np.flatnonzero((weight > 0) & (weight != 1))
         # the factor of L^T, upper triangular, is what GTSAM keeps of an information L L^T
         roots = np.swapaxes(np.linalg.cholesky(self.information[scaled] * weight[scaled, None, None]), 1, 2)
@@ -88,15 +93,25 @@ class Factors:
             result.add(between(int(self.graph.a[edge]), int(self.graph.b[edge]), factor.measured(), noise))
         return result
 
-    def gauged(self) -> gtsam.NonlinearFactorGraph:
-        """No edges yet, and pose 0 held at the origin."""
+    def loose(self, weight: Floats) -> Ints:
+        """First poses of what no edge of positive weight (E,) joins to pose 0; such parts stay where the graph has them."""
+        if not self.piece.any():
+            return np.empty(0, np.int64)
+        on = weight > 0
+        joined = parts(int(self.piece.max()) + 1, self.piece[self.graph.a[on]], self.piece[self.graph.b[on]])
+        _, first = np.unique(joined[self.piece], return_index=True)
+        return first[1:]
+
+    def gauged(self, loose: Ints | tuple[()] = ()) -> gtsam.NonlinearFactorGraph:
+        """No edges yet, pose 0 held at the origin and loose ones where the graph has them from there."""
         result = gtsam.NonlinearFactorGraph()
-        if self.graph.dimension == 2:
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, _GAUGE_SIGMA)
-            result.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), noise))
-        else:
-            noise = gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)
-            result.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), noise))
+        world = self.graph.world_from_body
+        held = [0, *loose]
+        planar = self.graph.dimension == 2
+        noise = gtsam.noiseModel.Isotropic.Sigma(3 if planar else 6, _GAUGE_SIGMA)
+        prior = gtsam.PriorFactorPose2 if planar else gtsam.PriorFactorPose3
+        for node, pose in zip(held, as_gtsam(geometry.between(world[:1], world[held]), self.graph.dimension), strict=True):
+            result.add(prior(int(node), pose, noise))
         return result
 
 
@@ -112,12 +127,14 @@ def least_squares(
     steps, converged = 0, False
     try:
         quick = gtsam.GaussNewtonOptimizer(weighted, values, gtsam.GaussNewtonParams())
-        least = quick.error()
+        least, gain = quick.error(), 0.0
         while steps < max_iterations and not converged:
             quick.iterate()
             steps += 1
-            gain = least - quick.error()
-            converged = abs(gain) <= tolerance * max(least, 1.0)
+            before, gain = gain, least - quick.error()
+            # a step gains at most as much less than the one before as that did: the next is not worth its time
+            coming = gain * gain / before if 0 < gain < before else abs(gain)
+            converged = min(abs(gain), coming) <= tolerance * max(least, 1.0)
             if not (gain >= 0 or converged):  # NaN too
                 break
             # a copy: what the optimiser returns is its own, and is gone after its next step

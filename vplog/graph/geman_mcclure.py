@@ -1,6 +1,6 @@
 """Geman-McClure kernel: far closures hardly pull at all.
 
-Geman and McClure: Statistical methods for tomographic image reconstruction, 1987; Kerl, Sturm, Cremers, ICRA 2013.
+Geman and McClure: Statistical Methods for Tomographic Image Reconstruction, Bulletin of the ISI 52, 1987.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 
 class GemanMcClureSettings(Settings):
-    """Least squares with closures under the Geman-McClure kernel: weight c^4 / (c^2 + r^2)^2."""
+    """Least squares with the weight of a closure c^4 / (c^2 + r^2)^2."""
 
     kind: Literal["geman_mcclure"] = "geman_mcclure"
     """Name of the method."""
     inlier_probability: float = Field(default=0.99, gt=0, lt=1)
-    """A closure has half its weight (half the weight at r^2 = (sqrt(2) - 1) c^2) at the distance that a true one exceeds with the
-    remaining probability: chi-square of 6 degrees 16.8."""
+    """A closure has half its weight, which is at r^2 = (sqrt(2) - 1) c^2, at this quantile of a true one's chi-square
+    (16.8 of 6 degrees)."""
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which it gives up."""
-    tolerance: float = Field(default=1e-9, gt=0)
+    tolerance: float = Field(default=1e-6, gt=0)
     """It has converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:

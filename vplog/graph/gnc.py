@@ -20,21 +20,30 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Solution
+from vplog.errors import GraphError
 from vplog.graph.agreement import agreement
 from vplog.graph.build import checked
-from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.factors import Factors, least_squares
 from vplog.graph.initialise import initial_poses
 from vplog.graph.leave_out import distance, group_costs, groups, tension
 from vplog.graph.lm import solve_kept
+from vplog.graph.pcm import PcmSettings
+from vplog.graph.truncated import truncated_weights
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from vplog.data import Floats, Ints, PoseGraph
     from vplog.graph.leave_out import Tension
 
+    Bools = NDArray[np.bool_]
+
 _WORST_SHARE = 0.5
 """Closures that cost at least this share of what the worst one does go with it; the others may only suffer from it."""
+_MOST_SUSPECTS = 50
+"""Groups that a round solves without, the most suspect first; public graphs have up to 10."""
 _MOST_ROUNDS = 100
 """Rounds of putting away and taking back at most; each puts one away for good, and public graphs take up to 10."""
 
@@ -57,7 +66,7 @@ class GncSettings(Settings):
     """Stages after which it gives up; residuals of 1e6 sigma take 40."""
     max_iterations: int = Field(default=100, ge=1)
     """Steps of the last solve, with the kept edges alone."""
-    tolerance: float = Field(default=1e-9, gt=0)
+    tolerance: float = Field(default=1e-6, gt=0)
     """The last solve has converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:
@@ -69,7 +78,7 @@ class GncSettings(Settings):
         if len(loops) == 0:
             start = initial_poses(factors, weight)
             return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, "")
-        weight[loops] = agreement(graph, loops).probability > 0.5
+        weight[loops] = self._start(graph, loops)
         far = int((weight[loops] == 0).sum())
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
         state = State(weight, initial_poses(factors, weight, bound))
@@ -82,6 +91,15 @@ class GncSettings(Settings):
         )
         return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
+    def _start(self, graph: PoseGraph, loops: Ints) -> Bools:
+        """Closures (K,) to begin with: those that agree with the odometry or, where it does not lead, with each other."""
+        part = OdometryChain.of(graph).part
+        across = part[graph.a[loops]] != part[graph.b[loops]]
+        result = agreement(graph, loops).probability > 0.5
+        kept, _ = PcmSettings(pair_probability=self.inlier_probability).consistent(graph, loops[across])
+        result[across] = np.isin(loops[across], kept)
+        return result
+
     def _anneal(self, factors: Factors, state: State, bound: float) -> tuple[State, int]:
         """Algorithm 1 of the paper over the closures of weight 1: those that are left have it, the others none."""
         judged = np.flatnonzero(is_loop(factors.graph) & (state.weight > 0))
@@ -93,7 +111,7 @@ class GncSettings(Settings):
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         stage = 0
         for stage in range(1, self.max_stages + 1):  # noqa: B007 (told in the reason)
-            weight[judged] = _weights(chi2, bound, mu)
+            weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
             poses = least_squares(
@@ -106,18 +124,22 @@ class GncSettings(Settings):
     def _hold_against_the_rest(self, factors: Factors, state: State, loops: Ints) -> State:
         """Put away what costs the rest too much, take back what the rest predicts, until neither is left to do."""
         returned = np.zeros(len(state.weight), bool)
+        cleared: set[bytes] = set()
         for _ in range(_MOST_ROUNDS):
             kept = loops[state.weight[loops] > 0]
             if len(kept) == 0:
                 return state
-            pull = tension(factors, state.weight, state.poses, kept)
+            try:
+                pull = tension(factors, state.weight, state.poses, kept)
+            except GraphError:  # what is nearly open cannot be predicted; least squares may still find its best place
+                return state
             cost = np.minimum(pull.cost, state.chi2)  # first order may say more than there is
             limit = self._limit(factors, state, cost)
             if (cost > limit).any():
                 out = kept[(cost > limit) & (cost >= _WORST_SHARE * cost.max())]
                 state = self._settle(factors, _with(state.weight, out, 0.0), state.poses)
                 continue
-            smaller = self._without_a_false_place(factors, state, kept, pull)
+            smaller = self._without_a_false_place(factors, state, kept, pull, cleared)
             if smaller is not None:
                 state = smaller
                 continue
@@ -128,24 +150,33 @@ class GncSettings(Settings):
             state = self._settle(factors, _with(state.weight, back, 1.0), state.poses)
         return state
 
-    def _without_a_false_place(self, factors: Factors, state: State, kept: Ints, pull: Tension) -> State | None:
+    def _without_a_false_place(
+        self, factors: Factors, state: State, kept: Ints, pull: Tension, cleared: set[bytes]
+    ) -> State | None:
         """The state without the first group of neighbouring closures that costs the rest too much; None: none does.
 
-        Groups support each other, so each is solved without, if it pulls hard enough to be suspected.
+        Groups support each other, so each is solved without, if it pulls hard enough to be suspected, and not `cleared`
+        already; those that turn out well are added.
         """
         graph = factors.graph
         places = groups(graph, kept)
-        suspicion = group_costs(graph, state.poses, kept, pull, places)
+        suspicion = np.minimum(group_costs(graph, state.poses, kept, pull, places), state.chi2)
         suspicion[[len(place) == 1 for place in places]] = 0.0  # answered already
-        limit = self._limit(factors, state, suspicion)
-        for place in np.argsort(-suspicion, kind="stable"):
-            if suspicion[place] <= limit[place]:
-                break
+        size = np.array([len(place) for place in places])
+        limit = np.zeros(len(places))
+        for members in np.unique(size).tolist():
+            limit[size == members] = self._limit(factors, state, suspicion[size == members], members)
+        ratio = suspicion / np.maximum(limit, 1e-300)
+        suspects = [place for place in np.argsort(-ratio, kind="stable") if ratio[place] > 1.0]
+        for place in suspects[:_MOST_SUSPECTS]:
             members = kept[places[place]]
+            if members.tobytes() in cleared:
+                continue
             smaller = self._settle(factors, _with(state.weight, members, 0.0), state.poses)
             cost = state.chi2 - smaller.chi2
             if cost > self._limit(factors, state, np.array([cost]), len(members))[0]:
                 return smaller
+            cleared.add(members.tobytes())
         return None
 
     def _predicted(self, factors: Factors, state: State, away: Ints, freedom: Floats) -> Ints:
@@ -171,7 +202,7 @@ class GncSettings(Settings):
         dof = d * (int(state.weight.sum()) - len(state.poses) + 1 - members)
         if dof <= 0:
             return np.full(len(cost), said)
-        scale = (state.chi2 - cost) / chi2_quantile(1.0 - self.inlier_probability, dof)
+        scale = np.maximum(state.chi2 - cost, 0.0) / chi2_quantile(1.0 - self.inlier_probability, dof)
         tail = d * (2.0 / (d + 2.0)) ** (2.0 / d) / (1.0 - self.inlier_probability)
         others = chi2_quantile(self.inlier_probability, (members - 1) * d) if members > 1 else 0.0
         return np.minimum(said, scale * (tail + others))
@@ -199,10 +230,3 @@ def _with(weight: Floats, edges: Ints, value: float) -> Floats:
     result = np.array(weight)
     result[edges] = value
     return result
-
-
-def _weights(chi2: Floats, bound: float, mu: float) -> Floats:
-    """Eq. (14): 1 for small residuals, 0 for large ones, between them falling."""
-    with np.errstate(divide="ignore"):
-        between = np.sqrt(bound * mu * (mu + 1.0) / chi2) - mu
-    return np.where(chi2 <= bound * mu / (mu + 1.0), 1.0, np.where(chi2 >= bound * (mu + 1.0) / mu, 0.0, between))

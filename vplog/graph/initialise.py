@@ -12,17 +12,26 @@ from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
 from vplog.graph.factors import anchored, as_array, as_values
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
+    from vplog.data import Floats, PoseGraph
     from vplog.graph.factors import Factors
 
 
-def relaxed(factors: Factors, weight: Floats) -> Floats | None:
+_LINEAR_STEPS = 300
+"""Conjugate gradients on a linear problem at most: with the chain as preconditioner they end after a step per loop."""
+_LINEAR_TOLERANCE = 1e-4
+"""They end at this share of the first residual: what follows corrects far more."""
+
+
+def relaxed(factors: Factors, weight: Floats, chain: Floats) -> Floats | None:
     """Poses (N, 4, 4) by rotations first, positions then, each a linear problem: chordal in space, LAGO in the plane.
 
-    None where that fails: an ill-conditioned problem, or poses that are not finite.
+    `chain` are the poses by odometry alone. None where that fails: an ill-conditioned problem, parts that no edge of
+    positive weight joins, or poses that are not finite.
     """
+    if len(factors.loose(weight)):
+        return None
     try:
-        poses = _planar(factors, weight) if factors.graph.dimension == 2 else _chordal(factors, weight)
+        poses = _planar(factors, weight, chain) if factors.graph.dimension == 2 else _chordal(factors, weight)
     except RuntimeError:  # of GTSAM's elimination
         return None
     return anchored(poses, factors.graph.world_from_body[0]) if np.isfinite(poses).all() else None
@@ -33,39 +42,85 @@ def _chordal(factors: Factors, weight: Floats) -> Floats:
     return as_array(gtsam.InitializePose3.initialize(factors.weighted(weight)), 3)
 
 
-def _planar(factors: Factors, weight: Floats) -> Floats:
-    """Linear approximation for graph optimisation (LAGO): Carlone, Aragues, Castellanos, Bona, IJRR 2014.
+def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
+    """Linear approximation for graph optimisation: Carlone, Aragues, Castellanos, Bona, IJRR 2014 (LAGO).
 
     The odometry chain is the spanning tree: along it turns are summed without wrapping, so each other edge tells the
     turn between its ends but for whole circles, and their number is the one that the chain is nearest to (section 4).
-    Then orientations are a linear problem, and with them known, positions too: one step of Gauss-Newton.
+    Then orientations are a linear problem, and with them known, positions too.
     """
     graph = factors.graph
-    poses, leads = odometry_chain(graph)
-    step = np.arctan2(graph.a_from_b[:, 1, 0], graph.a_from_b[:, 0, 0])
-    along = np.where(graph.a[leads] < graph.b[leads], step[leads], -step[leads])
-    start = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    gaps = np.flatnonzero(leads < 0)  # each piece of the chain goes on from the heading that its first pose has
-    piece = np.cumsum(leads < 0) - 1
-    total = np.cumsum(np.where(leads < 0, 0.0, along))
-    yaw = total - (total - start)[gaps][piece]
-    circles = np.round((yaw[graph.b] - yaw[graph.a] - step) / (2.0 * np.pi))
-    sigma = 1.0 / np.sqrt(graph.information[:, 2, 2] * np.where(weight > 0, weight, 1.0))
-
-    linear = gtsam.GaussianFactorGraph()
-    one, minus = np.eye(1), -np.eye(1)
-    model = gtsam.noiseModel.Unit.Create(1)
-    linear.add(0, one / 1e-6, np.zeros(1), model)
-    turn = ((step + 2.0 * np.pi * circles) / sigma).tolist()
-    for edge in np.flatnonzero(weight > 0).tolist():
-        scale = 1.0 / sigma[edge]
-        linear.add(int(graph.a[edge]), minus * scale, int(graph.b[edge]), one * scale, np.array([turn[edge]]), model)
-    solved = linear.optimize()
-    yaw = np.array([solved.at(node)[0] for node in range(len(poses))])
+    turn = np.arctan2(graph.a_from_b[:, 1, 0], graph.a_from_b[:, 0, 0])
+    yaw = np.unwrap(np.arctan2(chain[:, 1, 0], chain[:, 0, 0]))
+    turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
+    yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None])[:, 0]
     zero = np.zeros(len(yaw))
-    turned = geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), np.zeros((len(yaw), 3)))
-    values = as_values(turned, 2)
-    return as_array(values.retract(factors.weighted(weight).linearize(values).optimize()), 2)
+    poses = geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
+    shift = (poses[graph.a, :2, :2] @ graph.a_from_b[:, :2, 3:])[:, :, 0]
+    firmness = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
+    if (np.abs(graph.a - graph.b) != 1).sum() > _LINEAR_STEPS:  # so many loops that factorising is faster
+        poses[:, :2, 3] = _placed(graph, weight * firmness, shift)
+        return poses
+    poses[:, :2, 3] = _spread(graph, weight * firmness, shift, poses[:, :2, 3])
+    return poses
+
+
+def _placed(graph: PoseGraph, firmness: Floats, shift: Floats) -> Floats:
+    """What _spread finds for positions (N, 2), from the origin and by factorisation."""
+    linear = gtsam.NonlinearFactorGraph()
+    linear.add(gtsam.PriorFactorPoint2(0, np.zeros(2), gtsam.noiseModel.Isotropic.Precision(2, 1e12)))
+    noise = {one: gtsam.noiseModel.Isotropic.Precision(2, one) for one in np.unique(firmness[firmness > 0]).tolist()}
+    for a, b, moved, one in zip(graph.a.tolist(), graph.b.tolist(), shift, firmness.tolist(), strict=True):
+        if one > 0:
+            linear.add(gtsam.BetweenFactorPoint2(a, b, moved, noise[one]))
+    values = gtsam.Values()
+    for node in range(len(graph.world_from_body)):
+        values.insert(node, np.zeros(2))
+    values = values.retract(linear.linearize(values).optimize())
+    return np.asarray(gtsam.utilities.extractPoint2(values), np.float64)
+
+
+def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Floats) -> Floats:
+    """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first stays.
+
+    Conjugate gradients on the normal equations. The preconditioner is the same problem on the chain of poses alone,
+    which two running sums solve; a link that has no edge is given the mean firmness.
+    """
+    n, k = start.shape
+    a, b = graph.a, graph.b
+
+    def pull(tension: Floats) -> Floats:
+        """What tensions (E, k) of the edges add up to at their ends, the first pose being held."""
+        result = np.empty((n, k))
+        for column in range(k):
+            along = tension[:, column]
+            result[:, column] = np.bincount(b, along, n) - np.bincount(a, along, n)
+        result[0] = 0.0
+        return result
+
+    chain = np.bincount(np.maximum(a, b), np.where(np.abs(a - b) == 1, firmness, 0.0), n)[1:, None]
+    chain = np.where(chain > 0, chain, firmness.mean())
+
+    def precondition(residual: Floats) -> Floats:
+        flow = np.cumsum(residual[:0:-1], axis=0)[::-1]  # through each link goes what everything after it pulls
+        return np.concatenate([np.zeros((1, k)), np.cumsum(flow / chain, axis=0)])
+
+    values = np.array(start)
+    residual = pull(firmness[:, None] * (difference - values[b] + values[a]))
+    direction = step = precondition(residual)
+    energy = first = (residual * step).sum(0)
+    for _ in range(_LINEAR_STEPS):
+        if (energy <= _LINEAR_TOLERANCE**2 * first).all():
+            break
+        back = pull(firmness[:, None] * (direction[b] - direction[a]))
+        along = (direction * back).sum(0)
+        length = np.divide(energy, along, out=np.zeros(k), where=along > 0)
+        values = values + length * direction
+        residual = residual - length * back
+        step = precondition(residual)
+        before, energy = energy, (residual * step).sum(0)
+        direction = step + np.divide(energy, before, out=np.zeros(k), where=before > 0) * direction
+    return values
 
 
 def initial_poses(factors: Factors, weight: Floats, bound: float = np.inf) -> Floats:
@@ -77,7 +132,7 @@ def initial_poses(factors: Factors, weight: Floats, bound: float = np.inf) -> Fl
     graph = factors.graph
     robust = is_loop(graph)
     candidates = [graph.world_from_body, odometry_chain(graph)[0]]
-    linear = relaxed(factors, weight) if (robust & (weight > 0)).any() else None
+    linear = relaxed(factors, weight, candidates[1]) if (robust & (weight > 0)).any() else None
     if linear is not None:
         candidates.append(linear)
     costs = []

@@ -36,6 +36,8 @@ class Tension:
 
     cost: Floats
     """(K,) by how much chi-square falls without the closure, to first order."""
+    covariance: Floats
+    """(K, d, d) of the motion between the ends, the closure itself included, in the frame of b."""
     force: Floats
     """(K, d) information times residual: how hard the closure pulls at b."""
     freedom: Floats
@@ -56,6 +58,7 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
     return Tension(
         cost=(whitened**2 / rest).sum(1),
+        covariance=covariance,
         force=(information @ error[:, axes, None])[:, :, 0],
         freedom=(1.0 / rest - 1.0).max(1),
     )
@@ -124,10 +127,12 @@ def groups(graph: PoseGraph, loops: Ints) -> list[Ints]:
 
 
 def group_costs(graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, places: list[Ints]) -> Floats:
-    """At most how much chi-square each place (G,) costs the rest, beyond what noise within it does.
+    """At most how much chi-square falls without each place (G,), about.
 
-    The members pull as one at their middle one; against them stands at least the way round by another place, or by
-    the odometry, whatever is shorter. The rest may stand firmer still, so a large figure is a reason to look closely.
+    The members pull as one at their middle one. Against them stands at least the way round by another place or by the
+    odometry, whatever is shorter, and at least what of the graph's information on the middle one is left without all
+    of theirs, were there no noise between them. Both say too little, so a large figure is a reason to look closely.
+    What the members pull against each other is added.
     """
     axes = AXES[graph.dimension]
     chain = OdometryChain.of(graph)
@@ -157,7 +162,20 @@ def group_costs(graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, pla
             round_ = round_ + moved @ leg @ np.swapaxes(moved, 1, 2)
         joined = (chain.part[a] == chain.part[a[near]]) & (chain.part[b] == chain.part[b[near]])
         least = np.where(joined, np.minimum(least, _quadratic(force, own + round_)), least)
-    return least
+    at = np.array([place[len(place) // 2] for place in places])
+    legs = np.linalg.inv(information[loops[member]])
+    for here, there in ((graph.b[loops[member]], b[whose]), (graph.a[loops[member]], a[whose])):
+        later = np.maximum(here, there)
+        moved = geometry.adjoint(geometry.between(poses[graph.b[loops[member]]], poses[later]))[:, axes][:, :, axes]
+        legs = legs + moved @ chain.covariance(np.minimum(here, there), later) @ np.swapaxes(moved, 1, 2)
+    soft = np.add.reduceat(back @ np.linalg.inv(legs) @ at_middle, first, axis=0)
+    root = np.swapaxes(np.linalg.cholesky(soft), 1, 2)
+    leverage, turn = np.linalg.eigh(root @ pull.covariance[at] @ np.swapaxes(root, 1, 2))
+    whitened = (np.swapaxes(turn, 1, 2) @ np.linalg.solve(np.swapaxes(root, 1, 2), force[:, :, None]))[:, :, 0]
+    left = (whitened**2 / np.maximum(1.0 - leverage, _ALONE)).sum(1)
+    alone = _quadratic(pull.force[member], np.linalg.inv(information[loops[member]]))
+    among = np.add.reduceat(alone, first) - _quadratic(force, own)
+    return np.minimum(least, left) + np.maximum(among, 0.0)
 
 
 def _quadratic(force: Floats, covariance: Floats) -> Floats:

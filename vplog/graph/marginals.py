@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import geometry
+from vplog.errors import GraphError
 from vplog.graph.build import AXES
 from vplog.graph.factors import as_values
 
@@ -24,15 +25,18 @@ def edge_covariances(
     """Covariance (K, d, d) of a_from_b for these edges of positive weight, after the weighted least squares at `poses`.
 
     In the frame of b, to first order; d = 6, or 3 in the plane. `weighted` is the graph where it has more than the
-    weighted edges. Of the inverse of the information matrix just the
-    blocks that the factorisation touches are computed, from the root of GTSAM's Bayes tree down, and those of every
-    edge are among them (Takahashi et al. 1973; Kaess and Dellaert, RAS 2009, section 3). So all edges of a graph cost
-    about as much as one step of its solution.
+    weighted edges. Of the inverse of the information matrix just the blocks that the factorisation touches are
+    computed, from the root of GTSAM's Bayes tree down, and those of every edge are among them (Takahashi et al. 1973;
+    Kaess and Dellaert, RAS 2009, section 3). So all edges of a graph cost about as much as one step of its solution.
+    Raises GraphError where the poses are not determined.
     """
     graph = factors.graph
     size = len(AXES[graph.dimension])
     values = as_values(geometry.between(poses[:1], poses), graph.dimension)
-    tree = (weighted or factors.weighted(weight)).linearize(values).eliminateMultifrontal()
+    try:
+        tree = (weighted or factors.weighted(weight)).linearize(values).eliminateMultifrontal()
+    except RuntimeError:
+        raise GraphError("The graph leaves its poses too open to say how far. Check the information of its edges.") from None
     ends: dict[int, list[tuple[int, int]]] = {}
     for row, (a, b) in enumerate(zip(graph.a[edges].tolist(), graph.b[edges].tolist(), strict=True)):
         ends.setdefault(a, []).append((row, b))
@@ -49,10 +53,12 @@ def edge_covariances(
         root = np.linalg.inv(conditional.R())
         gain = -root @ conditional.S()
         cross = gain @ separator
-        own = root @ root.T + cross @ gain.T
-        whole = np.block([[own, cross], [cross.T, separator]])
+        inner = len(root)
+        whole = np.empty((size * len(keys), size * len(keys)))
+        whole[:inner, :inner] = root @ root.T + cross @ gain.T
+        whole[:inner, inner:], whole[inner:, :inner], whole[inner:, inner:] = cross, cross.T, separator
         place = {key: slice(k * size, (k + 1) * size) for k, key in enumerate(keys)}
-        for key in keys[: len(root) // size]:
+        for key in keys[: inner // size]:
             for row, other in ends.get(key, ()):
                 if other in place:
                     a, b = (place[key], place[other]) if start[row] == key else (place[other], place[key])
@@ -61,8 +67,8 @@ def edge_covariances(
             child = clique[number]
             below = child.conditional()
             shared = below.keys()[below.R().shape[0] // size :]
-            rows = np.concatenate([np.arange(place[key].start, place[key].stop) for key in shared]).astype(int)
-            ready.append((child, whole[np.ix_(rows, rows)]))
+            rows = (np.array([place[key].start for key in shared], int)[:, None] + np.arange(size)).ravel()
+            ready.append((child, whole[rows[:, None], rows]))
 
     order = _ROTATION_FIRST[graph.dimension]
     aa, ab, bb = (block[:, order][:, :, order] for block in (aa, ab, bb))

@@ -134,7 +134,7 @@ def edge_covariance(
     within, share = _within(covariance, modelled, settings.best_share, most)
     # judged by the surest and the least sure direction of an edge: a sound heading must not hide a vain position
     least, largest = np.median(share[:, 0]), np.median(share[:, -1])
-    if least < settings.best_share:
+    if least < settings.best_share / 2.0:  # what is raised by less than that was as good as believed
         warnings.append(
             f"The odometry's covariance was not believed: it claims {least:.1%} of the drift model's sigma "
             f"({settings.drift_per_metre:.1%} of the distance, {np.degrees(settings.turn_per_metre):.3f} deg/m), which "

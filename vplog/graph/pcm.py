@@ -44,7 +44,7 @@ class PcmSettings(Settings):
     """Branches of the exact search for the largest set, some seconds; the best one so far is taken after that."""
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which the last solve gives up."""
-    tolerance: float = Field(default=1e-9, gt=0)
+    tolerance: float = Field(default=1e-6, gt=0)
     """The last solve has converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:

@@ -28,7 +28,7 @@ _LEFT_OUT = re.compile(r"(VERTEX|EDGE|PARAMS|DATA|ROBOT|FLASER|RAWLASER|TRUEPOSE
 _QUATERNION_OFF = 0.1
 """How far a quaternion's length may be from 1: rounded to one digit passes, another quantity does not."""
 _FURTHEST_M = 1e8
-"""A coordinate beyond it is no place on Earth, in any frame that drives are recorded in (UTM and ECEF stay below 1e7)."""
+"""A coordinate beyond it is no place on earth, in any frame that drives are recorded in (UTM, ECEF: below 1e7)."""
 
 
 class _Layout(NamedTuple):
@@ -66,7 +66,7 @@ class _Lines:
     """Lines of one kind: where they stand, the ids they name, and the text of their numbers."""
 
     line: list[int] = field(default_factory=list)
-    ids: list[tuple[int, ...]] = field(default_factory=list)
+    ids: list[str] = field(default_factory=list)
     numbers: list[str] = field(default_factory=list)
 
 
@@ -93,16 +93,14 @@ def read_g2o(path: Path) -> GraphFile:
     if not edges.line:
         raise GraphError(f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve.")
 
-    seen: dict[int, int] = {}
-    for line, (name,) in zip(vertices.line, vertices.ids, strict=True):
-        if name in seen:
-            raise _at(path, line, f"vertex {name} was already given in line {seen[name]}")
-        seen[name] = line
-    for line, (a, b) in zip(edges.line, edges.ids, strict=True):
-        if a == b:
-            raise _at(path, line, f"an edge joins vertex {a} to itself")
-    known = np.array([name for (name,) in vertices.ids], np.int64)
-    ends = np.array(edges.ids, np.int64)
+    known, ends = _ids(path, vertices, 1)[:, 0], _ids(path, edges, 2)
+    again = _first(np.unique(known, return_index=True)[1], len(known))
+    if again is not None:
+        before = vertices.line[int(np.argmax(known == known[again]))]
+        raise _at(path, vertices.line[again], f"vertex {known[again]} was already given in line {before}")
+    itself = np.flatnonzero(ends[:, 0] == ends[:, 1])
+    if len(itself):
+        raise _at(path, edges.line[itself[0]], f"an edge joins vertex {ends[itself[0], 0]} to itself")
     ids = np.unique(np.concatenate([known, ends.ravel()]))
     a, b = (np.searchsorted(ids, ends[:, side]).astype(np.int32) for side in (0, 1))
 
@@ -146,18 +144,18 @@ def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
             )
         with path.open(encoding="latin-1") as stream:  # every byte is a character: bad ones fail as what they stand for
             for number, line in enumerate(stream, 1):
-                tag, *rest = line.split(None, 1) or ("#",)
+                words = line.split(None, 3)
+                tag = words[0] if words else "#"
                 if tag in ends:
                     named = ends[tag]
-                    words = rest[0].split(None, named) if rest else []
-                    if len(words) <= named:
+                    if len(words) < named + 2:
                         raise _at(path, number, f"{tag} ends too early")
                     found = lines.setdefault(tag, _Lines())
                     found.line.append(number)
-                    found.ids.append(tuple(_id(path, number, word) for word in words[:named]))
-                    found.numbers.append(words[named])
+                    found.ids.extend(words[1 : 1 + named])
+                    found.numbers.append(words[3] if named == 2 else line.split(None, 2)[2])
                 elif tag == "FIX":
-                    fixed += [(number, _id(path, number, word)) for word in (rest[0].split() if rest else ())]
+                    fixed += [(number, _id(path, number, word)) for word in line.split()[1:]]
                 elif tag[0] != "#":
                     if not _LEFT_OUT.match(tag):
                         raise _at(path, number, f"{tag[:30]!r} is no g2o element")
@@ -175,6 +173,22 @@ def _id(path: Path, line: int, word: str) -> int:
     if word.isascii() and word.isdigit() and len(word) < 20 and int(word) <= _MOST_ID:
         return int(word)
     raise _at(path, line, f"{word[:30]!r} is no vertex id; ids are whole numbers from 0 to 2^63 - 1")
+
+
+def _ids(path: Path, lines: _Lines, named: int) -> Ints:
+    """(L, named)."""
+    text = "".join(lines.ids)
+    if not text or (text.isascii() and text.isdigit() and max(map(len, lines.ids)) < 19):  # 18 digits fit for sure
+        return np.array(list(map(int, lines.ids)), np.int64).reshape(-1, named)
+    return np.array(
+        [_id(path, lines.line[row // named], word) for row, word in enumerate(lines.ids)], np.int64
+    ).reshape(-1, named)
+
+
+def _first(kept: Ints, count: int) -> int | None:
+    """The first of `count` rows that is not among those kept."""
+    missing = np.setdiff1d(np.arange(count), kept)
+    return int(missing[0]) if len(missing) else None
 
 
 def _numbers(path: Path, lines: _Lines, columns: int) -> Floats:
