@@ -20,7 +20,7 @@ from vplog.timing import Watch
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Floats, Ints
+    from vplog.data import Ints
     from vplog.results.g2o import GraphFile
 
 
@@ -62,9 +62,7 @@ def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
     return Optimised(file, solution, _record(path, out, method, file, solution, warnings + repairs, watch))
 
 
-def solve_parts(
-    graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints
-) -> tuple[Solution, list[str]]:
+def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints) -> tuple[Solution, list[str]]:
     """The solution of each part (N,) of a graph by itself, put together, and warnings of what was repaired."""
     poses, weight = np.array(graph.world_from_body), np.ones(len(graph.a))
     solutions, warnings = [], []

@@ -240,7 +240,8 @@ def bicocca(place: Path, methods: Sequence[str]) -> Iterator[Figure]:
             }
         ours = facts[methods[0]]["ate_m"]
         best = min(facts[kind]["ate_m"] for kind in methods)
-        yield Figure(f"B25b {threshold}: error of {methods[0]} to that of the best", ours / best, BICOCCA_BAR, True, facts)
+        name = f"B25b {threshold}: error of {methods[0]} to that of the best"
+        yield Figure(name, ours / best, BICOCCA_BAR, True, facts)
         yield Figure(f"B25b {threshold}: error of {methods[0]} to that of the odometry", ours / odometry, 1.0, True)
 
 

@@ -13,6 +13,7 @@ from vplog.evaluate.trajectory import Ate, aligned_error
 if TYPE_CHECKING:
     from vplog.data import Floats, Gps, Ints, Trajectory
 
+
 def local_enu(gps: Gps) -> tuple[Ints, Floats]:
     """Stamps and positions (T, 3) in m east, north and up of the first fix, without fixes that hold no position.
 

@@ -67,6 +67,7 @@ def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
         """Log likelihood, share of true ones, and their probabilities at these scales."""
         variance = s**2 * np.maximum(spread, 0.0) + t**2
         true = log_volume - 0.5 * (error2 / variance + np.log(2.0 * np.pi * variance)).sum(1)
+        sure = np.zeros(len(true))
         least = 1.0 / (2.0 * len(true))  # half a closure, so that no share is 0 or 1
         for _ in range(50):
             odds = np.exp(np.clip(math.log(share / (1.0 - share)) + true - false, -700.0, 700.0))

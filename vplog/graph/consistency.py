@@ -39,7 +39,7 @@ def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None
 
 
 def _planar_errors(a_from_b: Floats, world_from_a: Floats, world_from_b: Floats) -> Floats:
-    """Yaw, x, y (E, 3) of the logarithm of the residual motions: geometry.log of planar poses, at a tenth of the work."""
+    """Yaw, x, y (E, 3) of the logarithm of planar motions: geometry.log at a tenth of the work."""
     yaw, x, y = [], [], []
     for pose in (a_from_b, world_from_a, world_from_b):
         yaw.append(np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
@@ -114,7 +114,11 @@ class OdometryChain:
         # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
         moved = geometry.adjoint(geometry.between(poses[:1], poses))[:, axes][:, :, axes]
         total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
-        return cls(poses, np.cumsum(leads < 0), total, np.diagonal(step, axis1=1, axis2=2), axes)
+        part, variance = (
+            np.cumsum(leads < 0).astype(np.int64),
+            np.asarray(np.diagonal(step, axis1=1, axis2=2), np.float64),
+        )
+        return cls(poses, part, total, variance, axes)
 
     def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
@@ -192,10 +196,10 @@ def far_from_odometry(graph: PoseGraph, probability: float) -> Bools:
 def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
     """The solution, or the odometry poses where the solution bends the odometry more than its noise allows.
 
-    Odometry alone has no residual. Each of the L closures kept can bend it by its 6 (planar: 3) degrees of freedom, and if all are
-    true, the sum of chi-squares over the M odometry edges stays below the 0.999999 quantile of chi-square with
-    6 (3) min(L, M) degrees of freedom. Beyond it either false closures were believed or the noise is far too small: in
-    both cases the poses cannot be trusted.
+    Odometry alone has no residual. Each of the L closures kept can bend it by its 6 (planar: 3) degrees of freedom, and
+    if all are true, the sum of chi-squares over the M odometry edges stays below the 0.999999 quantile of chi-square
+    with 6 (3) min(L, M) degrees of freedom. Beyond it either false closures were believed or the noise is far too
+    small: in both cases the poses cannot be trusted.
     """
     odometry = ~is_loop(graph)
     each = degrees_of_freedom(graph)
@@ -212,8 +216,8 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
         weight=np.where(odometry, 1.0, 0.0),
         error_before=0.0,
         error_after=0.0,
-        reason=f"Odometry was kept: {dof // each} closures bend it to a chi-square of {chi2:.4g} where its noise allows "
-        f"{bound:.4g}, so some are false or the noise is too small.",
+        reason=f"Odometry was kept: {dof // each} closures bend it to a chi-square of {chi2:.4g} where its noise "
+        f"allows {bound:.4g}, so some are false or the noise is too small.",
     )
 
 
@@ -226,7 +230,9 @@ def chi2_quantile(probability: float, dof: int) -> float:
     """
     odd = dof % 2 == 1
     power = np.arange(dof // 2) + (0.5 if odd else 0.0)
-    log_gamma = math.lgamma(power[0] + 1.0) + np.concatenate([[0.0], np.cumsum(np.log(power[1:]))]) if dof > 1 else power
+    log_gamma = power
+    if dof > 1:
+        log_gamma = math.lgamma(power[0] + 1.0) + np.concatenate([[0.0], np.cumsum(np.log(power[1:]))])
 
     def tail(x: float) -> float:
         total = float(np.exp(power * math.log(x / 2.0) - log_gamma - x / 2.0).sum())

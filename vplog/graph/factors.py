@@ -94,7 +94,7 @@ class Factors:
         return result
 
     def loose(self, weight: Floats) -> Ints:
-        """First poses of what no edge of positive weight (E,) joins to pose 0; such parts stay where the graph has them."""
+        """First poses of what no edge of positive weight (E,) joins to pose 0; such parts stay where they are."""
         if not self.piece.any():
             return np.empty(0, np.int64)
         on = weight > 0
@@ -110,7 +110,8 @@ class Factors:
         planar = self.graph.dimension == 2
         noise = gtsam.noiseModel.Isotropic.Sigma(3 if planar else 6, _GAUGE_SIGMA)
         prior = gtsam.PriorFactorPose2 if planar else gtsam.PriorFactorPose3
-        for node, pose in zip(held, as_gtsam(geometry.between(world[:1], world[held]), self.graph.dimension), strict=True):
+        places = as_gtsam(geometry.between(world[:1], world[held]), self.graph.dimension)
+        for node, pose in zip(held, places, strict=True):
             result.add(prior(int(node), pose, noise))
         return result
 

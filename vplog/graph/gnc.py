@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Solution
 from vplog.errors import GraphError
 from vplog.graph.agreement import agreement
 from vplog.graph.build import checked
@@ -35,7 +34,7 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Floats, Ints, PoseGraph
+    from vplog.data import Floats, Ints, PoseGraph, Solution
     from vplog.graph.leave_out import Tension
 
     Bools = NDArray[np.bool_]
@@ -92,7 +91,7 @@ class GncSettings(Settings):
         return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
     def _start(self, graph: PoseGraph, loops: Ints) -> Bools:
-        """Closures (K,) to begin with: those that agree with the odometry or, where it does not lead, with each other."""
+        """Closures (K,) to begin with: those that agree with the odometry or, where it does not lead, each other."""
         part = OdometryChain.of(graph).part
         across = part[graph.a[loops]] != part[graph.b[loops]]
         result = agreement(graph, loops).probability > 0.5

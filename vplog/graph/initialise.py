@@ -9,7 +9,7 @@ import numpy as np
 
 from vplog import geometry
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
-from vplog.graph.factors import anchored, as_array, as_values
+from vplog.graph.factors import anchored, as_array
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph

@@ -101,7 +101,9 @@ def groups(graph: PoseGraph, loops: Ints) -> list[Ints]:
     so on from neighbour to neighbour.
     """
     chain = OdometryChain.of(graph)
-    own = np.median(np.diagonal(np.linalg.inv(informed(graph)[loops]), axis1=1, axis2=2), axis=0)
+    own: Floats = np.asarray(
+        np.median(np.diagonal(np.linalg.inv(informed(graph)[loops]), axis1=1, axis2=2), axis=0), np.float64
+    )
     walked = chain.walked(own)
     first, second = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
     order = np.lexsort((second, first))
@@ -173,7 +175,7 @@ def group_costs(graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, pla
     leverage, turn = np.linalg.eigh(root @ pull.covariance[at] @ np.swapaxes(root, 1, 2))
     whitened = (np.swapaxes(turn, 1, 2) @ np.linalg.solve(np.swapaxes(root, 1, 2), force[:, :, None]))[:, :, 0]
     left = (whitened**2 / np.maximum(1.0 - leverage, _ALONE)).sum(1)
-    alone = _quadratic(pull.force[member], np.linalg.inv(information[loops[member]]))
+    alone = _quadratic(pull.force[member], np.asarray(np.linalg.inv(information[loops[member]]), np.float64))
     among = np.add.reduceat(alone, first) - _quadratic(force, own)
     return np.minimum(least, left) + np.maximum(among, 0.0)
 

@@ -36,7 +36,9 @@ def edge_covariances(
     try:
         tree = (weighted or factors.weighted(weight)).linearize(values).eliminateMultifrontal()
     except RuntimeError:
-        raise GraphError("The graph leaves its poses too open to say how far. Check the information of its edges.") from None
+        raise GraphError(
+            "The graph leaves its poses too open to say how far. Check the information of its edges."
+        ) from None
     ends: dict[int, list[tuple[int, int]]] = {}
     for row, (a, b) in enumerate(zip(graph.a[edges].tolist(), graph.b[edges].tolist(), strict=True)):
         ends.setdefault(a, []).append((row, b))

@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field
 
 from vplog import geometry
-from vplog.data import Solution
 from vplog.graph.build import AXES, checked, informed
 from vplog.graph.clique import largest_clique
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
@@ -24,7 +23,7 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Ints, PoseGraph
+    from vplog.data import Ints, PoseGraph, Solution
 
     Bools = NDArray[np.bool_]
 
@@ -104,7 +103,8 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float) -> Bools:
         other = np.flatnonzero((piece[this + 1 :] == piece[this]).all(1)) + this + 1
         error = geometry.log(geometry.between(displaced[this], displaced[other]))[:, axes]
         walk_a, walk_b = (
-            np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None] * (chain.total[end[other]] - chain.total[end[this]])
+            np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None]
+            * (chain.total[end[other]] - chain.total[end[this]])
             for end in (a, b)
         )
         covariance = noise[this] + noise[other] + walk_b + after[this] @ walk_a @ after[this].T

@@ -36,9 +36,7 @@ def solve_robustly(
     start = initial_poses(factors, np.ones(len(graph.a)), half)
     fit = least_squares(factors, factors.robust(loops, estimator), start, max_iterations, tolerance)
     weight = np.ones(len(graph.a))
-    weight[loops] = [
-        estimator.weight(sigma) for sigma in residual_sigma(graph, fit.world_from_body, loops).tolist()
-    ]
+    weight[loops] = [estimator.weight(sigma) for sigma in residual_sigma(graph, fit.world_from_body, loops).tolist()]
     kept = int((weight[loops] > 0.5).sum())
     end = "converged" if fit.converged else "stopped at the limit"
     return Solution(
