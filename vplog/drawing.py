@@ -43,6 +43,9 @@ def _settle(figure: Figure) -> None:
     figure would differ from one process to the next."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
+    for part in figure.subfigs:
+        x0, y0, x1, y1 = (round(float(value), 4) for value in part.bbox_relative.extents)
+        part.bbox_relative.p0, part.bbox_relative.p1 = (x0, y0), (x1, y1)
     for axes in figure.axes:
         left, bottom, width, height = axes.get_position(original=True).bounds
         axes.set_position((round(left, 4), round(bottom, 4), round(width, 4), round(height, 4)), which="original")

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vplog.places.chow_liu import ChowLiuTree, learn_tree
@@ -46,6 +46,7 @@ def test_recovers_the_tree_that_made_the_samples() -> None:
 
 
 @given(IMAGES)
+@example([{0, 1, 2, 3, 5, 6}, {2, 4}, {0, 1, 3, 4, 5}, {6}])  # words that tell nothing of each other, to rounding
 def test_no_spanning_tree_has_more_information(images: list[set[int]]) -> None:
     occurrence = np.zeros((len(images), 7), bool)
     for row, image in enumerate(images):

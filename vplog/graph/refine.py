@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
+from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, is_loop, residual_sigma
 from vplog.graph.factors import Factors, least_squares
 from vplog.graph.marginals import edge_covariances
@@ -47,8 +48,8 @@ class RefineSettings(Settings):
     least_redundancy: float = Field(default=30.0, gt=0)
     """Degrees of freedom with which the constraints must check the odometry before its noise is judged by them: an
     estimate from 30 is good to a quarter."""
-    most_change: float = Field(default=1e4, ge=1)
-    """The covariance is changed by no more than this factor: a hundredfold sigma."""
+    most_change: float = Field(default=1e6, ge=1)
+    """The covariance is changed by no more than this factor: a thousandfold sigma."""
     max_rounds: int = Field(default=12, ge=1)
     """Rounds after which it gives up; drives take 3-6."""
 
@@ -139,11 +140,15 @@ def _misjudged(
     open of it.
     """
     graph, edges = factors.graph, np.flatnonzero(odometry)
-    open_ = edge_covariances(factors, weight, poses, edges, weighted)
-    size = open_.shape[1]
-    axes = slice(None) if size == 6 else [2, 3, 4]
+    size = 3 if graph.dimension == 2 else 6
+    axes = [2, 3, 4] if graph.dimension == 2 else slice(None)
     information = graph.information[edges][:, axes][:, :, axes]
-    redundancy = size * len(edges) - float(np.einsum("eij,eji->", information, open_))
+    try:
+        open_ = edge_covariances(factors, weight, poses, edges, weighted)
+        redundancy = size * len(edges) - float(np.einsum("eij,eji->", information, open_))
+    except GraphError:
+        # noise so large that rounding decides: all that the constraints could check, so that the next round has less
+        redundancy = float(size * min(np.count_nonzero(weight[~odometry]), len(edges)))
     if redundancy < least_redundancy:
         return 1.0
     chi2 = float((residual_sigma(graph, poses)[edges] ** 2).sum())

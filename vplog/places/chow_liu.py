@@ -94,11 +94,11 @@ def _span(image_start, values, posting_start, postings, times_log):
             if reached[word]:
                 continue
             b, ab = posting_start[word + 1] - posting_start[word], together[word]
-            # N times the mutual information, less what every pair has in common: N ln N
-            information = (
+            # N times the mutual information; rounded logarithms put that of independent words a step below zero
+            information = max(0, (
                 times_log[ab] + times_log[a - ab] + times_log[b - ab] + times_log[N - a - b + ab]
                 - times_log[a] - times_log[N - a] - times_log[b] - times_log[N - b] + times_log[N]
-            )  # fmt: skip
+            ))  # fmt: skip
             if information > best[word]:
                 best[word], parent[word], both[word] = information, node, ab
             if following < 0 or best[word] > best[following]:
