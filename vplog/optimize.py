@@ -35,7 +35,7 @@ class Optimised:
 
 
 def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
-    """Solve the graph of a g2o file and write it with its new poses to `out`, all edges kept, rejected ones too.
+    """Solve the graph of a g2o file and write it with its new poses to `out`, all its edges too.
 
     Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
     where it is. Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
@@ -46,20 +46,27 @@ def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
         file = read_g2o(path)
     graph, ids = file.graph, file.ids
     part = parts(len(ids), graph.a, graph.b)
-    warnings = list(file.warnings)
-    if part.any():
-        firsts = ", ".join(str(ids[np.argmax(part == k)]) for k in range(min(int(part.max()) + 1, 5)))
-        warnings.append(
-            f"The graph is in {int(part.max()) + 1} parts that no edge joins (they begin at {firsts}"
-            f"{', ..' if part.max() > 4 else ''}); each was solved by itself and stays where its first pose is."
-        )
+    warnings = file.warnings + _about_parts(part, ids)
     with watch.stage("solve"):
         solution, repairs = solve_parts(graph, part, optimiser, ids)
-        if part[file.held] == 0 and file.held:
-            solution = _holding(solution, graph, part == 0, file.held)
+        solution = _holding(solution, graph, part == part[file.held], file.held)
     with watch.stage("write"):
         write_g2o(out, graph, solution.world_from_body, ids, file.held)
     return Optimised(file, solution, _record(path, out, method, file, solution, warnings + repairs, watch))
+
+
+def _about_parts(part: Ints, ids: Ints) -> list[str]:
+    """What to say of a graph that is not in one part (N,)."""
+    size = np.bincount(part)
+    first = [str(ids[np.argmax(part == number)]) for number in np.flatnonzero(size > 1)[:5].tolist()]
+    alone = int((size == 1).sum())
+    said = [f"{alone} poses have no edge and stay where they are."] if alone else []
+    if (size > 1).sum() > 1:
+        said.append(
+            f"The graph is in {int((size > 1).sum())} parts that no edge joins (from {', '.join(first)} on"
+            f"{', ..' if (size > 1).sum() > 5 else ''}); each is solved by itself and stays where its first pose is."
+        )
+    return said
 
 
 def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints) -> tuple[Solution, list[str]]:
@@ -81,7 +88,7 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
         )
         alone, repairs = checked(alone)
         solution = keep_odometry_if_worse(alone, optimiser(alone))
-        where = f"Part that begins at {ids[rows[0]]}: " if len(rows) < len(part) else ""
+        where = f"Part from {ids[rows[0]]} on: " if (np.bincount(part) > 1).sum() > 1 else ""
         warnings += [where + text for text in repairs]
         poses[rows], weight[edges] = solution.world_from_body, solution.weight
         solutions.append(replace(solution, reason=where + solution.reason))
@@ -99,7 +106,7 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
 
 
 def _holding(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:
-    """The solution moved as one so that this row is where the graph has it."""
+    """The solution with this part (N,) moved as one so that its row is where the graph has it."""
     poses = np.array(solution.world_from_body)
     poses[part] = graph.world_from_body[row] @ inverse(poses[row]) @ poses[part]
     return replace(solution, world_from_body=poses)

@@ -159,7 +159,8 @@ def outliers(
         yield from _judged(f"{name}, {share:.0%} of the closures random", cases, optimum, methods, bar, share <= 0.8)
     for share in shares:
         cases = [with_strangers(graph, share, seed) for seed in range(seeds)]
-        yield from _judged(f"{name}, random closures added to {share:.0%}", cases, optimum, methods, None, False)
+        # the others take minutes on so many
+        yield from _judged(f"{name}, random closures added to {share:.0%}", cases, optimum, methods[:1], None, False)
     for size in GROUPS:
         for count in (1, 5):
             cases = [with_groups(graph, optimum, count, size, seed) for seed in range(seeds)]

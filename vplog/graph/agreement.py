@@ -36,6 +36,8 @@ class Agreement:
     """The same of the closures."""
     share: float
     """Of true ones among the closures."""
+    log_room: float
+    """Log of the volume that false closures are spread over, in m and rad."""
 
 
 def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
@@ -49,10 +51,11 @@ def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
     over the whole box, nine in ten of them do not pull the scales.
     """
     chain = OdometryChain.of(graph)
+    room = _log_volume(chain.poses[:, :3, 3], graph.dimension)
     known = chain.part[graph.a[loops]] == chain.part[graph.b[loops]]
     probability = np.ones(len(loops))
     if not known.any():
-        return Agreement(probability, 1.0, 1.0, 1.0)
+        return Agreement(probability, 1.0, 1.0, 1.0, room)
     axes = AXES[graph.dimension]
     a, b, measured = graph.a[loops[known]], graph.b[loops[known]], graph.a_from_b[loops[known]]
     error = geometry.log(geometry.between(measured, geometry.between(chain.poses[a], chain.poses[b])))[:, axes]
@@ -61,7 +64,7 @@ def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
     spread, turn = np.linalg.eigh(root @ chain.covariance(a, b) @ np.swapaxes(root, 1, 2))
     error2 = (np.swapaxes(turn, 1, 2) @ (root @ error[:, :, None]))[:, :, 0] ** 2
     log_volume = np.log(np.abs(np.linalg.det(root)))
-    false = -_log_volume(chain.poses[:, :3, 3], graph.dimension)
+    false = -room
 
     def fit(s: float, t: float, share: float) -> tuple[float, float, Floats]:
         """Log likelihood, share of true ones, and their probabilities at these scales."""
@@ -78,16 +81,17 @@ def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
         return float(np.logaddexp(math.log(share) + true, math.log(1.0 - share) + false).sum()), share, sure
 
     step = _COARSE
-    ladder = np.exp(np.arange(math.log(_RANGE[0]), math.log(_RANGE[1]) + 1e-9, math.log(step)))
+    ladder = [_RANGE[0] * step**rung for rung in range(round(math.log(_RANGE[1] / _RANGE[0], step)) + 1)]
     tried = {(s, t): fit(s, t, 0.5) for s in ladder for t in ladder}
     best = max(tried, key=lambda scales: tried[scales][0])
     while step > _FINE:
         step = math.sqrt(step)
         around = [(best[0] * step**i, best[1] * step**j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        tried = {scales: fit(*scales, tried[best][1]) if scales != best else tried[best] for scales in around}
+        inside = [scales for scales in around if all(_RANGE[0] <= one <= _RANGE[1] for one in scales)]
+        tried = {best: tried[best]} | {scales: fit(*scales, tried[best][1]) for scales in inside if scales != best}
         best = max(tried, key=lambda scales: tried[scales][0])
     _, share, probability[known] = tried[best]
-    return Agreement(probability, float(best[0]), float(best[1]), share)
+    return Agreement(probability, float(best[0]), float(best[1]), share, room)
 
 
 def _log_volume(places: Floats, dimension: int) -> float:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog import geometry
 from vplog.data import EdgeKind
+from vplog.errors import GraphError
 from vplog.graph.build import AXES, informed
+from vplog.graph.factors import Factors
+from vplog.graph.marginals import edge_covariances
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +24,7 @@ if TYPE_CHECKING:
     Bools = NDArray[np.bool_]
 
 _SURE = 0.999999
-"""Probability with which odometry as good as its noise says passes keep_odometry_if_worse: 6.2 sigma for one loop."""
+"""Probability with which odometry as good as its noise says passes keep_odometry_if_worse: 4.9 sigma of one edge."""
 
 
 def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:
@@ -196,18 +200,23 @@ def far_from_odometry(graph: PoseGraph, probability: float) -> Bools:
 def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
     """The solution, or the odometry poses where the solution bends the odometry more than its noise allows.
 
-    Odometry alone has no residual. Each of the L closures kept can bend it by its 6 (planar: 3) degrees of freedom, and
-    if all are true, the sum of chi-squares over the M odometry edges stays below the 0.999999 quantile of chi-square
-    with 6 (3) min(L, M) degrees of freedom. Beyond it either false closures were believed or the noise is far too
-    small: in both cases the poses cannot be trusted.
+    Odometry alone has no residual. If all closures that were kept are true, the sum of chi-squares over the odometry
+    edges is chi-square with as many degrees of freedom as the closures check them with: each edge's own, less what
+    the solution leaves open of it (its redundancy; Foerstner 1979). Beyond the 0.999999 quantile either false closures
+    were believed or the noise is far too small: in both cases the poses cannot be trusted.
     """
     odometry = ~is_loop(graph)
-    each = degrees_of_freedom(graph)
-    dof = each * min(int(odometry.sum()), int((solution.weight[~odometry] > 0.5).sum()))
-    if dof == 0:
+    kept = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
+    closures = int((kept[~odometry] > 0).sum())
+    if closures == 0:
         return solution
     chi2 = float((residual_sigma(graph, solution.world_from_body)[odometry] ** 2).sum())
-    bound = chi2_quantile(_SURE, dof)
+    if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
+        return solution
+    try:
+        bound = chi2_quantile(_SURE, max(round(_redundancy(graph, kept, solution.world_from_body, odometry)), 1))
+    except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
+        bound = chi2_quantile(_SURE, degrees_of_freedom(graph) * min(closures, int(odometry.sum())))
     if chi2 <= bound:
         return solution
     return replace(
@@ -216,11 +225,19 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
         weight=np.where(odometry, 1.0, 0.0),
         error_before=0.0,
         error_after=0.0,
-        reason=f"Odometry was kept: {dof // each} closures bend it to a chi-square of {chi2:.4g} where its noise "
+        reason=f"Odometry was kept: {closures} closures bend it to a chi-square of {chi2:.4g} where its noise "
         f"allows {bound:.4g}, so some are false or the noise is too small.",
     )
 
 
+def _redundancy(graph: PoseGraph, weight: Floats, poses: Floats, edges: Bools) -> float:
+    """Degrees of freedom with which the rest of the weighted graph checks these edges (E,)."""
+    rows = np.flatnonzero(edges)
+    left_open = edge_covariances(Factors.of(graph), weight, poses, rows)
+    return degrees_of_freedom(graph) * len(rows) - float(np.einsum("eij,eji->", informed(graph)[rows], left_open))
+
+
+@lru_cache
 def chi2_quantile(probability: float, dof: int) -> float:
     """Value that chi-square with `dof` degrees of freedom stays below with this probability.
 

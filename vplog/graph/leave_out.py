@@ -16,9 +16,11 @@ import numpy as np
 from vplog import geometry
 from vplog.graph.build import AXES, informed
 from vplog.graph.consistency import OdometryChain
-from vplog.graph.marginals import edge_covariances
+from vplog.graph.marginals import edge_covariances, joint_covariance
 
 if TYPE_CHECKING:
+    import gtsam
+
     from vplog.data import Floats, Int32s, Ints, PoseGraph
     from vplog.graph.factors import Factors
 
@@ -40,6 +42,8 @@ class Tension:
     """(K, d, d) of the motion between the ends, the closure itself included, in the frame of b."""
     force: Floats
     """(K, d) information times residual: how hard the closure pulls at b."""
+    log_spread: Floats
+    """(K,) half the log determinant of the covariance of the rest's prediction and the closure's noise together."""
     freedom: Floats
     """(K,) largest noise of the rest's prediction of the closure as a multiple of its own, in variance."""
 
@@ -58,14 +62,29 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
     return Tension(
         cost=(whitened**2 / rest).sum(1),
+        log_spread=-0.5 * (np.linalg.slogdet(information)[1] + np.log(rest).sum(1)),
         covariance=covariance,
         force=(information @ error[:, axes, None])[:, :, 0],
         freedom=(1.0 / rest - 1.0).max(1),
     )
 
 
-def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Floats:
-    """Squared distance (K,) of closures without weight to where the solved graph predicts them, in sigma."""
+def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: gtsam.GaussianBayesTree, loops: Ints) -> float:
+    """By how much chi-square falls without all of a few closures, to first order; `tree` as of marginals.factorised."""
+    size = len(AXES[factors.graph.dimension])
+    error, turned = _errors(factors.graph, poses, loops)
+    information = informed(factors.graph)[loops] * weight[loops, None, None]
+    root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
+    whiten = np.zeros((len(loops) * size, len(loops) * size))
+    for row, matrix in enumerate(root @ turned):
+        whiten[row * size : (row + 1) * size, row * size : (row + 1) * size] = matrix
+    leverage, turn = np.linalg.eigh(whiten @ joint_covariance(factors, tree, poses, loops) @ whiten.T)
+    whitened = turn.T @ (root @ error[:, AXES[factors.graph.dimension], None]).ravel()
+    return float((whitened**2 / np.clip(1.0 - leverage, _ALONE, 1.0)).sum())
+
+
+def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
+    """Squared distance (K,) of closures without weight to where the solved graph has them, in sigma, and log_spread."""
     graph = factors.graph
     axes = AXES[graph.dimension]
     # with next to no weight they are in the factorisation, which then knows their covariance, and change nothing
@@ -75,7 +94,8 @@ def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Fl
     covariance = turned @ edge_covariances(factors, barely, poses, loops) @ np.swapaxes(turned, 1, 2)
     covariance = covariance + np.linalg.inv(informed(graph)[loops])
     error = error[:, axes]
-    return (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+    squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+    return squared, 0.5 * np.linalg.slogdet(covariance)[1]
 
 
 def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
@@ -131,10 +151,9 @@ def groups(graph: PoseGraph, loops: Ints) -> list[Ints]:
 def group_costs(graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, places: list[Ints]) -> Floats:
     """At most how much chi-square falls without each place (G,), about.
 
-    The members pull as one at their middle one. Against them stands at least the way round by another place or by the
-    odometry, whatever is shorter, and at least what of the graph's information on the middle one is left without all
-    of theirs, were there no noise between them. Both say too little, so a large figure is a reason to look closely.
-    What the members pull against each other is added.
+    The members pull as one at their middle one. Against them stands the way round by another place or by the odometry,
+    whatever is shorter, or what of the graph's information on the middle one is left without theirs. Both say too
+    little as a rule, so a large figure is a reason to look closely. What the members pull against each other is added.
     """
     axes = AXES[graph.dimension]
     chain = OdometryChain.of(graph)

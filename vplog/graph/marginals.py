@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from vplog.graph.build import AXES
 from vplog.graph.factors import as_values
 
 if TYPE_CHECKING:
+    import gtsam
+
     from vplog.data import Floats, Ints
     from vplog.graph.factors import Factors
 
@@ -20,7 +22,7 @@ _ROTATION_FIRST = {2: [2, 0, 1], 3: [0, 1, 2, 3, 4, 5]}
 
 
 def edge_covariances(
-    factors: Factors, weight: Floats, poses: Floats, edges: Ints, weighted: Any | None = None
+    factors: Factors, weight: Floats, poses: Floats, edges: Ints, weighted: gtsam.NonlinearFactorGraph | None = None
 ) -> Floats:
     """Covariance (K, d, d) of a_from_b for these edges of positive weight, after the weighted least squares at `poses`.
 
@@ -32,13 +34,7 @@ def edge_covariances(
     """
     graph = factors.graph
     size = len(AXES[graph.dimension])
-    values = as_values(geometry.between(poses[:1], poses), graph.dimension)
-    try:
-        tree = (weighted or factors.weighted(weight)).linearize(values).eliminateMultifrontal()
-    except RuntimeError:
-        raise GraphError(
-            "The graph leaves its poses too open to say how far. Check the information of its edges."
-        ) from None
+    tree = factorised(factors, weighted or factors.weighted(weight), poses)
     ends: dict[int, list[tuple[int, int]]] = {}
     for row, (a, b) in enumerate(zip(graph.a[edges].tolist(), graph.b[edges].tolist(), strict=True)):
         ends.setdefault(a, []).append((row, b))
@@ -79,3 +75,30 @@ def edge_covariances(
     turned = np.swapaxes(moved, 1, 2)
     mixed = moved @ ab
     return bb - mixed - np.swapaxes(mixed, 1, 2) + moved @ aa @ turned
+
+
+def joint_covariance(factors: Factors, tree: gtsam.GaussianBayesTree, poses: Floats, edges: Ints) -> Floats:
+    """Covariance (K d, K d) of a_from_b of a few edges together, each in the frame of its b; `tree` is factorised()."""
+    graph = factors.graph
+    axes, order = AXES[graph.dimension], _ROTATION_FIRST[graph.dimension]
+    size = len(axes)
+    ends = np.stack([graph.a[edges], graph.b[edges]], axis=1)
+    nodes = np.unique(ends).tolist()
+    joint = tree.jointMarginalCovariance(nodes)
+    covariance = np.block([[joint.at(one, other)[np.ix_(order, order)] for other in nodes] for one in nodes])
+    moved = geometry.adjoint(geometry.between(poses[ends[:, 1]], poses[ends[:, 0]]))[:, axes][:, :, axes]
+    change = np.zeros((len(edges) * size, len(covariance)))
+    for row, (a, b) in enumerate(np.searchsorted(nodes, ends).tolist()):
+        part = slice(row * size, (row + 1) * size)
+        change[part, a * size : (a + 1) * size] = -moved[row]
+        change[part, b * size : (b + 1) * size] = np.eye(size)
+    return change @ covariance @ change.T
+
+
+def factorised(factors: Factors, weighted: gtsam.NonlinearFactorGraph, poses: Floats) -> gtsam.GaussianBayesTree:
+    """The graph `weighted`, linear at `poses` (N, 4, 4). Raises GraphError where they are not determined."""
+    values = as_values(geometry.between(poses[:1], poses), factors.graph.dimension)
+    try:
+        return weighted.linearize(values).eliminateMultifrontal()
+    except RuntimeError:
+        raise GraphError("The graph leaves its poses too open to say how far. Check its edges' information.") from None

@@ -296,7 +296,7 @@ def _place(poses: Floats, given: np.ndarray, a: Int32s, b: Int32s, a_from_b: Flo
 
 
 def write_g2o(path: Path, graph: PoseGraph, world_from_body: Floats, ids: Ints | None = None, held: int = 0) -> None:
-    """Vertices at the poses given (N, 4, 4), FIX for row `held`, and the edges; 17 digits, so nothing is lost.
+    """Vertices at the poses given (N, 4, 4), the edges, and FIX for row `held`; 17 digits, so nothing is lost.
 
     `ids` (N,) names the poses, their rows where None. The information matrix is that of the rotation vector, as GTSAM
     reads it, not of g2o's half-angle quaternion.
@@ -308,14 +308,14 @@ def write_g2o(path: Path, graph: PoseGraph, world_from_body: Floats, ids: Ints |
     with replacing(path) as stream:
         for name, row in zip(names.tolist(), _rows(world_from_body, graph.dimension), strict=True):
             stream.write(f"{layout.vertex} {name} {row}\n".encode())
-        if len(world_from_body):
-            stream.write(f"FIX {names[held]}\n".encode())
         edges = zip(
             names[graph.a].tolist(), names[graph.b].tolist(), _rows(graph.a_from_b, graph.dimension),
             information.tolist(), strict=True,
         )  # fmt: skip
         for a, b, row, upper in edges:
             stream.write(f"{layout.edge} {a} {b} {row} {' '.join(map(repr, upper))}\n".encode())
+        if len(world_from_body):  # last: GTSAM 4.3 reads no planar edge that comes after another element
+            stream.write(f"FIX {names[held]}\n".encode())
 
 
 def _rows(poses: Floats, dimension: int) -> list[str]:
