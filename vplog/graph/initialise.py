@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _LINEAR_STEPS = 300
 """Conjugate gradients on a linear problem at most: with the chain as preconditioner they end after a step per loop."""
+_LOST_RAD = np.pi / 3.0
+"""Noise of the heading, rad, beyond which the chain's whole circles may be wrong: half a circle is three sigmas."""
 _LINEAR_TOLERANCE = 1e-4
 """They end at this share of the first residual: what follows corrects far more."""
 
@@ -45,13 +48,16 @@ def _chordal(factors: Factors, weight: Floats) -> Floats:
 def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     """Linear approximation for graph optimisation: Carlone, Aragues, Castellanos, Bona, IJRR 2014 (LAGO).
 
-    The odometry chain is the spanning tree: along it turns are summed without wrapping, so each other edge tells the
-    turn between its ends but for whole circles, and their number is the one that the chain is nearest to (section 4).
-    Then orientations are a linear problem, and with them known, positions too.
+    Along a spanning tree turns are summed without wrapping, so each other edge tells the turn between its ends but for
+    whole circles, and their number is the one that the tree is nearest to (section 4). The tree is the odometry chain,
+    or where that is so long that it no longer knows its heading, the one of least noise. Then orientations are a linear
+    problem, and with them known, positions too.
     """
     graph = factors.graph
     turn = np.arctan2(graph.a_from_b[:, 1, 0], graph.a_from_b[:, 0, 0])
     yaw = np.unwrap(np.arctan2(chain[:, 1, 0], chain[:, 0, 0]))
+    if (1.0 / graph.information[~is_loop(graph), 2, 2]).sum() > _LOST_RAD**2:
+        yaw = _turned_least(graph, weight, turn, yaw)
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
     yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None])[:, 0]
     zero = np.zeros(len(yaw))
@@ -63,6 +69,32 @@ def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
         return poses
     poses[:, :2, 3] = _spread(graph, weight * firmness, shift, poses[:, :2, 3])
     return poses
+
+
+def _turned_least(graph: PoseGraph, weight: Floats, turn: Floats, yaw: Floats) -> Floats:
+    """Headings (N,) rad along the tree of edges over which each has gathered least noise (Dijkstra 1959)."""
+    n = len(yaw)
+    used = np.flatnonzero(weight > 0)
+    ends = np.concatenate([graph.a[used], graph.b[used]])
+    order = np.argsort(ends, kind="stable")
+    first = np.searchsorted(ends[order], np.arange(n + 1)).tolist()
+    other = np.concatenate([graph.b[used], graph.a[used]])[order].tolist()
+    step = np.concatenate([turn[used], -turn[used]])[order].tolist()
+    noise = np.tile(1.0 / (weight[used] * graph.information[used, 2, 2]), 2)[order].tolist()
+    result, least = yaw.tolist(), [np.inf] * n
+    least[0] = 0.0
+    waiting = [(0.0, 0)]
+    while waiting:
+        gathered, node = heappop(waiting)
+        if gathered > least[node]:
+            continue
+        for edge in range(first[node], first[node + 1]):
+            there, total = other[edge], gathered + noise[edge]
+            if total < least[there]:
+                least[there] = total
+                result[there] = result[node] + step[edge]
+                heappush(waiting, (total, there))
+    return np.array(result)
 
 
 def _placed(graph: PoseGraph, firmness: Floats, shift: Floats) -> Floats:
