@@ -9,6 +9,7 @@ import numpy as np
 
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
+from vplog.graph.cross_check import cross_checked
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.satellites import fixes_on
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Closures, Ints, Keyframes, Odometry, PoseGraph, Trajectory
+    from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.noise import NoiseSettings
     from vplog.graph.refine import Refined, RefineSettings
     from vplog.graph.satellites import Fixes, GpsSettings
@@ -31,6 +33,8 @@ class BackEnd(Protocol):
     def noise(self) -> NoiseSettings: ...
     @property
     def solve(self) -> OptimiserSettings: ...
+    @property
+    def cross_check(self) -> CrossCheckSettings: ...
     @property
     def refine(self) -> RefineSettings: ...
     @property
@@ -57,6 +61,7 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
     solution = consistency.keep_odometry_if_worse(graph, settings.solve(graph))
+    solution = cross_checked(graph, solution, settings.cross_check)
     fixes = fixes_on(log.gps(), odometry, keyframes, settings.gps) if settings.gps.use else None
     refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
     return Solved(

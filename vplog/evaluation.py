@@ -6,6 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vplog import logs
 from vplog.data import Trajectory
 from vplog.errors import ResultError, TruthError
@@ -18,6 +20,8 @@ from vplog.results import run_record, tables
 def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -> dict[str, Any]:
     """ATE and RPE of odometry and result, and the closures' precision and recall. `truth` is a TUM file or `gps`.
 
+    Of several drives in one folder the ATE of each by itself, and of each map as one trajectory.
+
     Raises TruthError or ResultError with one line.
     """
     record = run_record.read_run_json(folder / "run.json")
@@ -25,6 +29,8 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
         raise ResultError(
             f"The run in {folder} did not finish. Run it again: vplog run {record.get('log')} -o {folder}"
         )
+    if "maps" in record:
+        return _joint(folder, record, truth)
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     if truth == "gps":
@@ -42,6 +48,31 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
         "rpe_after": asdict(trajectory.rpe(after, known)),
         "closures": asdict(closures.score_closures(keyframes, ledger, known, stops)),
     }
+
+
+def _joint(folder: Path, record: dict[str, Any], truth: str) -> dict[str, Any]:
+    """Each drive by itself, and each map of several as one trajectory, all against a truth in the drives' clock."""
+    if truth == "gps":
+        raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
+    known = read_truth(Path(truth))
+    maps = []
+    for found in _recorded(record, folder, list, "maps"):
+        names = _recorded(found, folder, list, "drives")
+        joined = found.get("reason") is not None
+        file = "joint_trajectory.parquet" if joined else "trajectory.parquet"
+        parts = [tables.read_trajectory(folder / name / file) for name in names]
+        stamps, rows = np.unique(np.concatenate([after.stamp_ns for after, _ in parts]), return_index=True)
+        whole = Trajectory(stamps, np.concatenate([after.world_from_body for after, _ in parts])[rows])
+        own = [
+            {
+                "drive": name,
+                "ate_before": asdict(trajectory.ate(Trajectory(odometry.stamp_ns, odometry.odom_from_body), known)),
+                "ate_after": asdict(trajectory.ate(after, known)),
+            }
+            for name, (after, odometry) in zip(names, parts, strict=True)
+        ]
+        maps.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known))})
+    return {"truth": truth, "maps": maps}
 
 
 def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:

@@ -209,7 +209,10 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
     kept = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
     closures = int((kept[~odometry] > 0).sum())
     if closures == 0:
-        return solution
+        if odometry.all():
+            return solution
+        none = f"Odometry was kept: none of the {int((~odometry).sum())} closures agrees with it. {solution.reason}"
+        return replace(solution, world_from_body=odometry_chain(graph)[0], reason=none)
     chi2 = float((residual_sigma(graph, solution.world_from_body)[odometry] ** 2).sum())
     if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
         return solution

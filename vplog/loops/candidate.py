@@ -77,14 +77,17 @@ class Row:
     reverse_inliers: int = -1
 
 
-def check_queries(drive: Drive, match: int, queries: Sequence[int]) -> list[Row]:
-    """The queries that were proposed for one map frame, whose landmarks are made once, if at all."""
-    settings, camera = drive.settings, drive.camera
-    theirs = drive.features(match)
+def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[int]) -> list[Row]:
+    """The queries of one drive that were proposed for one frame of a drive before it, or of the same one.
+
+    The frame's landmarks are made once, if at all.
+    """
+    settings = later.settings
+    theirs = earlier.features(match)
     known = None
     rows = []
     for query in queries:
-        own = drive.features(query)
+        own = later.features(query)
         few = first_matches(own, theirs, settings.matching, settings.min_matches)
         if few is not None:
             rows.append(Row(few, 0, Pose(Verdict.TOO_FEW_MATCHES, 0, 0.0)))
@@ -92,35 +95,37 @@ def check_queries(drive: Drive, match: int, queries: Sequence[int]) -> list[Row]
         mine, found = match_features(own, theirs, settings.matching)
         if len(mine) < settings.min_matches:
             rows.append(Row(len(mine), 0, Pose(Verdict.TOO_FEW_MATCHES, 0, 0.0)))
-        elif camera.matrix is None:
+        elif later.camera.matrix is None or earlier.camera.matrix is None:
             pose = verify_epipolar.solve(
                 own.points[mine], theirs.points[found], own.width, own.height, settings.epipolar
             )
             rows.append(Row(len(mine), 0, pose))
         else:
             if known is None:
-                known = _landmarks(drive, match)
-            row = _check_metric(drive, own, mine, found, known, settings.metric)
-            rows.append(_with_direction(drive, row, own, theirs, mine, found))
+                known = _landmarks(earlier, match)
+            row = _check_metric(later, own, mine, found, known, earlier.stereo, settings.metric)
+            rows.append(_with_direction(later, earlier, row, own, theirs, mine, found))
     return rows
 
 
-def check_back(drive: Drive, query: int, matches: Sequence[int], rows: Sequence[Row], share: float) -> list[Row]:
+def check_back(
+    later: Drive, earlier: Drive, query: int, matches: Sequence[int], rows: Sequence[Row], share: float
+) -> list[Row]:
     """The believed rows of one query with what the query's own landmarks say of them.
 
     `share` is the calibration's, by which both ways may be bent. Where the query has too few landmarks, one way has to
     do, and the row keeps `reverse_inliers` -1.
     """
-    known = _landmarks(drive, query)
+    known = _landmarks(later, query)
     # where and how far apart the views are is decided already; what is asked is only whether the same pose comes out
-    lenient = drive.settings.metric.model_copy(update=_ANY_POSE)
+    lenient = later.settings.metric.model_copy(update=_ANY_POSE)
     result = []
     for match, row in zip(matches, rows, strict=True):
         if row.pairs is None:
             raise ValueError("a row without a pose was to be checked the other way round")
         mine, found = row.pairs
-        back = _check_metric(drive, drive.features(match), found, mine, known, lenient)
-        if back.landmarks < drive.settings.metric.min_inliers:
+        back = _check_metric(earlier, earlier.features(match), found, mine, known, later.stereo, lenient)
+        if back.landmarks < later.settings.metric.min_inliers:
             result.append(row)
         else:
             result.append(replace(row, pose=_of_both(row.pose, back.pose, share), reverse_inliers=back.pose.inliers))
@@ -133,9 +138,16 @@ def _landmarks(drive: Drive, row: int) -> Landmarks:
 
 
 def _check_metric(
-    drive: Drive, own: Features, mine: np.ndarray, found: np.ndarray, known: Landmarks, metric: MetricSettings
+    drive: Drive,
+    own: Features,
+    mine: np.ndarray,
+    found: np.ndarray,
+    known: Landmarks,
+    stereo: bool,
+    metric: MetricSettings,
 ) -> Row:
-    """Features `mine` (K,) of one frame against the landmarks of `found` (K,) in the other."""
+    """Features `mine` (K,) of one frame of `drive` against the landmarks of `found` (K,) in the other frame, whose
+    depths, if it has any, are of a stereo pair or not."""
     settings, camera = drive.settings, drive.camera
     rays = undistort.rays(camera, own.points[mine])
     usable = known.known[found] & np.isfinite(rays).all(axis=1)
@@ -158,25 +170,26 @@ def _check_metric(
     )
     if pose.verdict is not Verdict.ACCEPTED:
         return Row(matches, count, pose)
-    scale = ("stereo" if drive.stereo else "depth") if known.from_depth else "odometry"
+    scale = ("stereo" if stereo else "depth") if known.from_depth else "odometry"
     return Row(matches, count, pose, scale, (mine.astype(np.int32), found.astype(np.int32)))
 
 
 def _with_direction(
-    drive: Drive, row: Row, own: Features, theirs: Features, mine: np.ndarray, found: np.ndarray
+    later: Drive, earlier: Drive, row: Row, own: Features, theirs: Features, mine: np.ndarray, found: np.ndarray
 ) -> Row:
     """The row with turn and direction, where that is asked for and metres are what it lacks."""
-    settings = drive.settings
+    settings = later.settings
     if not settings.direction.keep or row.pose.verdict not in (Verdict.DEGENERATE_MOTION, Verdict.TOO_FEW_LANDMARKS):
         return row
-    query, match = (undistort.rays(drive.camera, f.points[r]) for f, r in ((own, mine), (theirs, found)))
+    query = undistort.rays(later.camera, own.points[mine])
+    match = undistort.rays(earlier.camera, theirs.points[found])
     good = np.isfinite(query).all(axis=1) & np.isfinite(match).all(axis=1)
     pose = verify_direction.solve(
         row.pose.verdict,
         query[good],
         match[good],
         own.points[mine[good]] / [own.width, own.height],
-        drive.camera,
+        later.camera,
         settings.landmarks.pixel_sigma,
         settings.metric.systematic_px,
         settings.direction,

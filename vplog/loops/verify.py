@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     FeaturesOf = Callable[[int], Features]
     Progress = Callable[[int, int], None]
 
-__all__ = ["VerifySettings", "verify"]
+__all__ = ["Drive", "VerifySettings", "drive_of", "verify", "verify_between"]
 _LOG = logging.getLogger(__name__)
 _SUSPICIOUS_SHARE = 0.05
 """Disagreement of camera and odometry that is worth a word: five times a careful calibration's error."""
@@ -42,35 +42,57 @@ def verify(
     progress: Progress | None = None,
     baseline_m: float | None = None,
 ) -> Closures:
-    """The ledger of `proposals`, one row each, in their order.
+    """The ledger of the `proposals` of one drive, one row each, in their order: `drive_of`, then `verify_between`."""
+    drive = drive_of(keyframes, camera, features, settings, baseline_m)
+    return verify_between(proposals, drive, drive, threads, progress)
 
-    `features` gives the features of a keyframe row and is called from any thread. `progress(done, total)` counts
-    candidates and is called from the caller's thread. The result does not depend on `threads`. Candidates are worked
-    through by map frame, whose landmarks are made once, and only when some query shares enough features with it; those
-    believed are then looked at the other way round, by query. `baseline_m` says that the features' depths are those of
-    a stereo pair with this baseline, whose error is in the disparity.
 
-    Raises LogError for a calibrated camera with an unknown distortion model.
+def drive_of(
+    keyframes: Keyframes,
+    camera: Camera,
+    features: FeaturesOf,
+    settings: VerifySettings,
+    baseline_m: float | None = None,
+) -> Drive:
+    """A drive as its candidates are checked.
+
+    `features` gives the features of a keyframe row and is called from any thread. `baseline_m` says that the features'
+    depths are those of a stereo pair with this baseline, whose error is in the disparity. Raises LogError for a
+    calibrated camera with an unknown distortion model.
     """
-    total = len(proposals.query)
     if camera.matrix is not None:
         focal_px = undistort.focal_px(camera)  # refuse an unknown lens before the work, not within it
         if baseline_m is not None:
             stereo = for_stereo(settings.landmarks, focal_px, baseline_m)
             settings = settings.model_copy(update={"landmarks": stereo})
-    drive = Drive(keyframes, camera, features, settings, baseline_m is not None)
+    return Drive(keyframes, camera, features, settings, baseline_m is not None)
+
+
+def verify_between(
+    proposals: Proposals, later: Drive, earlier: Drive, threads: int = 1, progress: Progress | None = None
+) -> Closures:
+    """The ledger of proposals whose queries are rows of `later` and whose matches are rows of `earlier`, in their order.
+
+    Both may be the same drive. `progress(done, total)` counts candidates and is called from the caller's thread. The
+    result does not depend on `threads`. Candidates are worked through by map frame, whose landmarks are made once, and
+    only when some query shares enough features with it; those believed are then looked at the other way round.
+    """
+    total = len(proposals.query)
 
     def check(match: int, queries: list[int]) -> list[Row]:
         cv2.setNumThreads(1)  # one candidate, one thread; the pool is the only parallelism
-        return check_queries(drive, match, queries)
+        return check_queries(later, earlier, match, queries)
 
     def back(query: int, matches: list[int], believed: list[Row]) -> list[Row]:
         cv2.setNumThreads(1)
-        return check_back(drive, query, matches, believed, share)
+        return check_back(later, earlier, query, matches, believed, share)
 
     rows: dict[int, Row] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        share = _calibration_share(drive, pool, check) if camera.matrix is not None and total else 0.0
+        share = 0.0
+        if total and later.camera.matrix is not None and earlier.camera.matrix is not None:
+            drives = [later] if later is earlier else [later, earlier]
+            share = max(_calibration_share(drive, pool) for drive in drives)
         groups = _by(proposals.match, proposals.query, np.arange(total))
         matches = [int(proposals.match[group[0]]) for group in groups]
         queries = [proposals.query[group].tolist() for group in groups]
@@ -78,7 +100,7 @@ def verify(
             rows.update(zip(group.tolist(), found, strict=True))
             if progress is not None:
                 progress(len(rows), total)
-        if settings.both_ways:
+        if later.settings.both_ways:
             believed = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
             groups = _by(proposals.query, proposals.match, believed)
             queries = [int(proposals.query[group[0]]) for group in groups]
@@ -86,7 +108,7 @@ def verify(
             one_way = [[rows[at] for at in group.tolist()] for group in groups]
             for group, found in zip(groups, pool.map(back, queries, matches, one_way), strict=True):
                 rows.update(zip(group.tolist(), found, strict=True))
-    return _ledger(proposals, [rows[at] for at in range(total)], drive, share)
+    return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, share)
 
 
 def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
@@ -95,8 +117,13 @@ def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
     return np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(rows) else []
 
 
-def _calibration_share(drive: Drive, pool: Executor, check: Callable[[int, list[int]], list[Row]]) -> float:
+def _calibration_share(drive: Drive, pool: Executor) -> float:
     """By what share the camera's rotations over turning pairs disagree with the odometry's."""
+
+    def check(match: int, queries: list[int]) -> list[Row]:
+        cv2.setNumThreads(1)
+        return check_queries(drive, drive, match, queries)
+
     keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
     pairs = turning_pairs(keyframes, settings)
     turns = pool.map(check, pairs[:, 0].tolist(), [[later] for later in pairs[:, 1].tolist()])
@@ -104,7 +131,9 @@ def _calibration_share(drive: Drive, pool: Executor, check: Callable[[int, list[
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
     driven = geometry.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
-    seen = np.array([_of_body(found, camera) for at in good if (found := poses[at].match_from_query) is not None])
+    seen = np.array(
+        [_of_body(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
+    )
     share = rotation_share(driven, seen, settings)
     if share > _SUSPICIOUS_SHARE:
         _LOG.warning(
@@ -115,26 +144,27 @@ def _calibration_share(drive: Drive, pool: Executor, check: Callable[[int, list[
     return share
 
 
-def _of_body(match_from_query: Floats, camera: Camera) -> Floats:
-    """A motion of the camera as a motion of the body."""
-    return camera.body_from_camera @ match_from_query @ geometry.inverse(camera.body_from_camera)
+def _of_body(match_from_query: Floats, query: Camera, match: Camera) -> Floats:
+    """The pose of the query's camera in the match's as that of the bodies."""
+    return match.body_from_camera @ match_from_query @ geometry.inverse(query.body_from_camera)
 
 
-def _ledger(proposals: Proposals, rows: list[Row], drive: Drive, share: float) -> Closures:
-    """The columns of the ledger; poses and their information moved from the camera to the body."""
-    count, camera = len(rows), drive.camera
+def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive, share: float) -> Closures:
+    """The columns of the ledger; poses and their information moved from the cameras to the bodies."""
+    count, camera = len(rows), later.camera
     pose, information = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
     body_from_camera = geometry.adjoint(camera.body_from_camera)
     camera_from_body = geometry.adjoint(geometry.inverse(camera.body_from_camera))
-    twist, stamp_sigma_s = body_twists(drive.keyframes), drive.settings.calibration.stamp_sigma_s
+    twists = [body_twists(drive.keyframes) for drive in (earlier, later)]
+    stamp_sigma_s = later.settings.calibration.stamp_sigma_s
     for at, row in enumerate(rows):
         found, covariance = row.pose.match_from_query, row.pose.covariance
         if found is None:
             continue
-        pose[at] = _of_body(found, camera)
+        pose[at] = _of_body(found, camera, earlier.camera)
         if covariance is not None:
             total = body_from_camera @ (covariance + motion_covariance(found, share)) @ body_from_camera.T
-            speeds = twist[proposals.match[at]], twist[proposals.query[at]]
+            speeds = twists[0][proposals.match[at]], twists[1][proposals.query[at]]
             known = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
             information[at] = (known + known.T) / 2.0
         elif row.pose.information is not None:  # turn and direction alone

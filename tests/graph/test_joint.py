@@ -1,0 +1,96 @@
+"""Drives that know nothing of each other's start end in one map where closures join them, and only there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vplog import geometry
+from vplog.data import EdgeKind, Trajectory
+from vplog.evaluate.trajectory import ate
+from vplog.graph.joint import Between, Drive, JoinSettings, join
+from vplog.graph.refine import RefineSettings
+from vplog.graph.solve import GncSettings
+
+from . import drive as drives
+
+SHIFT = geometry.exp(np.array([0.1, -0.2, 2.0, 30.0, 10.0, -3.0]))
+CLOSURE = np.diag(1.0 / drives.CLOSURE_SIGMA**2)
+
+
+def lap(seed: int) -> tuple[Drive, np.ndarray]:
+    ring = drives.ring(80, loops=10, seed=seed)
+    graph = ring.graph
+    return Drive(graph, np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind])), ring.true
+
+
+def moved(drive: Drive, by: np.ndarray) -> Drive:
+    return replace(drive, graph=replace(drive.graph, world_from_body=by @ drive.graph.world_from_body))
+
+
+def between(later: int, earlier: int, true: list[np.ndarray], count: int, seed: int, false: int = 0) -> Between:
+    random = np.random.default_rng(seed)
+    query = np.sort(random.choice(len(true[later]), count, replace=False))
+    match = np.array([np.linalg.norm(true[earlier][:, :3, 3] - true[later][q, :3, 3], axis=1).argmin() for q in query])
+    z = geometry.between(true[earlier][match], true[later][query])
+    z = z @ geometry.exp(random.normal(size=(count, 6)) * drives.CLOSURE_SIGMA)
+    z[:false] = z[:false] @ geometry.exp(random.normal(size=(false, 6)) * [0.1, 0.1, 0.5, 4.0, 4.0, 0.3])
+    return Between(
+        later, earlier, query, match, z, np.broadcast_to(CLOSURE, (count, 6, 6)).copy(), np.zeros(count, bool)
+    )
+
+
+def joint_error(poses: list[np.ndarray], true: list[np.ndarray]) -> float:
+    both = np.concatenate(poses), np.concatenate(true)
+    stamps = np.arange(len(both[0]), dtype=np.int64) * 10**9
+    return ate(Trajectory(stamps, both[0]), Trajectory(stamps, both[1])).rmse_m
+
+
+@pytest.mark.parametrize("false", [0, 6])
+def test_two_drives_become_one_map(false: int) -> None:
+    (first, true_first), (second, true_second) = lap(1), lap(2)
+    true = [true_first, true_second]
+    ties = between(1, 0, true, 20, seed=3, false=false)
+    found = join([first, moved(second, SHIFT)], [ties], GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0, 1)]
+    assert found.weight[0][:false].sum() == 0
+    assert found.weight[0][false:].sum() >= 18 - false
+    assert joint_error(found.world_from_body, true) < 0.3
+    np.testing.assert_allclose(found.world_from_body[0][0], first.graph.world_from_body[0])
+
+
+def test_a_drive_that_joins_nothing_is_left_as_it_is() -> None:
+    (first, true_first), (second, true_second), (third, true_third) = lap(1), lap(2), lap(3)
+    true = [true_first, true_second, true_third]
+    third = moved(third, SHIFT)
+    ties = [between(1, 0, true, 10, 0), between(2, 0, true, 6, 1, false=6), between(2, 1, true, 2, 2)]
+    found = join([first, second, third], ties, GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0, 1), (2,)]
+    np.testing.assert_array_equal(found.world_from_body[2], third.graph.world_from_body)
+    assert found.weight[1].sum() == found.weight[2].sum() == 0
+    assert np.isnan(found.residual[1]).all()
+    assert list(found.apart) == [1]
+
+
+def test_a_chain_of_drives_is_joined_through_the_middle_one() -> None:
+    laps = [lap(seed) for seed in (1, 2, 3)]
+    true = [one for _, one in laps]
+    ties = [between(1, 0, true, 10, 0), between(2, 1, true, 10, 1)]
+    found = join(
+        [drive if at == 0 else moved(drive, SHIFT) for at, (drive, _) in enumerate(laps)],
+        ties,
+        GncSettings(),
+        JoinSettings(),
+        RefineSettings(),
+    )
+    assert found.maps == [(0, 1, 2)]
+    assert joint_error(found.world_from_body, true) < 0.3
+
+
+def test_no_ties_no_maps() -> None:
+    first, _ = lap(1)
+    found = join([first, first], [], GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0,), (1,)]
+    assert found.solved == {}

@@ -1,0 +1,105 @@
+"""Several drives in one map, on the small drive cut in two and on one from elsewhere."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from vplog import geometry
+from vplog.demo import SMALL, make_drive
+from vplog.evaluate.truth import read_truth
+from vplog.evaluation import evaluate
+from vplog.joint import run_joint
+from vplog.pipeline import load_pipeline
+from vplog.results import tables
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+
+QUICK = ("features.max_features=600", "library.size=12", "pictures.closures=0", "pictures.megapixels=0")
+
+
+def cut(log: Path, at_ns: int, folder: Path) -> list[Path]:
+    """The messages of a log before and from a time on, in a file each; both know how the camera is mounted."""
+    files = [folder / "before.mcap", folder / "after.mcap"]
+    with log.open("rb") as stream, files[0].open("wb") as one, files[1].open("wb") as other:
+        writers = [Writer(one), Writer(other)]
+        channels: list[dict[int, int]] = [{}, {}]
+        for writer in writers:
+            writer.start(profile="ros2")
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            for part, writer in enumerate(writers):
+                if channel.topic != "/tf_static" and (message.log_time >= at_ns) != bool(part):
+                    continue
+                if channel.id not in channels[part]:
+                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[part][channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+                writer.add_message(channels[part][channel.id], message.log_time, message.data, message.publish_time)
+        for writer in writers:
+            writer.finish()
+    return files
+
+
+@pytest.fixture(scope="module")
+def joint(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("joint")
+    parts = cut(drive.log, int(drive.stamp_ns[-14]), folder)
+    elsewhere = make_drive(folder / "elsewhere", SMALL.model_copy(update={"seed": SMALL.seed + 1})).log
+    run_joint([*parts, elsewhere], folder / "out", load_pipeline("default", QUICK), threads=2)
+    return folder / "out"
+
+
+def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_not(joint: Path, drive: Drive) -> None:
+    record = json.loads((joint / "run.json").read_text())
+    assert record["finished"] is True
+    assert [found["drives"] for found in record["maps"]] == [["before", "after"], ["drive"]]
+    ties = {(tie["query_drive"], tie["match_drive"]): tie for tie in record["joins"]}
+    assert ties["after", "before"]["kept"] >= 3
+    assert ties["drive", "before"]["kept"] == ties["drive", "after"]["kept"] == 0
+    assert any("drive joins no other drive" in warning for warning in record["warnings"])
+
+    known = read_truth(drive.truth)
+    poses = {name: tables.read_keyframes(joint / name / "joint_keyframes.parquet") for name in ("before", "after")}
+    first, _ = poses["before"]
+    true_first = geometry.interpolate_at(known.stamp_ns, known.world_from_body, first.stamp_ns[:1])[0]
+    for keyframes, world_from_body in poses.values():
+        true = geometry.interpolate_at(known.stamp_ns, known.world_from_body, keyframes.stamp_ns)
+        away = geometry.between(poses["before"][1][0], world_from_body)[:, :3, 3]
+        away -= geometry.between(true_first, true)[:, :3, 3]
+        assert np.linalg.norm(away, axis=1).max() < 1.5
+    assert not (joint / "drive" / "joint_keyframes.parquet").exists()
+    assert not [path.name for path in joint.rglob(".*")]
+
+
+def test_the_ledger_names_both_drives(joint: Path) -> None:
+    table = pq.read_table(joint / "joins.parquet").to_pylist()
+    assert {(row["query_drive"], row["match_drive"]) for row in table} <= {
+        ("after", "before"), ("drive", "before"), ("drive", "after"),
+    }  # fmt: skip
+    kept = [row for row in table if row["weight"] == 1]
+    assert len(kept) >= 3
+    assert all(row["verdict"] == "accepted" and row["shared_references"] for row in kept)
+
+
+def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Callable[..., Said]) -> None:
+    found = evaluate(joint, str(drive.truth))
+    assert [len(one["drives"]) for one in found["maps"]] == [2, 1]
+    assert found["maps"][0]["ate_after"]["rmse_m"] < 1.5
+    assert "as one trajectory" in verb("evaluate", joint, "--truth", drive.truth).out
+    assert "several drives" in verb("evaluate", joint, "--truth", "gps").error
+
+
+def test_gps_of_several_drives_is_refused(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    assert "one drive at a time" in verb("run", drive.log, drive.log, "-o", tmp_path, "--gps").error

@@ -1,0 +1,59 @@
+"""A robust solve held against others where it had to reject much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_chain
+from vplog.graph.dcs import DcsSettings
+from vplog.graph.geman_mcclure import GemanMcClureSettings
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from vplog.data import PoseGraph, Solution
+
+
+class CrossCheckSettings(Settings):
+    """When the solve of verified closures is not believed on its own."""
+
+    use: bool = True
+    """Whether to ask other methods at all."""
+    rejected_share: float = Field(default=0.1, ge=0, le=1)
+    """Share of the closures that the solve may reject unasked: verification lets few false ones through, and a true one
+    in a hundred is lost by design."""
+    rejected: int = Field(default=3, ge=0)
+    """And so many at least, as a share of few says nothing."""
+
+
+def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSettings) -> Solution:
+    """The solution, or the odometry poses where other methods find that the closures as a body contradict it.
+
+    A method that decides from the start which closures to believe may keep just those that a false story needs, and
+    bend the odometry no further than its noise allows. Kernels that weigh all of them alike tell that story whole: so
+    where much was rejected, and the odometry is bent too far by all that each of two kernels (DCS, Geman-McClure)
+    believes, the closures speak against the odometry and not against each other.
+    """
+    loops = is_loop(graph)
+    kept, count = int((solution.weight[loops] > 0.5).sum()), int(loops.sum())
+    if not settings.use or kept == 0 or count - kept < max(settings.rejected, settings.rejected_share * count):
+        return solution
+    said = []
+    for kernel in (DcsSettings(), GemanMcClureSettings()):
+        other = kernel(graph)
+        if keep_odometry_if_worse(graph, other) is other:
+            return solution
+        said.append(f"{kernel.kind} {int((other.weight[loops] > 0.5).sum())}")
+    return replace(
+        solution,
+        world_from_body=odometry_chain(graph)[0],
+        weight=np.where(loops, 0.0, 1.0),
+        error_before=0.0,
+        error_after=0.0,
+        reason=f"Odometry was kept: the methods disagree about the {count} verified closures. The solve keeps {kept}, "
+        f"{' and '.join(said)}, and these bend the odometry further than its noise allows: as a body the closures are "
+        "false, or the noise is too small.",
+    )

@@ -1,0 +1,195 @@
+"""Several drives in one graph: which of them closures join, and where each then lies in their common map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from vplog import geometry
+from vplog.data import EdgeKind, PoseGraph
+from vplog.graph.build import parts
+from vplog.graph.consistency import keep_odometry_if_worse, residual_sigma
+from vplog.graph.refine import RefineSettings, refine
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Floats, Ints
+    from vplog.graph.refine import Refined
+    from vplog.stages import Optimiser
+
+    Bools = NDArray[np.bool_]
+
+
+class JoinSettings(Settings):
+    """When closures between two drives are enough to put them into one map."""
+
+    least_closures: int = Field(default=3, ge=1)
+    """Closures between two drives that the solve must keep. Nothing but another one can speak against a closure that
+    alone joins two drives; a second may be of the same mistake, seldom a third at another keyframe."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One drive as its own closures leave it."""
+
+    graph: PoseGraph
+    """Its odometry and its own closures that were kept, from its own first pose on; 3D."""
+    of_odometry: Bools
+    """(E,) edges whose metres are the odometry's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """Verified closures from a later drive's keyframes to an earlier one's."""
+
+    later: int
+    """Number of the drive."""
+    earlier: int
+    query: Ints
+    """(L,) rows of the later drive's poses."""
+    match: Ints
+    """(L,) rows of the earlier drive's poses."""
+    match_from_query: Floats
+    """(L, 4, 4)."""
+    information: Floats
+    """(L, 6, 6), in the frame of the query."""
+    of_odometry: Bools
+    """(L,) closures whose metres are the odometry's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Drives in maps."""
+
+    maps: list[tuple[int, ...]]
+    """Numbers of the drives of each map, in order of their first ones."""
+    world_from_body: list[Floats]
+    """Of each drive, in the frame of its map's first drive."""
+    solved: dict[tuple[int, ...], Refined]
+    """What came of each map of several drives: its graph has their poses one after the other."""
+    weight: list[Floats]
+    """(L,) of each Between: 1 for the closures kept, 0 for all of those that do not hold."""
+    residual: list[Floats]
+    """(L,) sigma of each Between after the solve, NaN where it does not hold."""
+    apart: dict[int, str]
+    """Why the solve did not keep enough closures of a Between."""
+
+
+def join(
+    drives: Sequence[Drive],
+    between: Sequence[Between],
+    solve: Optimiser,
+    settings: JoinSettings,
+    learn: RefineSettings,
+) -> Joined:
+    """The maps that the drives make. Raises GraphError where a graph cannot be solved.
+
+    What is joined by enough closures is solved as one. Pairs of which too few are kept are taken apart, and what is
+    left is solved again, until every join is held by enough: so a drive that joins nothing keeps its own poses.
+    """
+    joined = [len(one.query) >= settings.least_closures for one in between]
+    weight = [np.zeros(len(one.query)) for one in between]
+    residual = [np.full(len(one.query), np.nan) for one in between]
+    poses = [drive.graph.world_from_body for drive in drives]
+    solved: dict[tuple[int, ...], Refined] = {}
+    apart: dict[int, str] = {}
+    while pending := [map_ for map_ in _maps(len(drives), between, joined) if len(map_) > 1 and map_ not in solved]:
+        members = pending[0]
+        ties = [at for at, one in enumerate(between) if joined[at] and one.later in members]
+        graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
+        solution = keep_odometry_if_worse(graph, solve(graph))
+        loose = [
+            at for at, part in zip(ties, rows, strict=True) if solution.weight[part].sum() < settings.least_closures
+        ]
+        if loose:
+            for at in loose:
+                joined[at] = False
+                apart[at] = solution.reason
+            continue
+        refined = solved[members] = refine(graph, solution, of_odometry, learn)
+        after = residual_sigma(refined.graph, refined.solution.world_from_body)
+        for at, part in zip(ties, rows, strict=True):
+            weight[at], residual[at] = solution.weight[part], after[part]
+        for member, start in zip(members, starts, strict=True):
+            count = len(drives[member].graph.world_from_body)
+            poses[member] = refined.solution.world_from_body[start : start + count]
+    return Joined(_maps(len(drives), between, joined), poses, solved, weight, residual, apart)
+
+
+def _maps(count: int, between: Sequence[Between], joined: Sequence[bool]) -> list[tuple[int, ...]]:
+    """The drives of each map, in order of their first ones."""
+    ties = [one for one, good in zip(between, joined, strict=True) if good]
+    number = parts(count, np.array([t.earlier for t in ties], np.int64), np.array([t.later for t in ties], np.int64))
+    return [tuple(np.flatnonzero(number == one).tolist()) for one in range(int(number.max()) + 1)]
+
+
+def _as_one(
+    drives: Sequence[Drive], members: Sequence[int], between: Sequence[Between]
+) -> tuple[PoseGraph, Bools, list[int], list[slice]]:
+    """One graph of some drives and the closures between them: with it, which edges have the odometry's metres, where
+    each drive's poses start, and where each Between's edges are."""
+    counts = [len(drives[member].graph.world_from_body) for member in members]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).tolist()
+    start_of = dict(zip(members, starts, strict=True))
+    own = [drives[member].graph for member in members]
+    placed = _placed(drives, members, between)
+    first = sum(len(graph.a) for graph in own)
+    rows = []
+    for one in between:
+        rows.append(slice(first, first + len(one.query)))
+        first += len(one.query)
+    graph = PoseGraph(
+        world_from_body=np.concatenate(
+            [placed[member] @ g.world_from_body for member, g in zip(members, own, strict=True)]
+        ),
+        a=np.concatenate(
+            [g.a + start for g, start in zip(own, starts, strict=True)]
+            + [one.match + start_of[one.earlier] for one in between]
+        ).astype(np.int32),
+        b=np.concatenate(
+            [g.b + start for g, start in zip(own, starts, strict=True)]
+            + [one.query + start_of[one.later] for one in between]
+        ).astype(np.int32),
+        a_from_b=np.concatenate([g.a_from_b for g in own] + [one.match_from_query for one in between]),
+        information=np.concatenate([g.information for g in own] + [one.information for one in between]),
+        kind=[kind for g in own for kind in g.kind] + [EdgeKind.LOOP] * sum(len(one.query) for one in between),
+    )
+    of_odometry = np.concatenate(
+        [drives[member].of_odometry for member in members] + [one.of_odometry for one in between]
+    )
+    return graph, of_odometry, starts, rows
+
+
+def _placed(drives: Sequence[Drive], members: Sequence[int], between: Sequence[Between]) -> dict[int, Floats]:
+    """(4, 4) map_from_drive of each, a start for the solve: by what most closures of a pair say, pair after pair."""
+    placed = {members[0]: np.eye(4)}
+    while len(placed) < len(members):
+        for one in between:
+            known = [one.later in placed, one.earlier in placed]
+            if all(known) or not any(known):
+                continue
+            match = drives[one.earlier].graph.world_from_body[one.match]
+            query = drives[one.later].graph.world_from_body[one.query]
+            earlier_from_later = match @ one.match_from_query @ geometry.inverse(query)
+            middle = _middle(earlier_from_later)
+            if known[1]:
+                placed[one.later] = placed[one.earlier] @ middle
+            else:
+                placed[one.earlier] = placed[one.later] @ geometry.inverse(middle)
+    return placed
+
+
+def _middle(poses: Floats) -> Floats:
+    """The one of the poses (L, 4, 4) with the least sum of distances to the others, a rad counting as 10 m."""
+    apart = [
+        np.linalg.norm(geometry.log(geometry.between(pose, poses)) * [10, 10, 10, 1, 1, 1], axis=1).sum()
+        for pose in poses
+    ]
+    return poses[int(np.argmin(apart))]
