@@ -14,11 +14,11 @@ import pytest
 
 from vplog import geometry
 from vplog.data import Camera, Features, Keyframes, Verdict
-from vplog.explain_picture import find_agreement, find_boxes
 from vplog.explain_words import tell
 from vplog.loops import undistort
 from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results import tables
+from vplog.shared_view import find_agreement, find_boxes
 
 if TYPE_CHECKING:
     from collections.abc import Callable

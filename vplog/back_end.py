@@ -10,6 +10,7 @@ import numpy as np
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
 from vplog.graph.cross_check import cross_checked
+from vplog.graph.directions import Directions, with_directions
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.satellites import fixes_on
@@ -62,6 +63,16 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
     solution = consistency.keep_odometry_if_worse(graph, settings.solve(graph))
     solution = cross_checked(graph, solution, settings.cross_check)
+    if len(lines := without_metres(closures)):
+        directions = Directions(
+            closures.match[lines].astype(np.int64),
+            closures.query[lines].astype(np.int64),
+            closures.match_from_query[lines],
+            closures.information[lines],
+            log.camera().body_from_camera,
+        )
+        graph, solution = with_directions(graph, solution, directions, settings.solve)
+        rows = np.concatenate([rows, lines])
     fixes = fixes_on(log.gps(), odometry, keyframes, settings.gps) if settings.gps.use else None
     refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
     return Solved(
@@ -72,6 +83,12 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
         source,
         doubts + repairs + (fixes.warnings if fixes else []),
     )
+
+
+def without_metres(closures: Closures) -> Ints:
+    """Ledger rows of which turn and direction are known, but no metres."""
+    known = np.isfinite(closures.information).all((1, 2))
+    return np.flatnonzero(known & np.array([verdict is not Verdict.ACCEPTED for verdict in closures.verdict], bool))
 
 
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
@@ -106,6 +123,9 @@ def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) ->
     after[rows] = consistency.residual_sigma(refined.graph, solution.world_from_body)[loops]
     weight[rows] = solution.weight[loops]
     verdict = list(closures.verdict)
-    for row in rows[weight[rows] < 0.5]:
-        verdict[row] = Verdict.REJECTED_BY_SOLVER
+    for row in rows.tolist():
+        if weight[row] < 0.5 and verdict[row] is Verdict.ACCEPTED:
+            verdict[row] = Verdict.REJECTED_BY_SOLVER
+        elif weight[row] >= 0.5 and verdict[row] is not Verdict.ACCEPTED:
+            verdict[row] = Verdict.DIRECTION_ONLY
     return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)

@@ -18,6 +18,7 @@ from vplog.cli_print import (
     print_evaluation,
     print_explanation,
     print_info,
+    print_joint,
     print_json,
     print_optimised,
     print_run,
@@ -39,7 +40,12 @@ _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 _SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
 """The kinds of graph/solve.py, here too since that imports numpy."""
-_DEMO_NEXT = "Look at it: Foxglove or rerun open result.mcap, evo reads trajectory.tum, DuckDB the .parquet files."
+_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+"""Those of export.py, here too since that imports numpy."""
+_DEMO_NEXT = (
+    "Look at it: a browser opens report.html, Foxglove or rerun result.mcap, evo reads trajectory.tum, DuckDB the "
+    ".parquet files."
+)
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
@@ -79,37 +85,19 @@ def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
 
 def info(arguments: argparse.Namespace) -> None:
     """What is in a log, what would be used, what is wrong, the command to run."""
-    from dataclasses import asdict
+    from vplog.info import preflight
 
-    from vplog import logs
+    found = preflight(arguments.log, _topics(arguments))
+    if arguments.html is not None:
+        from vplog.info_page import write_page
 
-    log = logs.open(arguments.log, _topics(arguments))
-    found = log.info()
-    camera = log.camera() if any(topic.role == "image" for topic in found.topics) or found.kind == "images" else None
-    command = f"vplog run {arguments.log} -o OUT"
+        write_page(arguments.html, found)
     if arguments.json:
-        about = None
-        if camera is not None:
-            about = {
-                "name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "matrix": None if camera.matrix is None else camera.matrix.tolist(),
-                "distortion_model": camera.distortion_model,
-                "distortion": camera.distortion.tolist(),
-                "body_from_camera": camera.body_from_camera.tolist(),
-            }
-        print_json({**asdict(found), "camera": about, "command": command})
-        return
-    print_info(found)
-    if camera is not None:
-        text = (
-            "uncalibrated" if camera.matrix is None else f"fx {camera.matrix[0, 0]:.1f} px, {camera.distortion_model}"
-        )
-        print(f"camera    {camera.name}: {camera.width} x {camera.height}, {text}")
-    for warning in dict.fromkeys(found.warnings + log.warnings):
-        print(f"warning   {warning}")
-    print(f"run       {command}")
+        print_json(found.record)
+    else:
+        print_info(found.record)
+        if arguments.html is not None:
+            print(f"page      {arguments.html}")
 
 
 def library(arguments: argparse.Namespace) -> None:
@@ -132,31 +120,29 @@ def library(arguments: argparse.Namespace) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """A recorded drive to an optimised trajectory."""
-    from vplog.errors import LogError
-    from vplog.pipeline import run as run_pipeline
-
-    if len(arguments.logs) > 1:
-        raise LogError(
-            f"{len(arguments.logs)} logs were given, and a run takes one drive. Run each by itself, "
-            "or share places between them with one --library."
-        )
+    """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
     if arguments.gps:
         arguments.set.append("gps.use=true")
+    pipeline, topics = _pipeline(arguments), _topics(arguments)
     with Progress(arguments) as progress:
-        done = run_pipeline(
-            arguments.logs[0],
-            arguments.output,
-            _pipeline(arguments),
-            arguments.library,
-            _topics(arguments),
-            arguments.threads,
-            progress,
-        )
+        if len(arguments.logs) > 1:
+            from vplog.joint import run_joint
+
+            found = run_joint(
+                arguments.logs, arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
+            )
+        else:
+            from vplog.pipeline import run as run_pipeline
+
+            found = run_pipeline(
+                arguments.logs[0], arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
+            ).record
     if arguments.json:
-        print_json({"run": str(arguments.output), **done.record})
+        print_json({"run": str(arguments.output), **found})
+    elif len(arguments.logs) > 1:
+        print_joint(arguments.output, found)
     else:
-        print_run(arguments.output, done.record)
+        print_run(arguments.output, found)
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -253,6 +239,41 @@ def optimize(arguments: argparse.Namespace) -> None:
         print_optimised(done.record)
 
 
+def report(arguments: argparse.Namespace) -> None:
+    """Write the report of a finished run anew, against a truth where one is given."""
+    from vplog.retell import report as write_report
+
+    found = write_report(
+        arguments.run, arguments.output, arguments.truth, arguments.log, _topics(arguments), arguments.threads
+    )
+    if arguments.json:
+        print_json(found)
+    else:
+        print(found["report"])
+
+
+def export(arguments: argparse.Namespace) -> None:
+    """A finished run in the format of another tool."""
+    from vplog.export import export as export_run
+
+    found = export_run(arguments.run, arguments.format, arguments.output)
+    if arguments.json:
+        print_json(found)
+    else:
+        print("\n".join(found["written"]))
+
+
+def export_map(arguments: argparse.Namespace) -> None:
+    """The places of one run or many, in one Parquet file."""
+    from vplog.export import export_map as write_map
+
+    found = write_map(arguments.runs, arguments.output)
+    if arguments.json:
+        print_json(found)
+    else:
+        print(f"{found['map']}: {found['places']} places of {len(found['drives'])} drives")
+
+
 def config(arguments: argparse.Namespace) -> None:
     """Every setting of a pipeline, as YAML that a pipeline file may hold."""
     import yaml
@@ -291,6 +312,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from vplog.demo import DemoSettings, make_drive
     from vplog.evaluation import evaluate as evaluate_run
     from vplog.pipeline import run as run_pipeline
+    from vplog.retell import report as write_report
 
     pipeline = _pipeline(arguments)
     _folder(arguments.output)
@@ -300,6 +322,7 @@ def demo(arguments: argparse.Namespace) -> None:
         progress("render", 1, 1)
         done = run_pipeline(drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress)
     found = evaluate_run(arguments.output / "run", str(drive.truth))
+    write_report(arguments.output / "run", truth=str(drive.truth))
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
@@ -326,9 +349,12 @@ def _topics(arguments: argparse.Namespace) -> TopicChoice:
     return TopicChoice(
         image=arguments.image_topic,
         depth=arguments.depth_topic,
+        right=arguments.right_topic,
         camera_info=arguments.camera_info_topic,
         odometry=arguments.odometry_topic,
         gps=arguments.gps_topic,
+        odometry_file=arguments.odometry_file,
+        calibration_file=arguments.calibration,
     )
 
 
@@ -338,9 +364,7 @@ def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print one JSON object")
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    topics = argparse.ArgumentParser(add_help=False)
-    for role in ("image", "depth", "camera-info", "odometry", "gps"):
-        topics.add_argument(f"--{role}-topic", metavar="TOPIC", help=f"use this {role} topic")
+    topics = _topic_options()
     threads = argparse.ArgumentParser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads.add_argument(
@@ -363,8 +387,7 @@ def _parser() -> argparse.ArgumentParser:
     def output(sub: argparse.ArgumentParser, text: str) -> None:
         sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=text)
 
-    sub = add("info", info, topics)
-    sub.add_argument("log", type=Path, metavar="LOG")
+    _add_info(add("info", info, topics))
     sub = add("library", library, topics, threads, settings)
     sub.add_argument("logs", type=Path, nargs="+", metavar="LOG")
     output(sub, "folder of the library")
@@ -386,6 +409,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
     output(sub, "the graph at its solved poses, as g2o")
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="how false closures are met (default: gnc)")
+    _add_results(add, common, topics, threads)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
     sub = add("schemas", schemas)
@@ -394,6 +418,39 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("config", config, settings)
     return parser
+
+
+def _topic_options() -> argparse.ArgumentParser:
+    topics = argparse.ArgumentParser(add_help=False)
+    for role in ("image", "depth", "right", "camera-info", "odometry", "gps"):
+        topics.add_argument(f"--{role}-topic", metavar="TOPIC", help=f"use this {role} topic")
+    topics.add_argument("--odometry-file", type=Path, metavar="FILE.tum", help="use these poses as the odometry")
+    topics.add_argument(
+        "--calibration", type=Path, metavar="FILE.yaml", help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml"
+    )
+    return topics
+
+
+def _add_results(
+    add: Callable[..., argparse.ArgumentParser], common: argparse.ArgumentParser, topics: argparse.ArgumentParser,
+    threads: argparse.ArgumentParser,
+) -> None:  # fmt: skip
+    sub = add("report", report, topics, threads)
+    sub.add_argument("run", type=Path, metavar="RUN")
+    sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    sub.add_argument("--log", type=Path, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
+    sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="page (default: RUN/report.html)")
+    sub = add("export", export)
+    sub.add_argument("run", type=Path, metavar="RUN")
+    sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
+    whole = add("map", export_map)
+    maps = whole.add_subparsers(required=True, metavar="VERB")
+    text = "the places of one run or many, in one file"
+    sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
+    sub.set_defaults(verb=export_map)
+    sub.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.parquet", help="file to write")
 
 
 def _truth_options() -> argparse.ArgumentParser:
@@ -412,6 +469,11 @@ def _truth_options() -> argparse.ArgumentParser:
     )
     sub.add_argument("--library-size", type=_at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
     return sub
+
+
+def _add_info(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("log", type=Path, metavar="LOG")
+    sub.add_argument("--html", type=Path, metavar="FILE.html", help="also write a page with pictures of the drive")
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:

@@ -15,22 +15,35 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from vplog.data import LogInfo
-
 
 def say(message: str) -> None:
     print(f"vplog: {message}", file=sys.stderr)
 
 
-def print_info(found: LogInfo) -> None:
+def print_info(found: dict[str, Any]) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
-    seconds = max(found.end_ns - found.start_ns, 0) / 1e9
-    print(f"log       {found.path}\nkind      {found.kind}, {found.messages} messages over {seconds:.1f} s")
-    table = Table("topic", "type", "count", "role", "used", box=None)
-    for topic in found.topics:
-        table.add_row(topic.name, topic.type, str(topic.count), topic.role, "yes" if topic.used else "")
+    from vplog.info import in_words
+
+    seconds = max(found["end_ns"] - found["start_ns"], 0) / 1e9
+    print(f"log       {found['path']}\nkind      {found['kind']}, {found['messages']} messages over {seconds:.1f} s")
+    table = Table("topic", "type", "count", "Hz", "role", "used", "why", box=None)
+    for topic in found["topics"]:
+        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f}"
+        used = "yes" if topic["used"] else ""
+        cells = (topic["name"], topic["type"], str(topic["count"]), rate, topic["role"], used, topic["why"])
+        table.add_row(*(escape(cell) for cell in cells))
     console(sys.stdout).print(table)
+    for name, text in in_words(found):
+        print(f"{name:10}{text}")
+    for gap in found["gaps"]:
+        print(f"gap       {gap['seconds']:.1f} s without {gap['what']}, {gap['after_s']:.1f} s behind the start")
+    for warning in found["warnings"]:
+        print(f"warning   {warning}")
+    for problem in found["problems"]:
+        print(f"problem   {problem}")
+    print(f"run       {found['command']}")
 
 
 def print_run(out: Path, record: dict[str, Any]) -> None:
@@ -47,7 +60,31 @@ def print_run(out: Path, record: dict[str, Any]) -> None:
     print(f"  {totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
 
 
+def print_joint(out: Path, record: dict[str, Any]) -> None:
+    for number, found in enumerate(record["maps"]):
+        print(f"{out}: map {number}: {', '.join(found['drives'])}")
+        if found["reason"]:
+            print(f"  {found['reason']}")
+    for tie in record["joins"]:
+        residual = "" if tie["kept"] == 0 else f", median {tie['median_residual_sigma']:.2f} sigma"
+        print(
+            f"  {tie['query_drive']} to {tie['match_drive']}: {tie['candidates']} candidates, "
+            f"{tie['verified']} verified, {tie['kept']} kept{residual}"
+        )
+    for warning in record["warnings"]:
+        say(f"warning: {warning}")
+    totals = record["totals"]
+    print(f"  {totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+
+
 def print_evaluation(found: dict[str, Any]) -> None:
+    for number, one in enumerate(found.get("maps", [])):
+        print(f"map {number}     ATE rmse {one['ate_after']['rmse_m']:.6f} m as one trajectory")
+        for drive in one["drives"]:
+            before, after = drive["ate_before"]["rmse_m"], drive["ate_after"]["rmse_m"]
+            print(f"  {drive['drive']}: ATE rmse {before:.6f} m before, {after:.6f} m after, by itself")
+    if "maps" in found:
+        return
     closures = found.get("closures")
     if closures:
         share = {

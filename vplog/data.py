@@ -43,6 +43,11 @@ class Camera:
     height: int
     body_from_camera: Floats
     """(4, 4); the camera looks along its z, x right, y down."""
+    baseline_m: float | None = None
+    """m from this camera, the left one of a rectified pair, to the right one along its x. None without a pair; with
+    one `matrix` is of the rectified images, which have no distortion, and frames have a `right` image."""
+    disparity_zero_px: float = 0.0
+    """px that points at infinity lie further left in the right image: difference of the principal points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +61,8 @@ class Frame:
     depth: Float32s | None = None
     """(H, W) float32 m along the camera's z, NaN where unknown; registered to the image. None without a depth topic."""
     right: Bytes | None = None
-    """(H, W) uint8 grey of the right camera of a stereo pair."""
+    """(H, W) uint8 grey of the right camera of a stereo pair, both rectified: rows correspond. None without a pair,
+    or where this frame's right image is missing or damaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +157,7 @@ class Verdict(StrEnum):
     IMPLAUSIBLE_POSE = "implausible_pose"
     TOO_FAR = "too_far"
     INCONSISTENT = "inconsistent"
+    DIRECTION_ONLY = "direction_only"
     REJECTED_BY_SOLVER = "rejected_by_solver"
 
     @property
@@ -169,6 +176,7 @@ _SENTENCES = {
     Verdict.IMPLAUSIBLE_POSE: "The pose found would put the camera further away than a shared view can be.",
     Verdict.TOO_FAR: "The views agree, but are further apart than one place is wide; nearer keyframes tell it better.",
     Verdict.INCONSISTENT: "The pose from query to match and the one from match to query do not agree.",
+    Verdict.DIRECTION_ONLY: "Turn and direction agree with the robust solve, which took them without metres.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
 }
 
@@ -282,6 +290,18 @@ class Topic:
     role: str
     """`image`, `depth`, `camera_info`, `odometry`, `gps`, `tf_static`, `tf`, or `` where vplog has no use for it."""
     used: bool
+    part: str = ""
+    """What it is used as: `image`, `right`, `depth`, `camera_info`, `right_info`, `odometry`, `gps`, `tf_static`, `tf`;
+    empty where it is not used."""
+    pixels: str = ""
+    """Of images: pixel layout or format, as the first message names it."""
+    width: int = 0
+    """px of the first image; 0 where it is not told without decoding it, as of video."""
+    height: int = 0
+    frame: str = ""
+    """Of images and calibrations: the frame_id."""
+    calibrated: bool | None = None
+    """Of calibrations: whether the matrix is set."""
 
 
 @dataclass(frozen=True)
@@ -296,3 +316,7 @@ class LogInfo:
     messages: int
     topics: list[Topic]
     warnings: list[str] = field(default_factory=list)
+    odometry_frames: list[str] = field(default_factory=list)
+    """Names of the frames from the one that stands still to the body; empty where the odometry names none."""
+    skew_ms: dict[str, float] = field(default_factory=dict)
+    """By topic in use: log time less header stamp, the median."""

@@ -10,16 +10,17 @@ import numpy as np
 
 from vplog import explain_words, logs
 from vplog.errors import LibraryError, ResultError, SettingsError
-from vplog.explain_picture import Side, View, draw, find_agreement, find_boxes
+from vplog.explain_picture import Side, View, draw
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
+from vplog.shared_view import find_agreement, find_boxes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from vplog.data import Closures, Keyframes
-    from vplog.explain_picture import SharedBoxes
+    from vplog.shared_view import SharedBoxes
 
     Choose = Callable[[Closures, Keyframes], int]
 

@@ -49,8 +49,9 @@ def tell(
     """Of one ledger row by column, with the solved poses (N, 4, 4), the verdicts of all candidates of its query, the
     run's settings, and what the solver said of the whole run."""
     verdict = Verdict(row["verdict"])
+    became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, f"Rejected, {verdict.value}")
     return Words(
-        f"{'Accepted' if verdict is Verdict.ACCEPTED else f'Rejected, {verdict.value}'}: {verdict.sentence}",
+        f"{became}: {verdict.sentence}",
         _proposed(row, keyframes, siblings),
         _geometry(row),
         _solver(row, keyframes, world_from_body, reason),
@@ -239,6 +240,13 @@ def _by_solver(row: Row, _: Pipeline) -> str:
     )
 
 
+def _direction_only(row: Row, _: Pipeline) -> str:
+    return (
+        "Metres would need landmarks: keyframes around the match that moved further, a depth image or a stereo pair. "
+        "--set verify.direction.keep=false leaves such closures out."
+    )
+
+
 _CHANGES: dict[Verdict, Callable[[Row, Pipeline], str]] = {
     Verdict.ACCEPTED: _accepted,
     Verdict.TOO_FEW_MATCHES: _too_few_matches,
@@ -250,6 +258,7 @@ _CHANGES: dict[Verdict, Callable[[Row, Pipeline], str]] = {
     Verdict.IMPLAUSIBLE_POSE: _implausible,
     Verdict.TOO_FAR: _too_far,
     Verdict.INCONSISTENT: _inconsistent,
+    Verdict.DIRECTION_ONLY: _direction_only,
     Verdict.REJECTED_BY_SOLVER: _by_solver,
 }
 """What would change each verdict."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +19,15 @@ from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.features.sift import SiftSettings
 from vplog.features.store import FeatureStore
 from vplog.graph import consistency
+from vplog.graph.cross_check import CrossCheckSettings
+from vplog.graph.joint import JoinSettings
 from vplog.graph.noise import NoiseSettings
 from vplog.graph.refine import RefineSettings
 from vplog.graph.satellites import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
 from vplog.keyframes import KeyframeSettings, select_keyframes
 from vplog.loops.propose import ProposeSettings, candidate_stops, propose
+from vplog.loops.stereo import StereoSettings
 from vplog.loops.verify import VerifySettings, verify
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
@@ -34,8 +38,11 @@ from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.places.shared import SharesReferences
 from vplog.places.stored import load_references, read_library_record
 from vplog.references import PAPER_SIZE, LibrarySettings, choose, evenly
+from vplog.report import write_report
 from vplog.results import g2o, mcap, run_record, tables, tum
+from vplog.results.previews import PictureSettings, Previews
 from vplog.settings import Settings, load_yaml, override
+from vplog.show import Seen, earth_of, finished_picture, reference_use
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
@@ -44,6 +51,7 @@ if TYPE_CHECKING:
     from vplog.data import Camera, Ints, Odometry, PoseGraph, Solution, Trajectory
     from vplog.loops.propose import Proposals
     from vplog.places.coverage import Coverage
+    from vplog.results.shown import Shown
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]
@@ -65,6 +73,8 @@ class Pipeline(Settings):
     """Which frames become nodes."""
     features: SiftSettings = SiftSettings()
     """Local features of a frame."""
+    stereo: StereoSettings = StereoSettings()
+    """Depth of features from a stereo pair."""
     library: LibrarySettings = LibrarySettings()
     """The reference images that places are described by."""
     places: PlaceSettings = BobbSettings()
@@ -79,10 +89,16 @@ class Pipeline(Settings):
     """Odometry noise."""
     solve: OptimiserSettings = GncSettings()
     """Robust solve of the pose graph."""
+    cross_check: CrossCheckSettings = CrossCheckSettings()
+    """Other methods asked where the solve rejects much."""
     refine: RefineSettings = RefineSettings()
     """What the constraints kept say of the odometry."""
     gps: GpsSettings = GpsSettings()
     """Satellite fixes as constraints."""
+    join: JoinSettings = JoinSettings()
+    """Several drives in one map."""
+    pictures: PictureSettings = PictureSettings()
+    """What result.mcap and report.html show of the camera's images."""
 
     @model_validator(mode="before")
     @classmethod
@@ -144,13 +160,23 @@ def run(
     topics: logs.TopicChoice | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    features: FeatureStore | None = None,
 ) -> Run:
-    """Drive in, run folder out. Raises VplogError with one line where that cannot be."""
+    """Drive in, run folder out. Raises VplogError with one line where that cannot be.
+
+    The features of the keyframes go to the store given, for who needs them afterwards, or to one that goes with the
+    run.
+    """
     log = logs.open(path, topics)
     watch, warnings = Watch(), []
     check_library(library, pipeline)
     record.begin_folder(out, pipeline, path, threads)
-    with ThreadPoolExecutor(1) as aside, FeatureStore(out / ".features") as store, record.heard(warnings):
+    with (
+        ThreadPoolExecutor(1) as aside,
+        FeatureStore(out / ".features") if features is None else nullcontext(features) as store,
+        Previews(out / ".pictures", pipeline.pictures) as previews,
+        record.heard(warnings),
+    ):
         hashes = aside.submit(record.hash_inputs, path)
         with watch.stage("read"):
             odometry = _odometry(log)
@@ -160,7 +186,7 @@ def run(
         with watch.stage("extract", len(keyframes.stamp_ns)):
             later = library is not None or pipeline.library.choose == "coverage"
             chosen = set() if later else set(choose(keyframes.stamp_ns, pipeline.library).tolist())
-            keyframes, references, lost = extract(log, keyframes, chosen, pipeline, store, threads, progress)
+            keyframes, references, lost = extract(log, keyframes, chosen, pipeline, store, previews, threads, progress)
             warnings += lost + ([_UNCALIBRATED.format(camera=camera.name)] if camera.matrix is None else [])
         if library is None and pipeline.library.choose == "coverage":
             with watch.stage("choose", len(store)):
@@ -178,7 +204,7 @@ def run(
         with watch.stage("verify", len(proposals.query)):
             closures = verify(
                 proposals, keyframes, camera, store.__getitem__, pipeline.verify, threads,
-                lambda done, total: progress("verify", done, total),
+                lambda done, total: progress("verify", done, total), camera.baseline_m,
             )  # fmt: skip
             closures = name_shared(closures, state, descriptors)
         with watch.stage("solve"):
@@ -188,13 +214,20 @@ def run(
         with watch.stage("write"):
             done = Run(keyframes, closures, graph, solution)
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-            column = state.to_arrow(descriptors)
-            tables.write_descriptors(out / "descriptors.parquet", keyframes, [column], state.arrow_type, header)
-            write_results(out, done, odometry, solved.trajectory, camera, header)
+            places = [state.to_arrow(descriptors)]
+            tables.write_descriptors(out / "descriptors.parquet", keyframes, places, state.arrow_type, header)
+            head, on_earth = record.head(pipeline, path, threads), about_gps(solved.fixes, solved.refined)
+            shown = finished_picture(
+                Seen(previews.image, store.__getitem__, camera, state, descriptors), previews, closures, known,
+                pipeline.verify, pipeline.pictures, threads,
+                gps=log.gps(), earth=earth_of(solved.trajectory, log.gps(), on_earth),
+                about={"versions": head["versions"], "inputs": hashes.result()},
+            )  # fmt: skip
+            write_results(out, done, odometry, solved.trajectory, camera, header, shown)
             if library is None:
                 state.save(out / "library")
         account = {
-            **record.head(pipeline, path, threads),
+            **head,
             "finished": True,
             "topics": (topics or logs.TopicChoice()).model_dump(mode="json"),
             "inputs": hashes.result(),
@@ -202,6 +235,7 @@ def run(
                 "hash": state.hash,
                 "from": str(library) if library else "the drive's own keyframes",
                 "references": len(known),
+                "used": reference_use(state, descriptors),
                 "coverage": asdict(coverage),
             },
             "descriptor_bits": state.bits,
@@ -215,13 +249,21 @@ def run(
                 "reason": solution.reason if EdgeKind.LOOP in graph.kind or solved.fixes else _NO_CLOSURE,
             },
             "odometry": {"sigma_factor": float(np.sqrt(solved.refined.noise)), "scale": solved.refined.scale},
-            "gps": about_gps(solved.fixes, solved.refined),
+            "gps": on_earth,
             "stages": watch.stages,
             "totals": watch.totals(),
             "warnings": log.warnings + warnings,
         }
-        run_record.write_run_json(out / "run.json", account)
-    return replace(done, record=account)
+    return replace(done, record=finish(out, account, watch))
+
+
+def finish(out: Path, account: dict[str, Any], watch: Watch) -> dict[str, Any]:
+    """Write the report and, last, run.json: what it holds."""
+    with watch.stage("report"):
+        write_report(out, account)
+    account = {**account, "stages": watch.stages, "totals": watch.totals()}
+    run_record.write_run_json(out / "run.json", account)
+    return account
 
 
 def write_results(
@@ -231,6 +273,7 @@ def write_results(
     trajectory: Trajectory,
     camera: Camera,
     header: tables.TableMetadata,
+    shown: Shown | None = None,
 ) -> None:
     """The files of a run folder that every method writes alike."""
     keyframes, closures, graph, solution = done.keyframes, done.closures, done.graph, done.solution
@@ -242,7 +285,7 @@ def write_results(
     tables.write_trajectory(out / "trajectory.parquet", trajectory, odometry, header)
     tum.write_tum(out / "trajectory.tum", trajectory)
     g2o.write_g2o(out / "graph.g2o", graph, poses)
-    mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, camera)
+    mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, camera, shown)
 
 
 def extract(
@@ -251,6 +294,7 @@ def extract(
     chosen: set[int],
     pipeline: Pipeline,
     store: FeatureStore,
+    previews: Previews,
     threads: int,
     progress: Progress,
 ) -> tuple[Keyframes, list[Reference], list[str]]:
@@ -262,7 +306,7 @@ def extract(
             f"{log.name}: by the odometry nothing moves far enough for a second keyframe, and a graph needs two. "
             "Set keyframes.distance_m lower, or choose another topic with --odometry-topic."
         )
-    frames = extract_frames(log.frames(keyframes.stamp_ns), pipeline.features, threads)
+    frames = extract_frames(log.frames(keyframes.stamp_ns), pipeline.features, threads, pipeline.stereo)
     for row, (stamp_ns, frame, features, why) in enumerate(frames):
         progress("extract", row + 1, total)
         if frame is None or features is None:
@@ -270,6 +314,7 @@ def extract(
             continue
         kept.append(int(np.searchsorted(keyframes.stamp_ns, stamp_ns)))
         store.append(features)
+        previews.append(frame.image)
         if kept[-1] in chosen:
             references.append(Reference(frame.image, features, log.name, stamp_ns))
     if len(kept) < 2:

@@ -7,6 +7,7 @@ import logging
 import platform
 import shutil
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -76,6 +77,11 @@ def counts(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closure
         "candidates": len(closures),
         "verdicts": verdicts,
     }
+
+
+def losses(log: Log) -> list[dict[str, Any]]:
+    """What of the log could not be used, by reason and topic, with counts and times."""
+    return [asdict(loss) for loss in getattr(log, "losses", [])]
 
 
 @contextmanager

@@ -10,11 +10,16 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.writer import CompressionType
 from scipy.spatial.transform import Rotation
 
 from vplog import logs
 from vplog.errors import LogError
+from vplog.logs.containers import Channel
+from vplog.logs.messages import PoseMessage, decode
+from vplog.logs.odometry_message import read_odometry
 from vplog.stages import Log
 
 from .drives import (
@@ -28,6 +33,7 @@ from .drives import (
     foxglove_messages,
     png,
     ros_messages,
+    store,
     write_foxglove,
     write_ros1,
     write_ros2,
@@ -196,3 +202,20 @@ def test_jpeg_orientation_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(turned)
     log = logs.open(tmp_path)
     assert next(iter(log.frames(log.stamps()))).decode().image.shape == (8, 16)
+
+
+@given(st.text(max_size=9), st.text(max_size=9), st.integers(0, 2**31 - 1), st.integers(1, 2))
+def test_odometry_read_in_place_is_what_the_general_decoder_reads(frame: str, child: str, sec: int, ros: int) -> None:
+    m = next(m for m in ros_messages(DRIVE, ros) if m.topic == "/odom")
+    m.message.header.frame_id, m.message.child_frame_id, m.message.header.stamp.sec = frame, child, sec
+    encode = store(2).serialize_cdr if ros == 2 else store(1).serialize_ros1
+    data = bytes(encode(m.message, m.type))
+    channel = Channel("/odom", "nav_msgs/msg/Odometry", "cdr" if ros == 2 else "ros1")
+    found, expected = read_odometry(channel, data), decode(channel, data)
+    assert found is not None
+    assert isinstance(expected, PoseMessage)
+    for name in ("stamp_ns", "frame", "child", "position", "quaternion", "covariance"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert read_odometry(channel, data[:-1]) is None
+    assert read_odometry(channel, data + b"0") is None
+    assert read_odometry(channel, data[:20]) is None

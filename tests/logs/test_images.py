@@ -36,6 +36,53 @@ def test_colours_become_the_same_grey(encoding: str, order: str, padding: int) -
     np.testing.assert_allclose(image, expected, atol=0.51)
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_mosaics_become_the_grey_of_their_colours(pattern: str, bits: int) -> None:
+    """Two fields of one colour each: inside a field every way of filling the gaps gives the field's colour."""
+    colours = {c: np.repeat([[left, right]], 10, axis=1).repeat(8, axis=0) for c, left, right in _FIELDS}
+    mosaic = np.zeros((8, 20), np.uint8)
+    for i, c in enumerate(pattern.upper()):
+        mosaic[i // 2 :: 2, i % 2 :: 2] = colours[c][i // 2 :: 2, i % 2 :: 2]
+    expected = 0.299 * colours["R"] + 0.587 * colours["G"] + 0.114 * colours["B"]
+    pixels = mosaic if bits == 8 else mosaic.astype(np.uint16) * 257
+    image = grey(raw(f"bayer_{pattern}{bits}", pixels, padding=6, big_endian=bits == 16))
+    np.testing.assert_allclose(image[:, 2:8], expected[:, 2:8], atol=1)
+    np.testing.assert_allclose(image[:, 12:18], expected[:, 12:18], atol=1)
+    file = cv2.imencode(".png", mosaic)[1].tobytes()  # as a transport compresses it
+    packed = grey(ImageMessage(0, "", f"bayer_{pattern}8; png compressed ", file, True))
+    np.testing.assert_array_equal(packed, grey(raw(f"bayer_{pattern}8", mosaic)))
+
+
+_FIELDS = (("R", 200, 90), ("G", 40, 120), ("B", 90, 250))
+
+
+@pytest.mark.parametrize(("encoding", "first"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
+def test_shared_colours_leave_the_luma(encoding: str, first: int) -> None:
+    pixels = RNG.integers(0, 256, (6, 8, 2)).astype(np.uint8)
+    np.testing.assert_array_equal(grey(raw(encoding, pixels, 4)), pixels[..., first])
+
+
+@pytest.mark.parametrize(("encoding", "planes"), [("nv12", 1.5), ("nv21", 1.5), ("nv24", 3.0)])
+def test_luma_planes_come_first(encoding: str, planes: float) -> None:
+    pixels = RNG.integers(0, 256, (6, 8)).astype(np.uint8)
+    colours = bytes(int(6 * 8 * (planes - 1)))
+    message = ImageMessage(0, "", encoding, pixels.tobytes() + colours, False, 8, 6, 8)
+    np.testing.assert_array_equal(grey(message), pixels)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_low_bits_of_sixteen_are_seen(bits: int) -> None:
+    pixels = RNG.integers(0, 2**bits, (20, 30)).astype(np.uint16)
+    pixels[0, 0] = 2**bits - 1
+    expected = pixels >> (bits - 8)
+    np.testing.assert_array_equal(grey(raw("mono16", pixels)), expected)
+    file = cv2.imencode(".png", pixels)[1].tobytes()
+    np.testing.assert_array_equal(grey(ImageMessage(0, "", "mono16; png compressed ", file, True)), expected)
+    colour = grey(raw("rgb16", np.stack([pixels] * 3, axis=-1)))
+    np.testing.assert_allclose(colour, expected, atol=1)
+
+
 @pytest.mark.parametrize("padding", [0, 3])
 def test_mono_rows_with_padding(padding: int) -> None:
     pixels = RNG.integers(0, 256, (6, 5)).astype(np.uint8)
@@ -50,6 +97,7 @@ def test_mono_rows_with_padding(padding: int) -> None:
 @pytest.mark.parametrize("big_endian", [False, True])
 def test_sixteen_bits_in_both_byte_orders(big_endian: bool) -> None:
     pixels = RNG.integers(1, 65535, (6, 5)).astype(np.uint16)
+    pixels[0, 0] = 65534
     np.testing.assert_array_equal(grey(raw("mono16", pixels, 2, big_endian)), pixels // 256)
     np.testing.assert_allclose(depth_m(raw("16UC1", pixels, 2, big_endian)), pixels / 1000.0, rtol=1e-6)
     metres = RNG.uniform(0.1, 9, (6, 5)).astype(np.float32)
@@ -84,6 +132,54 @@ def test_quantised_inverse_depth() -> None:
     file = cv2.imencode(".png", np.round(a / metres + b).astype(np.uint16))[1].tobytes()
     message = ImageMessage(0, "", "32FC1; compressedDepth png", struct.pack("<iff", 1, a, b) + file, True)
     np.testing.assert_allclose(depth_m(message), metres, rtol=0.01)
+
+
+def rvl(pixels: np.ndarray) -> bytes:
+    """Wilson's encoder, number by number."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            nibbles.append(value & 7 | (8 if value >> 3 else 0))
+            value >>= 3
+            if not value:
+                return
+
+    flat, at, previous = pixels.ravel().tolist(), 0, 0
+    while at < len(flat):
+        for zero in (True, False):
+            stop = at
+            while stop < len(flat) and (flat[stop] == 0) == zero:
+                stop += 1
+            put(stop - at)
+            for depth in flat[at:stop] if not zero else ():
+                put((depth - previous) * 2 if depth >= previous else (previous - depth) * 2 - 1)
+                previous = depth
+            at = stop
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{n:x}" for n in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)]
+    return struct.pack("<II", pixels.shape[1], pixels.shape[0]) + struct.pack(f"<{len(words)}I", *words)
+
+
+def test_depth_in_rvl() -> None:
+    pixels = (1000 + np.cumsum(RNG.integers(-40, 40, (30, 50)), axis=1)).astype(np.uint16)
+    pixels[4:9, 10:30], pixels[0, 0], pixels[-1, -5:] = 0, 0, 0
+    pixels[20, 20] = 60000
+    depth = depth_m(ImageMessage(0, "", "16UC1; compressedDepth rvl", bytes(12) + rvl(pixels), True))
+    np.testing.assert_array_equal(np.isnan(depth), pixels == 0)
+    np.testing.assert_allclose(depth[pixels > 0], pixels[pixels > 0] / 1000.0, rtol=1e-6)
+    for bad in (rvl(pixels)[:-40], rvl(pixels)[:5], struct.pack("<II", 2**31, 2**31) + bytes(40)):
+        with pytest.raises(BadMessageError):
+            depth_m(ImageMessage(0, "", "16UC1; compressedDepth rvl", bytes(12) + bad, True))
+
+
+@given(st.binary(max_size=60))
+def test_any_rvl_is_a_depth_or_a_known_error(data: bytes) -> None:
+    message = ImageMessage(0, "", "16UC1; compressedDepth rvl", bytes(12) + struct.pack("<II", 8, 4) + data, True)
+    try:
+        assert depth_m(message).shape == (4, 8)
+    except BadMessageError as error:
+        assert "RVL" in str(error)
 
 
 @pytest.mark.parametrize("kind", [".jpg", ".png", ".webp", ".bmp", ".pgm", ".ppm"])

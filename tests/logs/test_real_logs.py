@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
+from mcap.reader import NonSeekingReader, make_reader
 from rosbags import rosbag1
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.containers import Notes
+from vplog.logs.containers import Channel, Notes
 from vplog.logs.mcap_file import McapFile
+from vplog.logs.recorded import RecordedLog
 from vplog.logs.ros1_bag import Ros1Bag
 
 DATA = Path(os.environ.get("VPLOG_DATA", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
@@ -91,6 +94,64 @@ def test_every_log_informs_or_says_why_not() -> None:
             told["refused"] += "No camera images" not in str(error) and "no image" not in str(error)
     assert told["informs"] >= 198  # of 204; the rest are empty, no log, or folders without their file
     assert told["refused"] <= 6
+
+
+def test_conformance_files_give_exactly_their_records() -> None:
+    """Each file of the format's own set has the records that a reader must find beside it."""
+    files = sorted(data("logs/mcap/foxglove+mcap").rglob("*.mcap"))
+    for path in files:
+        records = json.loads(path.with_suffix(".json").read_text())["records"]
+        fields = [(record["type"], dict(record["fields"])) for record in records]
+        schemas = {"0": "", **{one["id"]: one["name"] for kind, one in fields if kind == "Schema"}}
+        channels = {
+            one["id"]: Channel(one["topic"], schemas[one["schema_id"]], one["message_encoding"])
+            for kind, one in fields if kind == "Channel"
+        }  # fmt: skip
+        expected = [
+            (channels[one["channel_id"]], int(one["log_time"]), bytes(map(int, one["data"])))
+            for kind, one in fields if kind == "Message"
+        ]  # fmt: skip
+        file = McapFile(path, notes := Notes())
+        contents = file.contents()
+        found = list(file.messages(contents.counts))
+        assert [(m.channel, m.log_ns, m.data) for m in found] == expected, path.name
+        assert [file.read(m.place) for m in found] == [message for _, _, message in expected]
+        assert contents.counts.keys() == set(channels.values()), path.name
+        assert contents.messages == len(expected)
+        assert (contents.start_ns, contents.end_ns) == (
+            min((at for _, at, _ in expected), default=0), max((at for _, at, _ in expected), default=0),
+        )  # fmt: skip
+        assert notes.lines == []
+    assert len(files) > 100
+
+
+@pytest.mark.parametrize("bytes_flipped", [0, 1000])
+def test_damage_to_a_real_drive_is_counted_exactly(bytes_flipped: int, tmp_path: Path) -> None:
+    """The first chunk that is flipped is the last of the 70 % that are left."""
+    source = data("drives/kitti00")
+    shutil.copy(source / "metadata.yaml", tmp_path)
+    whole = (source / "kitti00.mcap").read_bytes()
+    with (source / "kitti00.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    recorded = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+    left = bytearray(whole[: len(whole) * 7 // 10])
+    start = summary.chunk_indexes[20].chunk_start_offset
+    left[start : start + 9] = bytes(9 * bool(bytes_flipped)) or left[start : start + 9]
+    (tmp_path / "kitti00.mcap").write_bytes(left)
+    log = logs.open(tmp_path)
+    assert isinstance(log, RecordedLog)
+    info = log.info()
+    found = {topic.name: topic.count for topic in info.topics}
+    lost = Counter({loss.topic: loss.messages or 0 for loss in log.losses})
+    assert Counter(found) + lost == Counter(recorded)
+    assert {loss.of for loss in log.losses} == {recorded[loss.topic] for loss in log.losses}
+    odometry = log.odometry()
+    assert odometry is not None
+    assert len(odometry.stamp_ns) == found["/wheel/odometry"]
+    assert len(log.stamps()) == found["/cam0/image_raw/compressed"]
+    assert max(span[1] for loss in log.losses for span in loss.spans_ns) == summary.statistics.message_end_time
 
 
 def test_mcap_messages_are_those_of_the_reference_reader() -> None:

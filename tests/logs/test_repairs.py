@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,10 @@ QUARTER = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
 """A quarter turn about z."""
 
 
+def stamps(header_ns: list[int], log_ns: list[int]) -> Stamps:
+    return Stamps(array("q", header_ns), array("q", log_ns))
+
+
 def track(*messages: PoseMessage) -> tuple[Odometry | None, str]:
     notes, poses = Notes(), PoseTrack("/odom")
     for message in messages:
@@ -49,18 +54,16 @@ def test_stamps_increase_and_the_first_of_equals_is_kept(stamps: list[int]) -> N
     assert stamp_ns.tolist() == sorted(set(stamps))
     assert rows.tolist() == [stamps.index(s) for s in sorted(set(stamps))]
     assert any("out of order" in line for line in notes.lines) == any(b < a for a, b in pairwise(stamps))
-    repeated = len(stamps) - len(set(stamps))
-    assert (f"{repeated} message" in " ".join(notes.lines)) == bool(repeated)
 
 
 def test_header_stamps_that_are_all_zero_give_way_to_log_times() -> None:
     notes = Notes()
-    stamp_ns, rows = Stamps([0, 0], [7, 9]).order("/t", notes)
+    stamp_ns, rows = stamps([0, 0], [7, 9]).order("/t", notes)
     assert (stamp_ns.tolist(), rows.tolist()) == ([7, 9], [0, 1])
     assert "log times" in notes.lines[0]
-    stamp_ns, rows = Stamps([0, 5], [7, 9]).order("/t", notes)
+    stamp_ns, rows = stamps([0, 5], [7, 9]).order("/t", notes)
     assert (stamp_ns.tolist(), rows.tolist()) == ([5], [1])
-    assert "1 message without a header stamp dropped" in notes.lines[1]
+    assert "Lost: 1 message without a header stamp, at t=0.000 s: /t 1." in notes.lines
 
 
 def test_pairs_are_nearest_within_half_a_period() -> None:
@@ -217,7 +220,7 @@ def test_repairs_in_a_whole_log(tmp_path: Path) -> None:
     np.testing.assert_array_equal(odometry.stamp_ns, drive.stamp_ns + LATENCY_NS)
     notes = " ".join(log.warnings)
     assert "out of order" in notes
-    assert "1 message with the stamp of an earlier one" in notes
+    assert "Lost: 1 message with the stamp of an earlier one, at t=0.100 s: /cam/image/compressed 1 of 5." in notes
     assert "/odom has no header stamps" in notes
 
 
@@ -241,4 +244,4 @@ def test_messages_that_do_not_decode_are_counted(tmp_path: Path) -> None:
     odometry = log.odometry()
     assert odometry is not None
     assert len(odometry.stamp_ns) == 4
-    assert "/pose: 1 message that cannot be decoded left out." in log.warnings
+    assert "Lost: 1 message that cannot be decoded, at t=0.400 s: /pose 1 of 5." in log.warnings

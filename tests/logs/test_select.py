@@ -21,13 +21,14 @@ def info(name: str, frame: str = "", calibrated: bool = True) -> Candidate:
 
 
 def names(chosen: Selection) -> dict[str, str | None]:
-    parts = ("image", "depth", "camera_info", "odometry", "gps")
+    parts = ("image", "depth", "right", "camera_info", "right_info", "odometry", "gps")
     return {part: channel.topic if (channel := getattr(chosen, part)) else None for part in parts}
 
 
 def pick(*found: Candidate, **choice: str) -> dict[str, str | None]:
-    forward = select(list(found), TopicChoice(**choice), "run.mcap")
-    assert select(list(reversed(found)), TopicChoice(**choice), "run.mcap") == forward  # the order of a file has no say
+    topics = TopicChoice.model_validate(choice)
+    forward = select(list(found), topics, "run.mcap")
+    assert select(list(reversed(found)), topics, "run.mcap") == forward  # the order of a file has no say
     return names(forward)
 
 
@@ -56,6 +57,48 @@ def test_depth_in_the_frame_of_the_image_first() -> None:
         pick(image, aligned, topic("/camera/depth/image", "depth", 50, frame="depth"))["depth"] == aligned.channel.topic
     )
     assert pick(aligned)["depth"] is None  # depth alone is no camera
+
+
+def test_pairs_by_their_names() -> None:
+    """The left one is the camera even where the right one has a message more."""
+    for left, right in (
+        ("/stereo/left/image_raw", "/stereo/right/image_raw"),
+        ("/camera_left/image", "/camera_right/image"),
+        ("/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
+        ("/cam0/image_raw", "/cam1/image_raw"),
+    ):
+        infos = [info(f"{name.rsplit('/', 1)[0]}/camera_info") for name in (left, right)]
+        pair = [topic(left), topic(right, count=11)]
+        chosen = pick(*pair, *infos)
+        assert (chosen["image"], chosen["right"]) == (left, right)
+        assert (chosen["camera_info"], chosen["right_info"]) == tuple(one.channel.topic for one in infos)
+        assert pick(*pair, *infos, right="")["right"] is None
+        assert pick(*pair, *infos, image=right)["right"] is None
+        assert pick(*pair, *infos, topic("/depth", "depth"))["right"] is None  # depth needs no second image
+    assert pick(topic("/front/left"), topic("/rear/right"))["right"] is None
+
+
+def test_pair_or_depth_but_not_both() -> None:
+    found = topic("/a"), topic("/b"), topic("/depth", "depth")
+    chosen = pick(*found, image="/a", right="/b")
+    assert (chosen["right"], chosen["depth"]) == ("/b", None)
+    with pytest.raises(LogError, match="Leave out --depth-topic or --right-topic"):
+        pick(*found, image="/a", right="/b", depth="/depth")
+    with pytest.raises(LogError, match=r"No topic '/c' in run.mcap. Image topics: /a, /b"):
+        pick(*found, right="/c")
+
+
+def test_tf_is_odometry_where_nothing_else_is() -> None:
+    moving = topic("/tf", "tf", 50, "tf2_msgs/msg/TFMessage")
+    static = topic("/tf_static", "tf_static", 1, "tf2_msgs/msg/TFMessage")
+    pose = topic("/pose", "odometry", 5, "geometry_msgs/msg/PoseStamped")
+    assert pick(moving, static)["odometry"] == "/tf"
+    assert pick(moving, static, pose)["odometry"] == "/pose"
+    assert pick(moving, static, pose, odometry="/tf")["odometry"] == "/tf"
+    assert pick(moving, static, odometry="")["odometry"] is None
+    topics = TopicChoice()
+    assert select([moving, static, pose], topics, "a").tf == ()
+    assert select([moving, pose], topics, "a").tf == (moving.channel,)  # the only place where static ones can be
 
 
 def test_odometry_by_type_then_count_then_name() -> None:

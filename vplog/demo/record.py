@@ -29,6 +29,8 @@ IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"
 DEPTH = "/camera/depth/image_raw/compressedDepth"
 DEPTH_INFO = "/camera/depth/camera_info"
+RIGHT = "/camera/right/image_raw/compressed"
+RIGHT_INFO = "/camera/right/camera_info"
 ODOMETRY = "/odom"
 GPS = "/gps/fix"
 TF_STATIC = "/tf_static"
@@ -37,6 +39,8 @@ TYPES = {
     CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
     DEPTH: "sensor_msgs/msg/CompressedImage",
     DEPTH_INFO: "sensor_msgs/msg/CameraInfo",
+    RIGHT: "sensor_msgs/msg/CompressedImage",
+    RIGHT_INFO: "sensor_msgs/msg/CameraInfo",
     ODOMETRY: "nav_msgs/msg/Odometry",
     GPS: "sensor_msgs/msg/NavSatFix",
     TF_STATIC: "tf2_msgs/msg/TFMessage",
@@ -196,25 +200,31 @@ def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
 
 
 def _frames(scene: Scene, pool: ThreadPoolExecutor) -> Iterator[tuple[str, int, Any]]:
-    """Image, calibration and, if asked for, depth of every frame."""
-    settings = scene.settings
+    """Image, calibration and, if asked for, depth and the right image of every frame."""
+    settings, baseline_m = scene.settings, scene.settings.stereo_baseline_m
 
-    def encoded(frame: int) -> tuple[Bytes, Bytes | None]:
+    def jpeg(image: Bytes) -> Bytes:
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])[1].ravel()
+
+    def encoded(frame: int) -> tuple[Bytes, Bytes | None, Bytes | None]:
         image, depth = take_picture(scene, frame)
-        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
-        return jpeg.ravel(), _compressed_depth(depth) if settings.depth else None
+        right = jpeg(take_picture(scene, frame, baseline_m)[0]) if baseline_m else None
+        return jpeg(image), _compressed_depth(depth) if settings.depth else None, right
 
     # One frame first: numba compiles in one thread while the others would only wait for it.
     first = encoded(0)
     rest = pool.map(encoded, range(1, len(scene.stamp_ns)))
-    for stamp, (jpeg, depth) in zip(scene.stamp_ns.tolist(), (first, *rest), strict=True):
+    for stamp, (left, depth, right) in zip(scene.stamp_ns.tolist(), (first, *rest), strict=True):
         header = _header(stamp, CAMERA_FRAME)
         compressed = TYPES[IMAGE]
-        yield IMAGE, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=jpeg)
+        yield IMAGE, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=left)
         yield CAMERA_INFO, stamp, _calibration(header, scene.camera)
         if depth is not None:
             yield DEPTH, stamp, _message(compressed, header=header, format="16UC1; compressedDepth png", data=depth)
             yield DEPTH_INFO, stamp, _calibration(header, scene.camera)
+        if right is not None:
+            yield RIGHT, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=right)
+            yield RIGHT_INFO, stamp, _calibration(header, scene.camera, baseline_m)
 
 
 def _compressed_depth(depth: Float32s) -> Bytes:
@@ -229,7 +239,8 @@ def _compressed_depth(depth: Float32s) -> Bytes:
     return np.concatenate([header, png.ravel()])
 
 
-def _calibration(header: object, camera: Camera) -> Any:
+def _calibration(header: object, camera: Camera, right_m: float = 0.0) -> Any:
+    """Of the camera, or of its twin so far to the right: the fourth column of P says how far (CameraInfo)."""
     assert camera.matrix is not None  # noqa: S101 - the demo's camera is calibrated
     return _message(
         TYPES[CAMERA_INFO],
@@ -240,7 +251,7 @@ def _calibration(header: object, camera: Camera) -> Any:
         d=camera.distortion,
         k=camera.matrix.ravel(),
         r=np.eye(3).ravel(),
-        p=np.hstack([camera.matrix, np.zeros((3, 1))]).ravel(),
+        p=np.hstack([camera.matrix, [[-camera.matrix[0, 0] * right_m], [0.0], [0.0]]]).ravel(),
         binning_x=0,
         binning_y=0,
         roi=_message("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),

@@ -62,18 +62,21 @@ def make_scene(settings: DemoSettings) -> Scene:
     )
 
 
-def take_picture(scene: Scene, frame: int) -> tuple[Bytes, Float32s]:
-    """Grey image (H, W) with sensor noise and depth (H, W) in m, NaN for sky, of one frame of the drive."""
+def take_picture(scene: Scene, frame: int, right_m: float = 0.0) -> tuple[Bytes, Float32s]:
+    """Grey image (H, W) with sensor noise and depth (H, W) in m, NaN for sky, of one frame of the drive.
+
+    `right_m` moves the camera so far to its right.
+    """
     settings = scene.settings
     time_s = float(scene.stamp_ns[frame] - route.START_NS) * 1e-9
     share = float(route.second_lap_share(settings, np.array(time_s * settings.speed_m_s)))
     image, depth = render(
         scene.world,
         scene.camera,
-        scene.world_from_body[frame] @ scene.camera.body_from_camera,
+        scene.world_from_body[frame] @ scene.camera.body_from_camera @ pose(np.eye(3), np.array([right_m, 0.0, 0.0])),
         FIRST_LIGHT.towards(LATER_LIGHT, share),
         traffic(scene.world, settings, time_s),
     )
-    rng = np.random.default_rng([settings.seed, 4, frame])
+    rng = np.random.default_rng([settings.seed, 4, frame] if right_m == 0 else [settings.seed, 8, frame])
     noise = rng.standard_normal(image.shape, np.float32) * np.float32(settings.image_noise)
     return np.clip(np.round(image + noise), 0, 255).astype(np.uint8), depth

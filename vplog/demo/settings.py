@@ -40,6 +40,8 @@ class DemoSettings(Settings):
     """Quality of the JPEG images."""
     depth: bool = False
     """Also write a depth image for every frame, in mm, registered to the grey image."""
+    stereo_baseline_m: float = Field(default=0.0, ge=0, le=2)
+    """Also write the images of a second camera so far to the right; 0 writes none."""
     odometry_rate_hz: float = Field(default=20.0, gt=1, le=1000)
     """Odometry samples per second."""
     odometry_scale_error: float = Field(default=0.01, ge=-0.5, le=0.5)

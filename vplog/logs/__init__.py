@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 from vplog.logs.select import TopicChoice
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from vplog.stages import Log
 
-__all__ = ["TopicChoice", "open"]
+__all__ = ["TopicChoice", "open", "open_drive"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
@@ -22,3 +23,13 @@ def open(path: Path, topics: TopicChoice | None = None) -> Log:
     from vplog.logs.detect import open_log  # OpenCV, rosbags and mcap load here, not with the package
 
     return open_log(path, topics or TopicChoice())
+
+
+def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:
+    """One drive recorded in several files, given in any order; of one path, the same as `open`.
+
+    Raises LogError where the files overlap in time, differ in kind or have no topic in common.
+    """
+    from vplog.logs.detect import open_drive as open_parts
+
+    return open_parts(paths, topics or TopicChoice())

@@ -46,7 +46,7 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
     if calibration is None:
         return unknown
     matrix, model, distortion = calibration.matrix, calibration.model, calibration.distortion
-    if "image_rect" in name and calibration.projection[0, 0] > 0:
+    if is_rectified(name) and calibration.projection[0, 0] > 0:
         matrix, model, distortion = calibration.projection[:, :3], "", np.zeros(0)
     if not ((np.abs(matrix) < _LARGEST_PX).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         notes.add(f"The calibration of {name} is not set (K[0] = {matrix[0, 0]:g}); the camera counts as uncalibrated.")
@@ -60,6 +60,11 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
         return unknown
     camera = replace(unknown, matrix=matrix, distortion_model=known[0], distortion=known[1])
     return _fit(camera, calibration, notes)
+
+
+def is_rectified(topic: str) -> bool:
+    """image_proc and stereo_image_proc name their output so."""
+    return "image_rect" in topic
 
 
 def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:

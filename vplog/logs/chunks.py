@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
 KEPT = 4
 """Chunks kept: image and depth lie in neighbouring chunks, each about 1 MB in common writers."""
+MOST_BYTES = 64 * 2**20
+"""Bytes above which only the last chunk is kept, whatever their size."""
 
 
 class ChunkCache:
@@ -22,7 +24,7 @@ class ChunkCache:
     def __call__(self, number: int) -> bytes:
         if number not in self._kept:
             self._kept[number] = self._load(number)
-            if len(self._kept) > KEPT:
+            while len(self._kept) > KEPT or (len(self._kept) > 1 and sum(map(len, self._kept.values())) > MOST_BYTES):
                 self._kept.popitem(last=False)
         self._kept.move_to_end(number)
         return self._kept[number]

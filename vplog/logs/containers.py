@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from vplog.logs.losses import Account
+
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
 Place = tuple[int, ...]
 """Where a message lies in its container; only the container that gave it out can read it."""
@@ -47,13 +49,19 @@ class Contents:
 
 @dataclass
 class Notes:
-    """Warnings of a log, each once, in the order they were found."""
+    """What is said of a log: remarks, each once, in the order they were found, and the account of what is lost."""
 
-    lines: list[str] = field(default_factory=list)
+    account: Account = field(default_factory=Account)
+    _said: list[str] = field(default_factory=list)
 
     def add(self, line: str) -> None:
-        if line not in self.lines:
-            self.lines.append(line)
+        if line not in self._said:
+            self._said.append(line)
+
+    @property
+    def lines(self) -> list[str]:
+        """The losses first."""
+        return [*self.account.sentences, *self._said]
 
 
 class Container(Protocol):
@@ -77,6 +85,14 @@ def ordered(counts: dict[Channel, int]) -> dict[Channel, int]:
 
 def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
+    """Counts of topics, whatever the types under one name."""
+    result: dict[str, int] = {}
+    for channel, count in counts.items():
+        result[channel.topic] = result.get(channel.topic, 0) + count
+    return result
 
 
 def count_messages(messages: Iterable[Message], channels: Iterable[Channel]) -> Contents:

@@ -10,12 +10,16 @@ from vplog.logs import image_folder, mcap_file, ros1_bag, sqlite_bag
 from vplog.logs.containers import Notes, plural
 from vplog.logs.image_folder import ImageFolder
 from vplog.logs.mcap_file import McapFile
+from vplog.logs.packed import unpacked
+from vplog.logs.parts import Part, in_order_of_time
 from vplog.logs.recorded import RecordedLog
 from vplog.logs.ros1_bag import Ros1Bag
-from vplog.logs.ros2_folder import Chain, MetadataError, ZstdMessages, split_parts, storage_files
+from vplog.logs.ros2_folder import Chain, Counted, Metadata, MetadataError, ZstdMessages, read_metadata, split_parts
 from vplog.logs.sqlite_bag import SqliteBag
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vplog.logs.containers import Container
     from vplog.logs.select import TopicChoice
     from vplog.stages import Log
@@ -40,31 +44,72 @@ def open_log(path: Path, choice: TopicChoice) -> Log:
 
 
 def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
-    kind = _magic(path)
+    container, kind = open_container(path, notes)
+    return _recorded(path, _name(path), _KINDS[kind], container, notes, choice)
+
+
+def _recorded(path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice) -> RecordedLog:
+    log = RecordedLog(path, name, kind, container, notes, choice)
+    if (said := notes.account.sentences) and not container.contents().messages:
+        raise LogError(f"{path}: nothing in it can be read. {said[0]}")
+    return log
+
+
+def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container, str]:
+    """The messages of one file, unpacked first where it is compressed as a whole, and its kind. Raises LogError.
+
+    `name` is what the file is called where something is said of it, its own name where empty.
+    """
+    kind, inside = _magic(path), path
     if kind == "zstd":
-        raise LogError(f"{path} is compressed as a whole. Unpack it with `zstd -d {path.name}` and give that file.")
-    if not kind:
-        raise LogError(_no_log(path))
-    return RecordedLog(path, path.stem, _KINDS[kind], _READERS[kind](path, notes), notes, choice)
+        inside = unpacked(path)
+        kind = _magic(inside)
+    if kind not in _READERS:
+        raise LogError(_no_log(path) if inside is path else f"{path} holds something else than a log when unpacked.")
+    return _READERS[kind](inside, notes, name or path.name), kind
+
+
+def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
+    """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
+    paths = [Path(path) for path in paths]
+    if len(paths) == 1:
+        return open_log(paths[0], choice)
+    notes, parts = Notes(), []
+    for path in paths:
+        if path.is_dir() or not path.exists():
+            what = "a folder; give it by itself" if path.is_dir() else "no file"
+            raise LogError(f"{path} is {what}. A drive in several logs is given as its files.")
+        same_name = sum(other.name == path.name for other in paths) > 1
+        try:
+            container, kind = open_container(path, notes, str(path) if same_name else path.name)
+            parts.append(Part(path, kind, container, container.contents()))
+        except OSError as error:
+            raise LogError(f"Cannot read {path}: {error.strerror or error}.") from None
+        except LogError as error:
+            notes.account.add("missing_file", None, (str(path), 0), [], f"Left out: {error}")
+    if not parts:
+        raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
+    parts = in_order_of_time(parts)
+    first, chain = parts[0], Chain([part.container for part in parts])
+    return _recorded(first.path, _name(first.path), _KINDS[first.kind], chain, notes, choice)
 
 
 def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
     problem = None
     if (path / "metadata.yaml").is_file():
         try:
-            files, mode = storage_files(path, notes)
-            return _open_bag(path, files, mode, choice, notes)
+            return _open_bag(path, read_metadata(path), choice, notes)
         except MetadataError as error:
             problem = str(error)
     files = sorted((file for file in path.iterdir() if file.is_file()), key=image_folder.natural_order)
-    logs = [file for file in files if _magic(file) in _READERS]
+    logs = [file for file in files if _magic(file) in (*_READERS, "zstd")]
     if logs:
         return _open_found(path, logs, problem or f"{path.name} has no metadata.yaml", choice, notes)
     if problem:
         raise LogError(f"{problem} Copy the whole bag folder, or give a storage file itself.")
     images = [file for file in files if image_folder.is_image(file)]
     if images:
-        return ImageFolder(path, images, notes)
+        return ImageFolder(path, images, notes, choice)
     found = plural(len(files), "file") if files else "nothing"
     raise LogError(f"{path} holds {found}, but no log and no images. A log is {_KNOWN}.")
 
@@ -78,36 +123,40 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
         names = ", ".join(file.name for file in logs[:_LISTED])
         raise LogError(f"{problem.rstrip('.')}, and the folder holds {len(logs)} logs. Give one of them: {names}.")
     notes.add(f"{problem.rstrip('.')}; {plural(len(parts), 'storage file')} found by content.")
-    return _open_bag(path, parts, "", choice, notes)
+    return _open_bag(path, Metadata(parts, [], "", {}, 0, 0), choice, notes)
 
 
-def _open_bag(folder: Path, files: list[Path], mode: str, choice: TopicChoice, notes: Notes) -> Log:
+def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> Log:
     """A ROS 2 bag of several storage files. An unreadable one is left out as long as another is sound."""
     name = folder.resolve().name
     parts: list[Container] = []
     kinds: set[str] = set()
     failures: list[LogError] = []
-    for file in files:
+    for file in metadata.files:
         try:
-            container, kind = _open_part(file, notes)
+            container, kind = open_container(file, notes)
+            if kind == "ros1":
+                raise LogError(f"{file} is a ROS 1 bag, which no ROS 2 bag holds.")
             parts.append(container)
             kinds.add(kind)
         except LogError as error:
             failures.append(error)
+            notes.account.add("missing_file", None, (file.name, 0), [], f"Left out: {error}")
     if not parts:
         raise failures[0]
-    for failure in failures:
-        notes.add(f"Left out: {failure}")
-    chain = Chain(parts)
-    container = ZstdMessages(chain, notes) if mode == "message" else chain
-    return RecordedLog(folder, name, "ros2-mcap" if "mcap" in kinds else "ros2-db3", container, notes, choice)
+    for missing in metadata.missing:
+        detail = f"{name} lacks {missing}, which metadata.yaml names."
+        notes.account.add("missing_file", None, (missing, 0), [], detail)
+    chain: Container = Chain(parts)
+    files = [file.name for file in metadata.files] + metadata.missing
+    counted = Counted(chain, metadata, files, notes) if metadata.recorded else chain
+    container = ZstdMessages(counted, notes) if metadata.mode == "message" else counted
+    return _recorded(folder, name, "ros2-mcap" if "mcap" in kinds else "ros2-db3", container, notes, choice)
 
 
-def _open_part(file: Path, notes: Notes) -> tuple[Container, str]:
-    kind = _magic(file)
-    if kind in ("mcap", "db3"):
-        return _READERS[kind](file, notes), kind
-    raise LogError(_no_log(file) if kind != "zstd" else f"{file} is compressed as a whole. Unpack it with `zstd -d`.")
+def _name(path: Path) -> str:
+    """Without the endings of its format and of its compression."""
+    return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
 
 
 def _magic(path: Path) -> str:

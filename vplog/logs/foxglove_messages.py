@@ -1,4 +1,4 @@
-"""Foxglove messages, protobuf and JSON (docs.foxglove.dev/docs/sdk/schemas), through Foxglove's own classes.
+"""Foxglove messages, protobuf, JSON and FlatBuffers (docs.foxglove.dev/docs/sdk/schemas), through Foxglove's classes.
 
 The file's descriptors are not built: these types are fixed by their names, and a stranger's schema runs nothing.
 """
@@ -13,12 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
+from vplog.logs.flat_messages import fill_flat
 from vplog.logs.messages import (
     BadMessageError,
     CalibrationMessage,
@@ -44,6 +47,8 @@ def decode_foxglove(kind: str, encoding: str, data: bytes) -> Record:
     message = make()
     if encoding == "json":
         _fill(message, json.loads(data))
+    elif encoding == "flatbuffer":
+        fill_flat(message, data)
     else:
         message.ParseFromString(data)
     return read(message)
@@ -99,12 +104,20 @@ def _calibration(m: Any) -> Record:
     matrix, projection = _matrix(m.K, (3, 3)), _matrix(m.P, (3, 4))
     distortion = np.array(m.D, np.float64)
     return CalibrationMessage(
-        _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, distortion, matrix, projection
-    )
+        _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, distortion, matrix, projection,
+        _matrix(m.R, (3, 3)),
+    )  # fmt: skip
 
 
 def _pose(m: Any) -> Record:
     return PoseMessage(_stamp(m), m.frame_id, "", _xyz(m.pose.position), _xyzw(m.pose.orientation), None)
+
+
+def _odometry(m: Any) -> Record:
+    covariance = _matrix(m.pose_covariance, (6, 6))
+    return PoseMessage(
+        _stamp(m), m.frame_id, m.body_frame_id, _xyz(m.pose.position), _xyzw(m.pose.orientation), covariance
+    )
 
 
 def _fix(m: Any) -> Record:
@@ -114,7 +127,8 @@ def _fix(m: Any) -> Record:
 
 
 def _transform(m: Any) -> TransformMessage:
-    return TransformMessage(m.parent_frame_id, m.child_frame_id, _xyz(m.translation), _xyzw(m.rotation))
+    position, quaternion = _xyz(m.translation), _xyzw(m.rotation)
+    return TransformMessage(m.parent_frame_id, m.child_frame_id, position, quaternion, _stamp(m))
 
 
 def _one_transform(m: Any) -> Record:
@@ -141,8 +155,10 @@ def _xyzw(q: Any) -> Floats:
 _READERS: dict[str, tuple[type[Proto], Callable[[Any], Record]]] = {
     "foxglove.RawImage": (RawImage, _raw),
     "foxglove.CompressedImage": (CompressedImage, _compressed),
+    "foxglove.CompressedVideo": (CompressedVideo, _compressed),
     "foxglove.CameraCalibration": (CameraCalibration, _calibration),
     "foxglove.PoseInFrame": (PoseInFrame, _pose),
+    "foxglove.Odometry": (Odometry, _odometry),
     "foxglove.LocationFix": (LocationFix, _fix),
     "foxglove.FrameTransform": (FrameTransform, _one_transform),
     "foxglove.FrameTransforms": (FrameTransforms, _transforms),

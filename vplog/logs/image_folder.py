@@ -1,16 +1,18 @@
-"""A folder of images as a Log: no odometry, no calibration."""
+"""A folder of images as a Log: odometry and calibration come from files beside it, if at all."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Camera, Frame, LogInfo, Topic
+from vplog.data import Frame, LogInfo, Topic
 from vplog.errors import LogError
+from vplog.logs.beside import Beside
+from vplog.logs.cameras import camera_of
 from vplog.logs.images import grey
 from vplog.logs.messages import BadMessageError, ImageMessage
 from vplog.logs.stamps import increasing, rows_of
@@ -19,8 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from vplog.data import Bytes, Gps, Ints, Odometry
+    from vplog.data import Bytes, Camera, Gps, Ints, Odometry
     from vplog.logs.containers import Notes
+    from vplog.logs.losses import Loss
+    from vplog.logs.select import TopicChoice
 
 PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""
@@ -72,14 +76,16 @@ class FileFrame:
 class ImageFolder:
     """The images of one folder, in natural order of their names or in order of the times in them."""
 
-    def __init__(self, path: Path, files: list[Path], notes: Notes) -> None:
+    def __init__(self, path: Path, files: list[Path], notes: Notes, choice: TopicChoice) -> None:
         files = sorted(files, key=natural_order)
         times = stamps_of([file.stem for file in files])
         if times is None:
             notes.add(f"The names in {path.name} are not times; its images are taken to be 0.1 s apart.")
             times = [i * PERIOD_NS for i in range(len(files))]
         stamp_ns, rows = increasing(np.array(times, np.int64), path.name, notes)
-        self._path, self._notes = path, notes
+        if len(rows) < len(files):
+            notes.account.add("repeated_stamp", {path.name: len(files) - len(rows)}, (path.name, 0), [])
+        self._path, self._notes, self._beside = path, notes, Beside(choice, notes)
         self._stamp_ns, self._files = stamp_ns, [files[row] for row in rows.tolist()]
 
     @property
@@ -89,6 +95,10 @@ class ImageFolder:
     @property
     def warnings(self) -> list[str]:
         return list(self._notes.lines)
+
+    @property
+    def losses(self) -> list[Loss]:
+        return self._notes.account.losses
 
     def info(self) -> LogInfo:
         count = len(self._files)
@@ -107,7 +117,7 @@ class ImageFolder:
             yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row])
 
     def odometry(self) -> Odometry | None:
-        return None
+        return self._beside.odometry
 
     def gps(self) -> Gps | None:
         return None
@@ -115,7 +125,11 @@ class ImageFolder:
     @cached_property
     def _camera(self) -> Camera:
         height, width = _read(self._files[0]).shape
-        return Camera(self.name, None, "none", np.zeros(0), width, height, np.eye(4))
+        known = self._beside.camera(self.name)
+        camera = camera_of(self.name, known.calibration if known else None, (width, height), self._notes)
+        if known is None or known.body_from_camera is None:
+            return camera
+        return replace(camera, body_from_camera=known.body_from_camera)
 
 
 def _read(path: Path) -> Bytes:

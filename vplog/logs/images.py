@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -40,9 +41,31 @@ _LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "8UC4": ("u1", 4, cv2.COLOR_BGRA2GRAY),
     "mono16": ("u2", 1, None),
     "16UC1": ("u2", 1, None),
+    "rgb16": ("u2", 3, cv2.COLOR_RGB2GRAY),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2GRAY),
+    "rgba16": ("u2", 4, cv2.COLOR_RGBA2GRAY),
+    "bgra16": ("u2", 4, cv2.COLOR_BGRA2GRAY),
     "32FC1": ("f4", 1, None),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
+    "nv12": ("u1", 1, None),
+    "nv21": ("u1", 1, None),
+    "nv24": ("u1", 1, None),
 }
-"""ROS encoding: type of a channel, channels, OpenCV's conversion to grey (8UC3 is BGR, as cv_bridge has it)."""
+"""ROS encoding: type of a channel, channels, OpenCV's conversion to grey (8UC3 is BGR, as cv_bridge has it). Of nv12,
+nv21 and nv24 the luma comes first, and it is the grey image; what follows is not read."""
+_MOSAICS = {
+    "rggb": cv2.COLOR_BayerBG2GRAY,
+    "bggr": cv2.COLOR_BayerRG2GRAY,
+    "gbrg": cv2.COLOR_BayerGR2GRAY,
+    "grbg": cv2.COLOR_BayerGB2GRAY,
+}
+"""ROS names a mosaic by its first two rows, OpenCV by the second and third px of its second row."""
+_LAYOUTS |= {f"bayer_{name}{8 * size}": (f"u{size}", 1, code) for name, code in _MOSAICS.items() for size in (1, 2)}
+_COLOURS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+"""As OpenCV decodes them."""
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 
 
@@ -54,16 +77,24 @@ def is_depth(message: ImageMessage) -> bool:
 
 
 def grey(message: ImageMessage) -> Bytes:
-    """(H, W) uint8. 16-bit images lose their low byte. Raises BadMessageError."""
+    """(H, W) uint8; of more bits the highest eight that are used. Raises BadMessageError."""
     if message.compressed:
-        image = _imdecode(message.data, cv2.IMREAD_GRAYSCALE)
-        return np.asarray(image, np.uint8)
-    pixels, conversion = _raw(message)
+        mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH if mosaic is None else cv2.IMREAD_UNCHANGED
+        pixels, conversion = _imdecode(message.data, flags), None
+        if mosaic is not None:  # some transports compress the mosaic as it is
+            conversion = mosaic[2] if pixels.ndim == 2 else _COLOURS[pixels.shape[2]]
+    else:
+        pixels, conversion = _raw(message)
     if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
+        # cameras of 10, 12 and 14 bits fill the low bits of 16: the high byte alone would be black
+        pixels = (pixels >> max(int(pixels.max()).bit_length() - 8, 0)).astype(np.uint8)
     if pixels.dtype != np.uint8:
-        raise BadMessageError(f"encoding {message.encoding} is depth, not an image")
-    return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion))
+        raise BadMessageError(f"encoding {message.encoding[:40]!r} is depth, not an image")
+    try:
+        return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion))
+    except cv2.error:  # a mosaic or a row of shared colours of one px
+        raise BadMessageError(f"{message.encoding[:40]!r} with {pixels.shape[1]} x {pixels.shape[0]} px") from None
 
 
 def depth_m(message: ImageMessage) -> Float32s:
@@ -74,8 +105,11 @@ def depth_m(message: ImageMessage) -> Float32s:
     if message.data.startswith(_PNG):
         return _metres(_imdecode(message.data, cv2.IMREAD_UNCHANGED), message.encoding)
     if "rvl" in message.encoding.lower():
-        raise BadMessageError("compressedDepth with RVL is not supported; record it with PNG")
-    pixels = _imdecode(message.data[_DEPTH_HEADER:], cv2.IMREAD_UNCHANGED)
+        from vplog.logs.rvl import decode_rvl  # numba loads here
+
+        pixels = decode_rvl(message.data[_DEPTH_HEADER:])
+    else:
+        pixels = _imdecode(message.data[_DEPTH_HEADER:], cv2.IMREAD_UNCHANGED)
     if not message.encoding.startswith("32FC1"):
         return _metres(pixels, message.encoding)
     # 32FC1 is stored as quantised inverse depth: raw = a / depth + b (compressed_depth_image_transport, codec.cpp).
@@ -119,6 +153,8 @@ def _imdecode(data: bytes, flags: int) -> Any:
     size = image_size(data)
     if size is None:
         raise BadMessageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP or PNM image")
+    if data.startswith(_PNG) and not _png_is_sound(data):
+        raise BadMessageError("the checksum of its PNG does not match")
     limit = MAX_PIXELS if data.startswith(b"RIFF") else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
     if size[0] * size[1] > limit:
         raise BadMessageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
@@ -159,6 +195,22 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
             return struct.unpack_from(">II", data, 16)
         position += 12 + length  # length, type, data, CRC
     return None
+
+
+def _png_is_sound(data: bytes) -> bool:
+    """By the CRC of every chunk; OpenCV's decoder would find the same, and say so on stderr."""
+    position, view = len(_PNG), memoryview(data)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        stop = position + 8 + length
+        if stop + 4 > len(data) or zlib.crc32(view[position + 4 : stop]) != int.from_bytes(
+            data[stop : stop + 4], "big"
+        ):
+            return False
+        if kind == b"IEND":
+            return True
+        position = stop + 4
+    return False
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:

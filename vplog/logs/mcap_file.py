@@ -1,7 +1,6 @@
-"""MCAP files (mcap.dev/spec), whole, cut or without a summary.
+"""MCAP files (mcap.dev/spec), whole, cut, damaged or without a summary, as a Container.
 
-The file is walked record by record once; chunks are stepped over, so that walk reads a few kB per MB. What the
-message indexes behind the chunks say then spares the unpacking of chunks without a topic of interest.
+What the message indexes behind the chunks say spares the unpacking of chunks without a topic of interest.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from mcap import records
@@ -17,195 +15,216 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from vplog.errors import LogError
 from vplog.logs.chunks import ChunkCache
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import Channel, Contents, Message, Notes, count_messages, ordered, plural
+from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered, plural
+from vplog.logs.mcap_layout import MAGIC, RECORD, read_layout
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from vplog.logs.containers import Place
+    from vplog.logs.mcap_layout import Chunk
 
-MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")
-"""Opcode and length before every record."""
+__all__ = ["MAGIC", "McapFile"]
+
 _MESSAGE = struct.Struct("<HIQQ")
 """Channel id, sequence, log time, publish time: the head of a message record."""
-_CHUNK_HEAD = struct.Struct("<QQQII")
-"""Start, end, unpacked size, CRC, length of the compression's name: the head of a chunk record."""
-_MAX_DEFINITION = 16 * 2**20
-"""Bytes of a schema or channel record that are read; the largest real schemas are some 100 kB."""
-
-
-@dataclass
-class _Chunk:
-    """A chunk of messages; or, with compression None, one message record outside any chunk."""
-
-    start: int
-    """Offset of the record's content in the file."""
-    stop: int
-    compression: str | None
-    size: int
-    crc: int
-    first_ns: int
-    last_ns: int
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages per channel id, from the message indexes behind it; empty where the writer left none."""
-    cut: bool = False
+_IDL = ("ros2idl", "omgidl")
+"""Schema languages whose writers may name types as C++ and DDS do."""
 
 
 class McapFile:
     """A Container over one MCAP file."""
 
-    def __init__(self, path: Path, notes: Notes) -> None:
-        self._path, self._notes = path, notes
+    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
+        """`name` is what the file is called where something is said of it."""
+        self._name, self._notes = name or path.name, notes
         self._file = path.open("rb")
-        self._length = path.stat().st_size
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: ""}
-        self._chunks: list[_Chunk] = []
-        self._cut_at: int | None = None
+        self._doubtful: set[tuple[int, int]] = set()
+        """Opcodes and ids of schemas and channels from damaged chunks, until a sound one says the same."""
+        self._length = path.stat().st_size
+        self._layout = read_layout(self._file, self._length, self._define, self._name)
         self._data = ChunkCache(self._unpack)
-        self._walk()
 
     def contents(self) -> Contents:
-        found = self._indexed() or count_messages(self._scan(None), self._channels.values())
-        if self._cut_at is not None:
-            left = f"the {plural(found.messages, 'message')} before it are read"
-            self._notes.add(f"{self._path.name} is cut or damaged at byte {self._cut_at}; {left}.")
-        return found
+        """Counted by the indexes behind the chunks; a chunk without is unpacked."""
+        counts: dict[Channel, int] = {}
+        times: list[int] = []
+        for number, chunk in enumerate(self._layout.chunks):
+            if chunk.counts and chunk.counts.keys() <= self._channels.keys():
+                found = chunk.counts
+                times += (chunk.first_ns, chunk.last_ns)
+            else:
+                found = {}
+                for channel_id, log_ns, _, _ in self._messages(number):
+                    found[channel_id] = found.get(channel_id, 0) + 1
+                    times = [*times[-2:], log_ns] if not times else [min(*times, log_ns), max(*times, log_ns)]
+            for channel_id, count in found.items():
+                if channel_id in self._channels:
+                    channel = self._channels[channel_id]
+                    counts[channel] = counts.get(channel, 0) + count
+            times = [min(times), max(times)] if times else []
+        counts = ordered(dict.fromkeys(self._channels.values(), 0) | counts)
+        start_ns, end_ns = (times[0], times[-1]) if times else (0, 0)
+        self._account_for(by_topic(counts), start_ns, end_ns)
+        return Contents(counts, start_ns, end_ns)
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        return self._scan(set(channels))
+        wanted = set(channels)
+        for number, chunk in enumerate(self._layout.chunks):
+            if not self._may_hold(chunk, wanted):
+                continue
+            data = self._data(number)
+            for channel_id, log_ns, start, stop in self._messages(number):
+                channel = self._channels.get(channel_id)
+                if channel in wanted and channel is not None:
+                    yield Message(channel, log_ns, data[start:stop], (number, start, stop))
 
     def read(self, place: Place) -> bytes:
         chunk, start, stop = place
         return self._data(chunk)[start:stop]
 
-    def _indexed(self) -> Contents | None:
-        """The contents by the indexes behind the chunks; None where they do not cover the file."""
-        if any(not c.counts or not c.counts.keys() <= self._channels.keys() for c in self._chunks):
-            return None
-        counts = dict.fromkeys(self._channels.values(), 0)
-        for chunk in self._chunks:
-            for channel_id, count in chunk.counts.items():
-                counts[self._channels[channel_id]] += count
-        start_ns = min((chunk.first_ns for chunk in self._chunks), default=0)
-        return Contents(ordered(counts), start_ns, max((chunk.last_ns for chunk in self._chunks), default=0))
+    def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
+        """What the walk could not find, and how much of what was recorded that is."""
+        layout, account, name = self._layout, self._notes.account, self._name
+        recorded = self._topics(layout.recorded)
+        lost = dict(found)
+        for chunk in layout.missing:
+            counts = self._topics(chunk.counts)
+            account.add("damaged_bytes", counts or None, (name, chunk.start), [(chunk.first_ns, chunk.last_ns)])
+            for topic, count in counts.items():
+                lost[topic] = lost.get(topic, 0) + count
+        for start, stop, chunks in layout.gaps:
+            if not layout.missing:
+                detail = f"{name} is damaged near byte {start}; it is read again from byte {stop} on."
+                account.add("damaged_bytes", None, (name, start), self._between(chunks, start_ns, end_ns), detail)
+        if layout.cut_at is not None:
+            total = sum(found.values())
+            detail = (
+                f"{name} is cut or damaged at byte {layout.cut_at} of {self._length}; "
+                f"the {plural(total, 'message')} before it are read."
+            )
+            account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)], detail)
+        if layout.index_cut_at is not None:
+            at = layout.index_cut_at
+            self._notes.add(f"{name} is cut or damaged at byte {at}, behind its messages; none is lost.")
+        whole = layout.cut_at is None and not layout.gaps
+        account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
+        account.settle({name}, recorded, found)
 
-    def _walk(self) -> None:
-        """Find every chunk and definition of the data and summary sections."""
-        if self._file.read(len(MAGIC)) != MAGIC:
-            raise LogError(f"{self._path} does not start as an MCAP file does.")
-        position, ended = len(MAGIC), False
-        while not ended:
-            head = self._at(position, _RECORD.size) if position < self._length else b""
-            if len(head) < _RECORD.size:
-                break
-            opcode, length = _RECORD.unpack(head)
-            start = position + _RECORD.size
-            stop = start + length
-            if opcode == 0 or (stop > self._length and opcode != Opcode.CHUNK):
-                break  # opcode 0 is invalid by the specification
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, self._at(start, min(length, _MAX_DEFINITION)))
-            elif opcode == Opcode.CHUNK:
-                self._add_chunk(start, min(stop, self._length), cut=stop > self._length)
-            elif opcode == Opcode.MESSAGE:
-                self._add_lone_message(start, stop)
-            elif opcode == Opcode.MESSAGE_INDEX and self._chunks and length >= 6:  # channel id, size of its entries
-                channel_id, size = struct.unpack("<HI", self._at(start, 6))
-                if size:
-                    self._chunks[-1].counts[channel_id] = size // 16  # each entry: time and offset, 8 bytes each
-            ended = opcode == Opcode.FOOTER
-            position = stop
-        if not ended:
-            self._cut_at = min(position, self._length)
+    def _between(self, chunks: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+        """The time between the chunk before a gap and the one behind it."""
+        found = self._layout.chunks
+        before = found[chunks - 1].last_ns if 0 < chunks <= len(found) else start_ns
+        behind = found[chunks].first_ns if chunks < len(found) else end_ns
+        return [(min(before, behind), max(before, behind))]
 
-    def _add_chunk(self, start: int, stop: int, cut: bool) -> None:
-        head = self._at(start, _CHUNK_HEAD.size)
-        if len(head) < _CHUNK_HEAD.size:
-            return
-        first_ns, last_ns, size, crc, name_length = _CHUNK_HEAD.unpack(head)
-        name = self._at(start + _CHUNK_HEAD.size, min(name_length, 20))  # known names have 0 to 4 bytes
-        data = start + _CHUNK_HEAD.size + name_length + 8
-        if data <= stop and size:
-            (length,) = struct.unpack("<Q", self._at(data - 8, 8))
-            stop = min(stop, data + length)
-            kind = name.decode("utf-8", "replace")
-            self._chunks.append(_Chunk(data, stop, kind, size, crc, first_ns, last_ns, cut=cut))
+    def _topics(self, counts: dict[int, int]) -> dict[str, int]:
+        """Counts of channel ids by topic, zero and less left out."""
+        result: dict[str, int] = {}
+        for channel_id, count in counts.items():
+            if count > 0 and (channel := self._channels.get(channel_id)) is not None:
+                result[channel.topic] = result.get(channel.topic, 0) + count
+        return result
 
-    def _add_lone_message(self, start: int, stop: int) -> None:
-        """Neighbouring messages outside chunks are kept as one run."""
-        last = self._chunks[-1] if self._chunks else None
-        if last and last.compression is None and last.stop == start - _RECORD.size and stop - last.start < 2**20:
-            last.stop = stop
-        else:
-            self._chunks.append(_Chunk(start - _RECORD.size, stop, None, 0, 0, 0, 0))
-
-    def _define(self, opcode: int, data: bytes) -> None:
+    def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
         stream = ReadDataStream(io.BytesIO(data))
         try:
             if opcode == Opcode.SCHEMA:
                 schema = records.Schema.read(stream)
-                self._schemas[schema.id] = schema.name
+                if self._is_news(opcode, schema.id, schema.id in self._schemas, doubtful):
+                    self._schemas[schema.id] = _ros_name(schema.name) if schema.encoding in _IDL else schema.name
             else:
                 channel = records.Channel.read(stream)
                 # A summary may repeat channels without their schemas: such a channel waits for the one in the data.
-                if channel.schema_id in self._schemas and channel.id not in self._channels:
+                known = channel.id in self._channels
+                if channel.schema_id in self._schemas and self._is_news(opcode, channel.id, known, doubtful):
                     name = self._schemas[channel.schema_id]
                     self._channels[channel.id] = Channel(channel.topic, name, channel.message_encoding)
         except (struct.error, UnicodeDecodeError, McapError):
-            self._notes.add(f"{self._path.name} holds a damaged schema or channel; its messages are left out.")
+            self._notes.add(f"{self._name} holds a damaged schema or channel; its messages are left out.")
 
-    def _scan(self, wanted: set[Channel] | None) -> Iterator[Message]:
-        unknown = 0
-        for number, chunk in enumerate(self._chunks):
-            if wanted is not None and not self._may_hold(chunk, wanted):
-                continue
-            data = self._data(number)
-            position = 0
-            while position + _RECORD.size <= len(data):
-                opcode, length = _RECORD.unpack_from(data, position)
-                start, stop = position + _RECORD.size, position + _RECORD.size + length
-                if stop > len(data):
-                    self._notes.add(
-                        f"{self._path.name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
-                    )
-                    break
-                if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
-                    channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
-                    channel = self._channels.get(channel_id)
-                    unknown += channel is None
-                    if channel is not None and (wanted is None or channel in wanted):
-                        body = start + _MESSAGE.size
-                        yield Message(channel, log_ns, data[body:stop], (number, body, stop))
-                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._define(opcode, data[start:stop])
-                position = stop
+    def _is_news(self, opcode: int, number: int, known: bool, doubtful: bool) -> bool:
+        """The first sound definition of a number holds; one from a damaged chunk until there is a sound one."""
+        news = not known or ((opcode, number) in self._doubtful and not doubtful)
+        if news and doubtful:
+            self._doubtful.add((opcode, number))
+        elif news:
+            self._doubtful.discard((opcode, number))
+        return news
+
+    def _messages(self, number: int) -> Iterator[tuple[int, int, int, int]]:
+        """Channel id, log time, start and stop of every message in a chunk; at its end, what it was short of."""
+        chunk, data = self._layout.chunks[number], self._data(number)
+        seen: dict[int, int] = {}
+        unknown, position, last_ns = 0, 0, chunk.first_ns
+        while position + RECORD.size <= len(data):
+            opcode, length = RECORD.unpack_from(data, position)
+            start, stop = position + RECORD.size, position + RECORD.size + length
+            if stop > len(data):
+                break
+            if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
+                channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
+                seen[channel_id] = seen.get(channel_id, 0) + 1
+                last_ns = log_ns
+                unknown += channel_id not in self._channels
+                yield channel_id, log_ns, start + _MESSAGE.size, stop
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._define(opcode, data[start:stop])
+            position = stop
+        key, account = (self._name, chunk.start), self._notes.account
         if unknown:
-            self._notes.add(f"{self._path.name}: {plural(unknown, 'message')} of unknown channels left out.")
+            account.add("unknown_channel", {"": unknown}, key, [(chunk.first_ns, chunk.last_ns)])
+        if (
+            data
+            and not chunk.cut
+            and (position < len(data) or any(seen.get(i, 0) < n for i, n in chunk.counts.items()))
+        ):
+            short = self._topics({i: n - seen.get(i, 0) for i, n in chunk.counts.items()})
+            detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
+            span = (min(last_ns, chunk.last_ns), chunk.last_ns)
+            account.add("damaged_chunk", short if chunk.counts else None, key, [span], detail)
 
-    def _may_hold(self, chunk: _Chunk, wanted: set[Channel]) -> bool:
+    def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
         """Not where its indexes name only channels that are known and not wanted."""
         return not chunk.counts or any(self._channels.get(i) in wanted or i not in self._channels for i in chunk.counts)
 
     def _unpack(self, number: int) -> bytes:
-        """The records of one chunk; empty, with a note, where it is damaged."""
-        chunk = self._chunks[number]
-        data = self._at(chunk.start, chunk.stop - chunk.start)
-        if chunk.compression is not None:
-            try:
-                data = unpack(chunk.compression, data, chunk.size, partial=chunk.cut)
-                if chunk.crc and not chunk.cut and zlib.crc32(data) != chunk.crc:
-                    raise BadChunkError("its checksum does not match")
-            except BadChunkError as error:
-                self._notes.add(f"{self._path.name} has a damaged chunk at byte {chunk.start}, left out: {error}.")
-                data = b""
+        """The records of one chunk; empty, and accounted for, where it is damaged."""
+        chunk = self._layout.chunks[number]
+        self._file.seek(chunk.start)
+        data = self._file.read(chunk.stop - chunk.start)
+        if chunk.compression is None:
+            return data
+        try:
+            data = unpack(chunk.compression, data, chunk.size, partial=chunk.cut)
+            if chunk.crc and not chunk.cut and zlib.crc32(data) != chunk.crc:
+                self._define_all(data)
+                raise BadChunkError("its checksum does not match")
+        except BadChunkError as error:
+            detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
+            span = (chunk.first_ns, max(chunk.first_ns, chunk.last_ns))
+            counts = self._topics(chunk.counts) if chunk.counts else None
+            self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), [span], detail)
+            return b""
         return data
 
-    def _at(self, position: int, length: int) -> bytes:
-        self._file.seek(position)
-        return self._file.read(length)
+    def _define_all(self, data: bytes) -> None:
+        """Schemas and channels of a chunk whose checksum is wrong: other chunks need them, and a wrong one fails to
+        decode, which a wrong message may not."""
+        position = 0
+        while position + RECORD.size <= len(data):
+            opcode, length = RECORD.unpack_from(data, position)
+            position += RECORD.size
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and position + length <= len(data):
+                self._define(opcode, data[position : position + length], doubtful=True)
+            position += length
+
+
+def _ros_name(name: str) -> str:
+    """`sensor_msgs/msg/Image` of `sensor_msgs::msg::Image` and of DDS's `sensor_msgs::msg::dds_::Image_`."""
+    return name.replace("::", "/").replace("/dds_/", "/").rstrip("_")

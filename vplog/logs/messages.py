@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -41,6 +43,8 @@ class CalibrationMessage:
     """(3, 3) of the image as the sensor gives it; all zero where uncalibrated."""
     projection: Floats
     """(3, 4) of the rectified image; all zero where unknown."""
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+    """(3, 3) rectified_from_camera of a stereo pair; the identity or all zero without one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,7 @@ class TransformMessage:
     child: str
     position: Floats
     quaternion: Floats
+    stamp_ns: int = 0
 
 
 Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[TransformMessage]
@@ -87,12 +92,17 @@ _KINDS = {
     "sensor_msgs/CompressedImage": "image",
     "foxglove.CompressedImage": "image",
     "foxglove.RawImage": "image",
+    "foxglove.CompressedVideo": "image",
+    "foxglove_msgs/CompressedVideo": "image",
+    "ffmpeg_image_transport_msgs/FFMPEGPacket": "image",
     "sensor_msgs/CameraInfo": "camera_info",
     "foxglove.CameraCalibration": "camera_info",
     "nav_msgs/Odometry": "odometry",
     "geometry_msgs/PoseStamped": "odometry",
     "geometry_msgs/PoseWithCovarianceStamped": "odometry",
+    "geometry_msgs/TransformStamped": "odometry",
     "foxglove.PoseInFrame": "odometry",
+    "foxglove.Odometry": "odometry",
     "sensor_msgs/NavSatFix": "gps",
     "foxglove.LocationFix": "gps",
     "tf2_msgs/TFMessage": "tf",
@@ -100,7 +110,7 @@ _KINDS = {
     "foxglove.FrameTransform": "tf",
     "foxglove.FrameTransforms": "tf",
 }
-_ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxglove"}
+_ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxglove", "flatbuffer": "foxglove"}
 
 
 def kind_of(channel: Channel) -> str:

@@ -2,58 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from vplog.data import Frame, LogInfo, Topic
+from vplog.data import LogInfo, Topic
 from vplog.errors import LogError
-from vplog.logs.cameras import body_from_camera, camera_of
-from vplog.logs.content import Content, read_content
-from vplog.logs.images import depth_m, grey, is_depth
-from vplog.logs.messages import BadMessageError, CalibrationMessage, ImageMessage, decode, kind_of
-from vplog.logs.select import Candidate, TopicChoice, select
+from vplog.logs.beside import Beside
+from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
+from vplog.logs.candidates import read_candidates
+from vplog.logs.content import read_content
+from vplog.logs.frames import RecordedFrame, size_of
+from vplog.logs.losses import Account
+from vplog.logs.pictures import Pictures
+from vplog.logs.select import TopicChoice, select
 from vplog.logs.stamps import rows_of
-from vplog.logs.transforms import clean
+from vplog.logs.stereo import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
-    import numpy as np
-
-    from vplog.data import Camera, Gps, Ints, Odometry
+    from vplog.data import Bytes, Camera, Gps, Ints, Odometry
     from vplog.logs.containers import Channel, Container, Contents, Notes
+    from vplog.logs.content import Content
+    from vplog.logs.losses import Loss
+    from vplog.logs.stereo import Pair
 
 _LISTED = 8
 """Topics that an error lists."""
-_TRIED = 10
-"""Images tried for the size of all; a drive whose first second is damaged is not usable."""
-
-
-@dataclass(eq=False)
-class RecordedFrame:
-    """One image message and its depth message, still as bytes; decoding needs nothing else."""
-
-    stamp_ns: int
-    camera: Camera
-    image_channel: Channel
-    image_data: bytes
-    depth_channel: Channel | None
-    depth_data: bytes | None
-
-    def decode(self) -> Frame:
-        """Raises LogError with topic and stamp where the bytes are not an image."""
-        image = _pixels(self.image_channel, self.image_data, self.stamp_ns, grey)
-        depth = None
-        if self.depth_channel is not None and self.depth_data is not None:
-            depth = _pixels(self.depth_channel, self.depth_data, self.stamp_ns, depth_m)
-            if depth.shape != image.shape:
-                raise LogError(
-                    f"{self.depth_channel.topic} at {self.stamp_ns} ns is {_size(depth)} px, but the image is "
-                    f"{_size(image)} px. Depth must be registered to the image; choose another with --depth-topic."
-                )
-        return Frame(self.stamp_ns, self.camera, image, depth)
 
 
 class RecordedLog:
@@ -64,8 +41,9 @@ class RecordedLog:
     ) -> None:
         self._path, self._name, self._kind, self._container, self._notes = path, name, kind, container, notes
         self._contents: Contents = container.contents()
-        self._candidates = self._read_candidates()
+        self._candidates = read_candidates(container, self._contents)
         self._selection = select(self._candidates, choice, path.name)
+        self._beside_log = Beside(choice, notes)
 
     @property
     def name(self) -> str:
@@ -75,14 +53,14 @@ class RecordedLog:
     def warnings(self) -> list[str]:
         return list(self._notes.lines)
 
+    @property
+    def losses(self) -> list[Loss]:
+        """What could not be used so far, counted; complete once the log was read."""
+        return self._notes.account.losses
+
     def info(self) -> LogInfo:
         """Reads the chosen topics once, so that the warnings are complete."""
-        used = set(self._selection.channels)
-        roles = {candidate.channel: candidate.role for candidate in self._candidates}
-        topics = [
-            Topic(channel.topic, channel.type, channel.encoding, count, roles.get(channel, ""), channel in used)
-            for channel, count in self._contents.counts.items()
-        ]
+        topics = [self._topic(channel, count) for channel, count in self._contents.counts.items()]
         content = self._content
         if self._selection.image is not None:
             self._check_images()
@@ -91,7 +69,21 @@ class RecordedLog:
         start_ns = min((int(s[0]) for s in stamps), default=self._contents.start_ns)
         end_ns = max((int(s[-1]) for s in stamps), default=self._contents.end_ns)
         messages = self._contents.messages
-        return LogInfo(str(self._path), self._kind, start_ns, end_ns, messages, topics, self.warnings)
+        frames = [frame for frame in content.frames if frame]
+        return LogInfo(
+            str(self._path), self._kind, start_ns, end_ns, messages, topics, self.warnings, frames, content.skew_ms
+        )
+
+    def _topic(self, channel: Channel, count: int) -> Topic:
+        part = self._selection.parts.get(channel, "")
+        known = next((c for c in self._candidates if c.channel == channel), None)
+        if known is None:
+            return Topic(channel.topic, channel.type, channel.encoding, count, "", bool(part), part)
+        calibrated = known.calibrated if known.role == "camera_info" else None
+        return Topic(
+            channel.topic, channel.type, channel.encoding, count, known.role, bool(part), part, known.encoding,
+            *known.size, known.frame, calibrated,
+        )  # fmt: skip
 
     def camera(self) -> Camera:
         """Raises LogError where the log has no images."""
@@ -103,12 +95,12 @@ class RecordedLog:
 
     def frames(self, stamp_ns: Ints) -> Iterator[RecordedFrame]:
         """Raises LogError where a stamp is not one of `stamps()`."""
-        image, camera = self._image_channel(), self.camera()
+        camera = self.camera()
         for row in rows_of(self._content.stamp_ns, stamp_ns, self._name):
-            yield self._frame(row, image, camera)
+            yield self._frame(row, camera)
 
     def odometry(self) -> Odometry | None:
-        return self._content.odometry
+        return self._beside_log.odometry or self._content.odometry
 
     def gps(self) -> Gps | None:
         return self._content.gps
@@ -118,6 +110,7 @@ class RecordedLog:
         try:
             self.camera()
             _ = self._depth
+            _ = self._pair
         except LogError as error:
             self._notes.add(str(error))
 
@@ -130,107 +123,109 @@ class RecordedLog:
             raise LogError(f"{self._selection.image.topic} in {self._path.name} has no readable image.")
         return self._selection.image
 
-    def _frame(self, row: int, image: Channel, camera: Camera) -> RecordedFrame:
-        depth, place = self._depth, self._content.depth_places[row]
-        depth_data = None if depth is None or place is None else self._container.read(place)
-        data = self._container.read(self._content.places[row])
-        return RecordedFrame(int(self._content.stamp_ns[row]), camera, image, data, depth, depth_data)
+    def _frame(self, row: int, camera: Camera) -> RecordedFrame:
+        content, pictures, pair = self._content, self._pictures, self._pair
+        right = None if pair is None else pictures.beside(self._selection.right, content.right_places, row)
+        depth = pictures.beside(self._depth, content.depth_places, row)
+        stamp_ns, image = int(content.stamp_ns[row]), pictures.image(row)
+        return RecordedFrame(stamp_ns, camera, image, depth, right, pair, self._notes.account)
+
+    def _codec(self, channel: Channel | None) -> str:
+        return next((candidate.codec for candidate in self._candidates if candidate.channel == channel), "")
 
     @cached_property
     def _depth(self) -> Channel | None:
-        """The depth topic, or None, with a note, where its first image does not decode or not fit the camera's."""
+        """The depth topic, or None, with a note, where its first images do not decode or do not fit the camera's."""
         depth = self._selection.depth
-        row = next((i for i, place in enumerate(self._content.depth_places) if place is not None), None)
-        if depth is None or row is None:
+        if depth is None:
             return None
-        stamp_ns, place = int(self._content.stamp_ns[row]), self._content.depth_places[row]
         try:
-            first = _pixels(depth, self._container.read(place or ()), stamp_ns, depth_m)
+            first = self._pictures.first_depth(depth)
         except LogError as error:
             self._notes.add(f"Depth is not used: {error}")
             return None
+        if first is None:
+            return None
         if first.shape != (self._camera.height, self._camera.width):
             size = f"{self._camera.width} x {self._camera.height}"
-            self._notes.add(f"Depth is not used: {depth.topic} has {_size(first)} px, the images {size}.")
+            self._notes.add(f"Depth is not used: {depth.topic} has {size_of(first)} px, the images {size}.")
             return None
         return depth
 
-    def _read_candidates(self) -> list[Candidate]:
-        """Every topic that could play a part; the first message of each tells depth from grey, and its frame."""
-        kinds = {c: kind_of(c) for c in self._contents.counts}
-        asked = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and self._contents.counts[c]}
-        firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
-        left = set(asked)
-        for message in self._container.messages(asked) if asked else ():
-            if message.channel not in left:
-                continue
-            try:
-                record = decode(message.channel, message.data)
-            except BadMessageError:
-                continue  # the next one may be sound
-            if isinstance(record, ImageMessage | CalibrationMessage):
-                firsts[message.channel] = record
-                left.discard(message.channel)
-            if not left:
-                break
-        found = []
-        for channel, kind in kinds.items():
-            if kind:
-                found.append(_candidate(channel, self._contents.counts[channel], kind, firsts.get(channel)))
-        return found
-
     @cached_property
+    def _pictures(self) -> Pictures:
+        content = read_content(self._container, self._selection, self._notes)
+        image = self._selection.image
+        return Pictures(self._container, image, self._codec(image), content, self._notes)
+
+    @property
     def _content(self) -> Content:
-        return read_content(self._container, self._selection, self._notes)
+        return self._pictures.content
 
     @cached_property
     def _camera(self) -> Camera:
+        return self._left[0] if self._pair is None else self._pair.camera
+
+    @cached_property
+    def _left(self) -> tuple[Camera, str]:
+        """The camera of the images as they come, and its frame."""
         image = self._image_channel()
         content, notes = self._content, self._notes
-        first, size = self._first_image(image)
-        camera = camera_of(image.topic, content.calibration, size, notes)
-        if content.odometry is None:
-            return camera
-        return replace(camera, body_from_camera=body_from_camera(content.tree, content.body, first.frame, notes))
+        frame, size = self._pictures.first(image, [*content.places], self._path.name)
+        known = self._beside_log.camera(image.topic)
+        camera = camera_of(image.topic, known.calibration if known else content.calibration, size, notes)
+        if known is not None and known.body_from_camera is not None:
+            camera = replace(camera, body_from_camera=known.body_from_camera)
+        elif self.odometry() is not None:
+            placed = body_from_camera(content.tree, content.body, frame, notes)
+            camera = replace(camera, body_from_camera=placed)
+        return camera, frame
 
-    def _first_image(self, channel: Channel) -> tuple[ImageMessage, tuple[int, int]]:
-        """The first image that decodes, with its width and height; raises LogError where none of the first few does."""
-        reason = ""
-        for place in self._content.places[:_TRIED]:
-            try:
-                message = decode(channel, self._container.read(place))
-                if isinstance(message, ImageMessage):
-                    height, width = grey(message).shape
-                    return message, (width, height)
-            except BadMessageError as error:
-                reason = str(error)
-        raise LogError(f"{channel.topic} in {self._path.name} has no image that can be decoded: {reason}.")
+    @cached_property
+    def _pair(self) -> Pair | None:
+        """The left and right images as a rectified pair, or None, with a note where a right topic was there."""
+        image, right, content = self._selection.image, self._selection.right, self._content
+        if image is None or right is None:
+            return None
+        left, frame = self._left
+        if left.matrix is None:  # warned of as such: it costs more than the depth
+            return None
+        try:
+            if self._codec(right):
+                raise NoPairError(f"{right.topic} is video; of a pair, only the left images may be")
+            known = [self._beside_log.camera(channel.topic) for channel in (image, right)]
+            calibrations = [camera.calibration if camera else None for camera in known]
+            if known[0] is None:
+                calibrations = [content.calibration, content.right_calibration]
+            if calibrations[0] is None or calibrations[1] is None:
+                raise NoPairError(f"{right.topic} has no calibration")
+            other, size = self._pictures.first(right, content.right_places, self._path.name)
+            camera = camera_of(right.topic, calibrations[1], size, self._notes)
+            left_side = Side(left, calibrations[0], is_rectified(image.topic))
+            right_side = Side(camera, calibrations[1], is_rectified(right.topic))
+            apart = content.tree.between(other, frame) if other and frame else None
+            apart = self._beside_log.right_from_left(image.topic, right.topic) if known[0] else apart
+            pair = pair_of(left_side, right_side, apart)
+            error_px = row_error_px(self._rectified(pair, right))
+            if error_px is not None and error_px > MOST_ROWS_PX:
+                raise NoPairError(
+                    f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
+                )
+            return pair
+        except (NoPairError, LogError) as error:
+            self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")
+            return None
 
-
-def _pixels(channel: Channel, data: bytes, stamp_ns: int, convert: Callable[[ImageMessage], np.ndarray]) -> Any:
-    try:
-        message = decode(channel, data)
-        if not isinstance(message, ImageMessage):
-            raise BadMessageError("it is not an image message")
-        return convert(message)
-    except BadMessageError as error:
-        raise LogError(f"{channel.topic} at {stamp_ns} ns cannot be decoded: {error}.") from None
-
-
-def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | CalibrationMessage | None) -> Candidate:
-    role = kind
-    if kind == "tf" and channel.topic.rstrip("/").endswith("static"):
-        role = "tf_static"
-    if isinstance(first, ImageMessage) and (is_depth(first) or _named_depth(channel.topic, first)):
-        role = "depth"
-    calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
-    return Candidate(channel, count, role, clean(first.frame) if first else "", calibrated)
-
-
-def _named_depth(topic: str, first: ImageMessage) -> bool:
-    """Where the encoding leaves it open: old compressedDepth says only `png`, RealSense records depth as mono16."""
-    return topic.endswith("/compressedDepth") or (first.encoding == "mono16" and "depth" in topic.lower())
-
-
-def _size(image: np.ndarray) -> str:
-    return f"{image.shape[1]} x {image.shape[0]}"
+    def _rectified(self, pair: Pair, right: Channel) -> Iterator[tuple[Bytes, Bytes]]:
+        """Images of a few frames; what does not decode is left out."""
+        content, pictures, camera = self._content, self._pictures, self._left[0]
+        rows = [row for row, place in enumerate(content.right_places) if place is not None]
+        for row in rows[:: max(len(rows) // CHECKED_FRAMES, 1)][:CHECKED_FRAMES]:
+            image, beside = pictures.image(row), pictures.beside(right, content.right_places, row)
+            stamp_ns = int(content.stamp_ns[row])
+            try:  # nothing of a trial is counted
+                frame = RecordedFrame(stamp_ns, camera, image, None, beside, pair, Account()).decode()
+            except LogError:
+                continue
+            if frame.right is not None:
+                yield frame.image, frame.right

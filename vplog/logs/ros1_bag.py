@@ -1,185 +1,158 @@
-"""ROS 1 bags, format 2.0 (wiki.ros.org/Bags/Format/2.0), whole, cut or never indexed."""
+"""ROS 1 bags, format 2.0 (wiki.ros.org/Bags/Format/2.0), whole, cut, damaged or never indexed, as a Container."""
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from vplog.errors import LogError
 from vplog.logs.chunks import ChunkCache
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import Channel, Contents, Message, Notes, count_messages, ordered, plural
+from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered, plural
+from vplog.logs.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from vplog.logs.containers import Place
+    from vplog.logs.ros1_layout import Chunk
 
-MAGIC = b"#ROSBAG V2.0\n"
-_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-"""Values of the field `op`."""
-_MAX_HEADER = 2**20
-"""Bytes of a record header that are believed; real ones are some 100 bytes."""
-_MAX_CONNECTION = 16 * 2**20
-"""Bytes of a connection record that are read: its message definition, 100 kB at most in practice."""
-
-
-@dataclass
-class _Chunk:
-    start: int
-    stop: int
-    compression: str
-    size: int
-    cut: bool
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages per connection, from the index records behind it; empty where there are none."""
+__all__ = ["MAGIC", "Ros1Bag"]
 
 
 class Ros1Bag:
     """A Container over one bag file."""
 
-    def __init__(self, path: Path, notes: Notes) -> None:
-        self._path, self._notes = path, notes
+    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
+        """`name` is what the file is called where something is said of it."""
+        self._name, self._notes = name or path.name, notes
         self._file = path.open("rb")
         self._length = path.stat().st_size
         self._channels: dict[int, Channel] = {}
-        self._chunks: list[_Chunk] = []
-        self._cut_at: int | None = None
-        self._times: list[tuple[int, int]] = []
+        self._layout = read_layout(self._file, self._length, self._connect, self._name)
         self._data = ChunkCache(self._unpack)
-        self._walk()
 
     def contents(self) -> Contents:
-        found = self._indexed() or count_messages(self._scan(None), self._channels.values())
-        if self._cut_at is not None:
-            left = f"the {plural(found.messages, 'message')} before it are read"
-            self._notes.add(f"{self._path.name} is cut or damaged at byte {self._cut_at}; {left}.")
-        return found
+        """Counted by the indexes; a chunk without is unpacked."""
+        counts: dict[Channel, int] = {}
+        start_ns, end_ns = 2**64, 0
+        for count, chunk in enumerate(self._layout.chunks):
+            if chunk.counts and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
+                found = chunk.counts
+                start_ns, end_ns = min(start_ns, chunk.first_ns), max(end_ns, chunk.last_ns)
+            else:
+                found = {}
+                for connection, log_ns, _, _ in self._messages(count):
+                    found[connection] = found.get(connection, 0) + 1
+                    start_ns, end_ns = min(start_ns, log_ns), max(end_ns, log_ns)
+                    chunk.first_ns, chunk.last_ns = min(chunk.first_ns or log_ns, log_ns), max(chunk.last_ns, log_ns)
+            for connection, messages in found.items():
+                if connection in self._channels:
+                    channel = self._channels[connection]
+                    counts[channel] = counts.get(channel, 0) + messages
+        start_ns = min(start_ns, end_ns)
+        counts = ordered(dict.fromkeys(self._channels.values(), 0) | counts)
+        self._account_for(by_topic(counts), start_ns, end_ns)
+        return Contents(counts, start_ns, end_ns)
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        return self._scan(set(channels))
+        wanted = set(channels)
+        for count, chunk in enumerate(self._layout.chunks):
+            if not self._may_hold(chunk, wanted):
+                continue
+            data = self._data(count)
+            for connection, log_ns, start, stop in self._messages(count):
+                channel = self._channels.get(connection)
+                if channel in wanted and channel is not None:
+                    yield Message(channel, log_ns, data[start:stop], (count, start, stop))
 
     def read(self, place: Place) -> bytes:
         chunk, start, stop = place
         return self._data(chunk)[start:stop]
 
-    def _indexed(self) -> Contents | None:
-        """The contents by the indexes behind the chunks; None where they do not cover the file."""
-        unknown = any(not c.counts or not c.counts.keys() <= self._channels.keys() for c in self._chunks)
-        if unknown or len(self._times) != len(self._chunks):
-            return None
-        counts = dict.fromkeys(self._channels.values(), 0)
-        for chunk in self._chunks:
-            for connection, count in chunk.counts.items():
-                counts[self._channels[connection]] += count
-        start_ns = min((start for start, _ in self._times), default=0)
-        return Contents(ordered(counts), start_ns, max((end for _, end in self._times), default=0))
+    def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
+        layout, account, name = self._layout, self._notes.account, self._name
+        recorded = dict(found)
+        for count, chunk in enumerate(layout.missing):
+            counts = self._topics(chunk.counts)
+            account.add("damaged_bytes", counts or None, (name, count), [(chunk.first_ns, chunk.last_ns)])
+            for topic, messages in counts.items():
+                recorded[topic] = recorded.get(topic, 0) + messages
+        for start, stop in layout.gaps if not layout.missing else ():
+            before = max((c.last_ns for c in layout.chunks if c.stop <= start), default=start_ns)
+            behind = min((c.first_ns for c in layout.chunks if c.start >= stop and c.first_ns), default=end_ns)
+            detail = f"{name} is damaged near byte {start}; it is read again from byte {stop} on."
+            account.add("damaged_bytes", None, (name, start), [(min(before, behind), max(before, behind))], detail)
+        if layout.cut_at is not None:
+            detail = (
+                f"{name} is cut or damaged at byte {layout.cut_at} of {self._length}; "
+                f"the {plural(sum(found.values()), 'message')} before it are read."
+            )
+            account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)] if end_ns else [], detail)
+        if layout.index_cut_at is not None:
+            self._notes.add(
+                f"{name} is cut or damaged at byte {layout.index_cut_at}, behind its messages; none is lost."
+            )
+        whole = layout.cut_at is None and (not layout.gaps or bool(layout.missing))
+        account.know(name, recorded if whole else {}, start_ns)
 
-    def _walk(self) -> None:
-        if self._at(0, len(MAGIC)) != MAGIC:
-            raise LogError(f"{self._path} does not start as a ROS 1 bag of format 2.0 does.")
-        position = len(MAGIC)
-        while position < self._length:
-            head = self._at(position, 4)
-            size = int.from_bytes(head, "little")
-            header = _fields(self._at(position + 4, size)) if len(head) == 4 and size <= _MAX_HEADER else None
-            start = position + 8 + size
-            if header is None or start > self._length:
-                break
-            stop = start + int.from_bytes(self._at(start - 4, 4), "little")
-            op = _number(header, b"op")
-            if stop > self._length and op != _CHUNK:
-                break
-            if op == _CHUNK:
-                kind = header.get(b"compression", b"").decode("ascii", "replace")
-                cut = stop > self._length
-                self._chunks.append(_Chunk(start, min(stop, self._length), kind, _number(header, b"size"), cut))
-            elif op == _INDEX and self._chunks:
-                self._chunks[-1].counts[_number(header, b"conn")] = _number(header, b"count")
-            elif op == _CHUNK_INFO:
-                self._times.append((_time(header, b"start_time"), _time(header, b"end_time")))
-            elif op == _CONNECTION:
-                self._connect(header, self._at(start, min(stop - start, _MAX_CONNECTION)))
-            position = stop
-        if position != self._length:
-            self._cut_at = min(position, self._length)
+    def _topics(self, counts: dict[int, int]) -> dict[str, int]:
+        """Counts of connections by topic, zero and less left out."""
+        result: dict[str, int] = {}
+        for connection, count in counts.items():
+            if count > 0 and (channel := self._channels.get(connection)) is not None:
+                result[channel.topic] = result.get(channel.topic, 0) + count
+        return result
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         topic = header.get(b"topic", b"").decode("utf-8", "replace")
-        kind = (_fields(data) or {}).get(b"type", b"").decode("utf-8", "replace")
-        self._channels[_number(header, b"conn")] = Channel(topic, kind, "ros1")
+        kind = (fields(data) or {}).get(b"type", b"").decode("utf-8", "replace")
+        self._channels[number(header, b"conn")] = Channel(topic, kind, "ros1")
 
-    def _scan(self, wanted: set[Channel] | None) -> Iterator[Message]:
-        unknown = 0
-        for number, chunk in enumerate(self._chunks):
-            if wanted is not None and not self._may_hold(chunk, wanted):
-                continue
-            data = self._data(number)
-            position = 0
-            while position < len(data):
-                size = int.from_bytes(data[position : position + 4], "little")
-                start = position + 8 + size
-                header = _fields(data[position + 4 : start - 4]) if start <= len(data) else None
-                stop = start + int.from_bytes(data[start - 4 : start], "little")
-                if header is None or stop > len(data):
-                    at = self._chunks[number].start
-                    self._notes.add(f"{self._path.name} has a damaged chunk at byte {at}; the rest of it is left out.")
-                    break
-                op = _number(header, b"op")
-                if op == _CONNECTION:
-                    self._connect(header, data[start:stop])
-                elif op == _MESSAGE:
-                    channel = self._channels.get(_number(header, b"conn"))
-                    unknown += channel is None
-                    if channel is not None and (wanted is None or channel in wanted):
-                        yield Message(channel, _time(header, b"time"), data[start:stop], (number, start, stop))
-                position = stop
+    def _messages(self, count: int) -> Iterator[tuple[int, int, int, int]]:
+        """Connection, log time, start and stop of every message in a chunk; at its end, what it was short of."""
+        chunk, data = self._layout.chunks[count], self._data(count)
+        seen: dict[int, int] = {}
+        unknown, position, last_ns = 0, 0, chunk.first_ns
+        while position < len(data):
+            size = int.from_bytes(data[position : position + 4], "little")
+            start = position + 8 + size
+            header = fields(data[position + 4 : start - 4]) if start <= len(data) else None
+            stop = start + int.from_bytes(data[start - 4 : start], "little")
+            if header is None or stop > len(data):
+                break
+            op = number(header, b"op")
+            if op == CONNECTION:
+                self._connect(header, data[start:stop])
+            elif op == MESSAGE:
+                connection, last_ns = number(header, b"conn"), time_ns(header, b"time")
+                seen[connection] = seen.get(connection, 0) + 1
+                unknown += connection not in self._channels
+                yield connection, last_ns, start, stop
+            position = stop
+        key, account = (self._name, chunk.start), self._notes.account
+        span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
         if unknown:
-            self._notes.add(f"{self._path.name}: {plural(unknown, 'message')} of unknown connections left out.")
+            account.add("unknown_channel", {"": unknown}, key, span)
+        fewer = any(seen.get(connection, 0) < messages for connection, messages in chunk.counts.items())
+        if data and not chunk.cut and (position < len(data) or fewer):
+            short = {connection: messages - seen.get(connection, 0) for connection, messages in chunk.counts.items()}
+            detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
+            account.add("damaged_chunk", self._topics(short) if chunk.counts else None, key, span, detail)
 
-    def _may_hold(self, chunk: _Chunk, wanted: set[Channel]) -> bool:
+    def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
         """Not where its indexes name only connections that are known and not wanted."""
         return not chunk.counts or any(self._channels.get(i) in wanted or i not in self._channels for i in chunk.counts)
 
-    def _unpack(self, number: int) -> bytes:
-        """The records of one chunk; empty, with a note, where it is damaged."""
-        chunk = self._chunks[number]
+    def _unpack(self, count: int) -> bytes:
+        """The records of one chunk; empty, and accounted for, where it is damaged."""
+        chunk = self._layout.chunks[count]
+        self._file.seek(chunk.start)
+        data = self._file.read(chunk.stop - chunk.start)
         try:
-            return unpack(chunk.compression, self._at(chunk.start, chunk.stop - chunk.start), chunk.size, chunk.cut)
+            return unpack(chunk.compression, data, chunk.size, chunk.cut)
         except BadChunkError as error:
-            self._notes.add(f"{self._path.name} has a damaged chunk at byte {chunk.start}, left out: {error}.")
+            detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
+            span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
+            counts = self._topics(chunk.counts) if chunk.counts else None
+            self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), span, detail)
             return b""
-
-    def _at(self, position: int, length: int) -> bytes:
-        self._file.seek(position)
-        return self._file.read(length)
-
-
-def _fields(data: bytes) -> dict[bytes, bytes] | None:
-    """The `name=value` fields of a header; None where it is damaged."""
-    fields: dict[bytes, bytes] = {}
-    position = 0
-    while position < len(data):
-        stop = position + 4 + int.from_bytes(data[position : position + 4], "little")
-        name, equals, value = data[position + 4 : stop].partition(b"=")
-        if stop > len(data) or not equals:
-            return None
-        fields[name] = value
-        position = stop
-    return fields
-
-
-def _number(header: dict[bytes, bytes], name: bytes) -> int:
-    """A little-endian field of 1 to 8 bytes; -1 where it is missing."""
-    return int.from_bytes(header[name][:8], "little") if name in header else -1
-
-
-def _time(header: dict[bytes, bytes], name: bytes) -> int:
-    """Nanoseconds of a ROS time field: u32 seconds, u32 nanoseconds."""
-    value = header.get(name, b"")
-    if len(value) != 8:
-        return 0
-    seconds, nanoseconds = struct.unpack("<II", value)
-    return seconds * 1_000_000_000 + nanoseconds

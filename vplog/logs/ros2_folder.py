@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from vplog.logs.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.containers import Contents, Message, Notes, ordered
+from vplog.logs.containers import Contents, Message, Notes, by_topic, ordered
+from vplog.logs.losses import Runs
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -20,11 +22,30 @@ _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
 
 
+_MOST_MESSAGES = 2**48
+"""Messages of a topic that are believed: more than a recorder writes in its life."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class MetadataError(Exception):
     """metadata.yaml is damaged, or names no file that exists; the message is a sentence."""
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What metadata.yaml says of a bag."""
+
+    files: list[Path]
+    """The storage files that are there, in order."""
+    missing: list[str]
+    """Names of those that are not."""
+    mode: str
+    """Compression: ``, `file` or `message`."""
+    recorded: dict[str, int]
+    """Messages by topic; empty where it does not say."""
+    start_ns: int
+    """When the recording began; 0 where it does not say."""
+    end_ns: int
 
 
 class Chain:
@@ -54,6 +75,32 @@ class Chain:
         return self._parts[place[0]].read(place[1:])
 
 
+class Counted:
+    """A Container whose metadata say how much was recorded, so that what is lost can be counted."""
+
+    def __init__(self, found: Container, metadata: Metadata, files: Collection[str], notes: Notes) -> None:
+        self._found, self._metadata, self._files, self._notes = found, metadata, files, notes
+
+    def contents(self) -> Contents:
+        contents, known = self._found.contents(), self._metadata
+        account, found = self._notes.account, by_topic(contents.counts)
+        unexplained = account.settle(self._files, known.recorded, found, known.end_ns or None)
+        if unexplained:
+            more = sum(unexplained.values())
+            self._notes.add(f"metadata.yaml counts {more} more messages than its storage files, which are whole, hold.")
+        elif account.losses:
+            for file in self._files:
+                account.know(file, {}, contents.start_ns)
+            account.know("metadata.yaml", known.recorded, contents.start_ns or known.start_ns)
+        return contents
+
+    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        return self._found.messages(channels)
+
+    def read(self, place: Place) -> bytes:
+        return self._found.read(place)
+
+
 class ZstdMessages:
     """A Container whose messages are each a zstd frame (rosbag2's compression mode MESSAGE)."""
 
@@ -64,26 +111,29 @@ class ZstdMessages:
         return self._packed.contents()
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        lost: dict[str, Runs] = {}
+        reason = ""
         for message in self._packed.messages(channels):
-            if data := self._unpack(message.data):
-                yield message._replace(data=data)
+            topic = message.channel.topic
+            try:
+                yield message._replace(data=unpack_zstd_message(message.data))
+            except BadChunkError as error:
+                reason = reason or f"The first does not unpack: {error}."
+                lost.setdefault(topic, Runs()).lost(message.log_ns)
+                self._notes.account.add("packed", {topic: lost[topic].messages}, (topic, 0), lost[topic].spans, reason)
+            else:
+                if topic in lost:
+                    lost[topic].sound()
 
     def read(self, place: Place) -> bytes:
-        return self._unpack(self._packed.read(place))
-
-    def _unpack(self, data: bytes) -> bytes:
         try:
-            return unpack_zstd_message(data)
-        except BadChunkError as error:
-            self._notes.add(f"Messages that do not unpack are left out; the first: {error}.")
+            return unpack_zstd_message(self._packed.read(place))
+        except BadChunkError:
             return b""
 
 
-def storage_files(folder: Path, notes: Notes) -> tuple[list[Path], str]:
-    """The storage files of a bag folder in order, and its compression mode: ``, `file` or `message`.
-
-    Raises MetadataError where metadata.yaml is damaged or names no file that exists.
-    """
+def read_metadata(folder: Path) -> Metadata:
+    """What metadata.yaml says. Raises MetadataError where it is damaged or names no file that exists."""
     tree = _metadata(folder)
     listed = tree.get("relative_file_paths")
     names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
@@ -94,10 +144,28 @@ def storage_files(folder: Path, notes: Notes) -> tuple[list[Path], str]:
     if not files:
         named = ", ".join(missing[:3]) or "no storage file"
         raise MetadataError(f"{folder / 'metadata.yaml'} names {named}, and no such file is in the folder.")
-    if missing:
-        notes.add(f"{folder.name} lacks {', '.join(missing[:3])} that metadata.yaml names; the other files are read.")
     mode = str(tree.get("compression_mode") or "").lower()
-    return files, mode if mode in ("file", "message") else ""
+    start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
+    end_ns = start_ns + length_ns if start_ns and length_ns else 0
+    return Metadata(files, missing, mode if mode in ("file", "message") else "", _recorded(tree), start_ns, end_ns)
+
+
+def _recorded(tree: dict) -> dict[str, int]:
+    """Messages by topic; empty where the list is not one."""
+    result: dict[str, int] = {}
+    topics = tree.get("topics_with_message_count")
+    for topic in topics if isinstance(topics, list) else []:
+        about = topic.get("topic_metadata") if isinstance(topic, dict) else None
+        name = about.get("name") if isinstance(about, dict) else None
+        count = topic.get("message_count") if isinstance(topic, dict) else None
+        if isinstance(name, str) and isinstance(count, int) and 0 <= count < _MOST_MESSAGES:
+            result[name] = result.get(name, 0) + count
+    return result
+
+
+def _nanoseconds(tree: Any) -> int:
+    values = tree.values() if isinstance(tree, dict) else ()
+    return next((value for value in values if isinstance(value, int) and 0 < value < 2**63), 0)
 
 
 def split_parts(files: list[Path]) -> list[Path] | None:

@@ -28,11 +28,26 @@ if TYPE_CHECKING:
 _UNKNOWN_COVARIANCE = 0
 """NavSatFix.COVARIANCE_TYPE_UNKNOWN."""
 
+_VIDEO = {
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
+        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
+        "bool is_bigendian\nuint8[] data"
+    ),
+    "foxglove_msgs/msg/CompressedVideo": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+    ),
+}
+"""Types of video that ROS does not come with: github.com/ros-misc-utilities/ffmpeg_image_transport_msgs, and
+docs.foxglove.dev/docs/sdk/schemas."""
+
 
 @cache
 def _store(encoding: str) -> Typestore:
     if encoding == "cdr":
-        return get_typestore(Stores.ROS2_HUMBLE)  # these types have one layout in every ROS 2 release
+        store = get_typestore(Stores.ROS2_HUMBLE)  # these types have one layout in every ROS 2 release
+        for name, fields in _VIDEO.items():
+            store.register(get_types_from_msg(fields, name))
+        return store
     store = get_typestore(Stores.ROS1_NOETIC)
     transforms = "geometry_msgs/TransformStamped[] transforms"
     for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
@@ -64,12 +79,21 @@ def _compressed(message: Any) -> Record:
     return ImageMessage(_stamp(message), message.header.frame_id, message.format, message.data.tobytes(), True)
 
 
+def _packet(message: Any) -> Record:
+    return ImageMessage(_stamp(message), message.header.frame_id, message.encoding, message.data.tobytes(), True)
+
+
+def _video(message: Any) -> Record:
+    stamp_ns = nanoseconds(message.timestamp.sec, message.timestamp.nanosec)
+    return ImageMessage(stamp_ns, message.frame_id, message.format, message.data.tobytes(), True)
+
+
 def _calibration(message: Any) -> Record:
     # ROS 2 made the fields of ROS 1 lower case.
-    d, k, p = (np.array(getattr(message, n if hasattr(message, n) else n.upper()), np.float64) for n in "dkp")
+    d, k, p, r = (np.array(getattr(message, n if hasattr(message, n) else n.upper()), np.float64) for n in "dkpr")
     return CalibrationMessage(
         _stamp(message), message.header.frame_id, message.width, message.height, message.distortion_model,
-        d, k.reshape(3, 3), p.reshape(3, 4),
+        d, k.reshape(3, 3), p.reshape(3, 4), r.reshape(3, 3),
     )  # fmt: skip
 
 
@@ -104,10 +128,15 @@ def _fix(message: Any) -> Record:
 def _transforms(message: Any) -> Record:
     return [
         TransformMessage(
-            t.header.frame_id, t.child_frame_id, _xyz(t.transform.translation), _xyzw(t.transform.rotation)
+            t.header.frame_id, t.child_frame_id, _xyz(t.transform.translation), _xyzw(t.transform.rotation), _stamp(t)
         )
         for t in message.transforms
     ]
+
+
+def _one_transform(message: Any) -> Record:
+    position, quaternion = _xyz(message.transform.translation), _xyzw(message.transform.rotation)
+    return PoseMessage(_stamp(message), message.header.frame_id, message.child_frame_id, position, quaternion, None)
 
 
 def _xyz(v: Any) -> Floats:
@@ -121,10 +150,13 @@ def _xyzw(q: Any) -> Floats:
 _READERS: dict[str, Callable[[Any], Record]] = {
     "sensor_msgs/Image": _image,
     "sensor_msgs/CompressedImage": _compressed,
+    "ffmpeg_image_transport_msgs/FFMPEGPacket": _packet,
+    "foxglove_msgs/CompressedVideo": _video,
     "sensor_msgs/CameraInfo": _calibration,
     "nav_msgs/Odometry": _odometry,
     "geometry_msgs/PoseStamped": _pose_stamped,
     "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
+    "geometry_msgs/TransformStamped": _one_transform,
     "sensor_msgs/NavSatFix": _fix,
     "tf2_msgs/TFMessage": _transforms,
     "tf/tfMessage": _transforms,

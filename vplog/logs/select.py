@@ -3,17 +3,20 @@
 An image topic is depth where its encoding is 16UC1 or 32FC1, or compressedDepth, or mono16 under a name with `depth`.
 Static transforms are those of all topics whose name ends in `static`. Of several topics that could play one of the
 other parts the first by these rules does, unless TopicChoice names another:
-- image: calibrated first, then most messages, then name;
+- image: calibrated first, then those that are not the right one of a pair, then most messages, then name;
+- right: the topic named like the image's with `right` for `left` (or another of _PAIRS), where no depth is used;
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
-- odometry: nav_msgs/Odometry first, then types with a covariance, then most messages, then name;
+- odometry: nav_msgs/Odometry first, then foxglove.Odometry, then types with a covariance, then other poses, then tf,
+  whose chain from its root to the body is taken; then most messages, then name;
 - gps: most messages, then name.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
@@ -32,10 +35,18 @@ class TopicChoice(Settings):
     """Topic of the camera's images."""
     depth: str | None = None
     """Topic of the depth images; an empty string uses none."""
+    right: str | None = None
+    """Topic of the right images of a stereo pair, whose left ones are `image`; an empty string uses none."""
     camera_info: str | None = None
     """Topic of the camera's calibration; an empty string uses none."""
     odometry: str | None = None
     """Topic of the odometry; an empty string uses none."""
+    odometry_file: Path | None = None
+    """TUM file of poses beside the log that is the odometry: of the body, or of the camera where the log's static
+    transforms have no base_link; its clock is that of the images' stamps."""
+    calibration_file: Path | None = None
+    """YAML file beside the log that calibrates the camera, or both of a pair: ROS camera_info, a Kalibr camchain or
+    EuRoC's sensor.yaml."""
     gps: str | None = None
     """Topic of the satellite fixes; an empty string uses none."""
 
@@ -50,6 +61,12 @@ class Candidate:
     frame: str = ""
     calibrated: bool = False
     """A camera_info whose matrix is set."""
+    codec: str = ""
+    """FFmpeg's decoder where the images are a video."""
+    encoding: str = ""
+    """Pixel layout of the images, or their format where compressed, as the first message names it."""
+    size: tuple[int, int] = (0, 0)
+    """Width and height in px of the first image, 0 where it is not told without decoding it."""
 
 
 @dataclass(frozen=True)
@@ -62,22 +79,38 @@ class Selection:
     odometry: Channel | None = None
     gps: Channel | None = None
     tf_static: tuple[Channel, ...] = ()
+    tf: tuple[Channel, ...] = ()
+    """Transforms over time: read where odometry comes from them, or where no topic is of static ones alone."""
+    right: Channel | None = None
+    right_info: Channel | None = None
+
+    @property
+    def parts(self) -> dict[Channel, str]:
+        """What each topic in use is used as, in the words of `vplog.data.Topic.part`."""
+        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info")
+        many = [(channel, name) for name in ("tf_static", "tf") for channel in getattr(self, name)]
+        one = [(channel, name) for name in named if (channel := getattr(self, name)) is not None]
+        return dict(many) | dict(one)
 
     @property
     def channels(self) -> list[Channel]:
-        parts = (self.image, self.depth, self.camera_info, self.odometry, self.gps)
-        return [part for part in parts if part is not None] + list(self.tf_static)
+        return list(self.parts)
 
 
 _NAMES = {
     "image": "Image",
     "depth": "Depth",
+    "right": "Image",
     "camera_info": "Calibration",
     "odometry": "Odometry",
     "gps": "GPS",
 }
-_POSE_TYPES = ("nav_msgs/Odometry", "geometry_msgs/PoseWithCovarianceStamped")
+_ROLES = {"right": "image"}
+"""What a topic of a part is taken for before parts are given out, where it is called otherwise."""
+_POSE_TYPES = ("nav_msgs/Odometry", "foxglove.Odometry", "geometry_msgs/PoseWithCovarianceStamped")
 """Odometry types in order of preference; every other comes after."""
+_PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"))
+"""Words that tell the topics of a stereo pair apart: most drivers', RealSense's, and EuRoC's."""
 
 
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
@@ -85,13 +118,13 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
 
     def pick(role: str, key: Callable[[Candidate], tuple], also: str = "") -> Candidate | None:
         wanted = getattr(choice, role)
-        found = sorted((c for c in candidates if c.role == role and c.count), key=key)
+        found = sorted((c for c in candidates if c.role == _ROLES.get(role, role) and c.count), key=key)
         if wanted is None:
             return found[0] if found else None
         if wanted == "":
             return None
         named = [c for c in candidates if c.channel.topic == wanted]
-        fitting = sorted((c for c in named if c.role in (role, also)), key=key)
+        fitting = sorted((c for c in named if c.role in (_ROLES.get(role, role), also)), key=key)
         if not fitting:
             raise LogError(_refusal(named, wanted, role, [c.channel.topic for c in found], log))
         return fitting[0]
@@ -102,18 +135,59 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     def calibrations(image: Candidate) -> list[Candidate]:
         return _calibrations(image, [c for c in candidates if c.role == "camera_info" and c.count])
 
-    image = pick("image", lambda c: (not any(info.calibrated for info in calibrations(c)[:1]), *by_size(c)), "depth")
-    depth = calibration = None
+    def as_image(c: Candidate) -> tuple:
+        uncalibrated = not any(info.calibrated for info in calibrations(c)[:1])
+        return uncalibrated, _partner(c, candidates, back=True) is not None, *by_size(c)
+
+    image = pick("image", as_image, "depth")
+    depth = calibration = right = right_info = None
     if image is not None:
-        depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *by_size(c)), "image")
+        if choice.depth is not None or not choice.right:
+            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *by_size(c)), "image")
+        right = pick("right", by_size) if choice.right is not None else _partner(image, candidates)
+        if right is not None and depth is not None:
+            if choice.right and choice.depth:
+                raise LogError(
+                    f"{log}: depth comes from {choice.depth} or from the pair {image.channel.topic} and "
+                    f"{choice.right}, not both. Leave out --depth-topic or --right-topic."
+                )
+            right = None
+        right_info = next(iter(calibrations(right)), None) if right is not None else None
         calibration = next(iter(calibrations(image)), None)
-        if choice.camera_info is not None:
+        if choice.calibration_file is not None:
+            if choice.camera_info:
+                raise LogError(_two("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic"))
+            calibration = right_info = None
+        elif choice.camera_info is not None:
             calibration = pick("camera_info", by_size)
-    odometry = pick("odometry", lambda c: (_pose_rank(c), *by_size(c)))
+    if choice.odometry_file is not None:
+        if choice.odometry:
+            raise LogError(_two("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
+        choice = choice.model_copy(update={"odometry": ""})
+    odometry = pick("odometry", lambda c: (_pose_rank(c), *by_size(c)), "tf")
+    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=by_size)
+    if odometry is None and choice.odometry is None and moving:
+        odometry = moving[0]
     gps = pick("gps", by_size)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
-    parts = (image, depth, calibration, odometry, gps)
-    return Selection(*(part.channel if part else None for part in parts), tf_static=static)
+    parts = {
+        "image": image, "depth": depth, "camera_info": calibration, "odometry": odometry, "gps": gps,
+        "right": right, "right_info": right_info,
+    }  # fmt: skip
+    found = {name: part.channel for name, part in parts.items() if part is not None}
+    tf = tuple(c.channel for c in moving) if not static or (odometry is not None and odometry.role == "tf") else ()
+    return Selection(**found, tf_static=static, tf=tf)
+
+
+def _partner(image: Candidate, candidates: list[Candidate], back: bool = False) -> Candidate | None:
+    """The right image topic of a pair whose left one is `image`, or back, the left one of the right."""
+    for left, right in _PAIRS:
+        here, there = (right, left) if back else (left, right)
+        name = image.channel.topic.replace(here, there)
+        if here in image.channel.topic:
+            found = [c for c in candidates if c.channel.topic == name and c.role == "image" and c.count]
+            return min(found, key=lambda c: c.channel, default=None)
+    return None
 
 
 def _calibrations(image: Candidate, infos: list[Candidate]) -> list[Candidate]:
@@ -144,6 +218,10 @@ def _shared(a: Candidate, b: Candidate) -> int:
 def _pose_rank(candidate: Candidate) -> int:
     kind = candidate.channel.type.replace("/msg/", "/")
     return _POSE_TYPES.index(kind) if kind in _POSE_TYPES else len(_POSE_TYPES)
+
+
+def _two(what: str, topic: str, file: Path, option: str) -> str:
+    return f"The {what} is either {topic} or {file}. Leave out --{option} or the file."
 
 
 def _refusal(named: list[Candidate], wanted: str, role: str, found: list[str], log: str) -> str:

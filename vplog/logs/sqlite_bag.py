@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.containers import Channel, Contents, Message, Notes, ordered, plural
+from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -15,13 +15,23 @@ if TYPE_CHECKING:
     from vplog.logs.containers import Place
 
 MAGIC = b"SQLite format 3\x00"
+_DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
+"""What reading a damaged file raises."""
+_MOST_TRIED = 100_000
+"""Rows that are looked for one by one behind damage: a second's work."""
+_MOST_MISSED = 2_000
+"""Rows that may be missing in a row where the last one is not known."""
 
 
 class SqliteBag:
     """A Container over one .db3 file."""
 
-    def __init__(self, path: Path, notes: Notes) -> None:
-        self._path, self._notes = path, notes
+    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
+        """`name` is what the file is called where something is said of it."""
+        self._path, self._name, self._notes = path, name or path.name, notes
+        self._damaged = False
+        self._last_row: int | None = None
+        """The last that can be read, once that is known to be less than all."""
         log = Path(f"{path}-wal")
         pending = log.is_file() and log.stat().st_size > 0
         try:
@@ -35,38 +45,109 @@ class SqliteBag:
 
     def contents(self) -> Contents:
         counts = dict.fromkeys(self._topics.values(), 0)
-        start_ns, end_ns, unknown = 2**63, 0, 0
+        times: list[int] = []
+        unknown = 0
         query = "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
-        for topic, count, first, last in self._rows(query):
+        try:
+            rows = self._db.execute(query).fetchall()
+        except _DAMAGE:
+            rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
+        for topic, count, first, last in rows:
             if topic not in self._topics:
                 unknown += count
                 continue
             counts[self._topics[topic]] += count
-            start_ns, end_ns = min(start_ns, _integer(first)), max(end_ns, _integer(last))
+            times = [min(*times, _integer(first)), max(*times, _integer(last))] if times else [first, last]
+            times = [_integer(time_ns) for time_ns in times]
+        start_ns, end_ns = times or (0, 0)
+        account, name = self._notes.account, self._name
         if unknown:
-            self._notes.add(f"{self._path.name}: {plural(unknown, 'message')} of unknown topics left out.")
-        return Contents(ordered(counts), min(start_ns, end_ns), end_ns)
+            account.add("unknown_channel", {"": unknown}, (name, 0), [])
+        account.know(name, {} if self._damaged else by_topic(counts), start_ns)
+        return Contents(ordered(counts), start_ns, end_ns)
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
-        marks = ",".join("?" * len(ids))
-        query = f"SELECT rowid, topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY rowid"  # noqa: S608 - marks only
-        for row, topic, time_ns, data in self._rows(query, ids):
+        for row, topic, time_ns, data in self._salvaged("rowid, topic_id, timestamp, data", ids):
             if isinstance(data, bytes):
                 yield Message(self._topics[topic], _integer(time_ns), data, (row,))
 
     def read(self, place: Place) -> bytes:
-        for (data,) in self._rows("SELECT data FROM messages WHERE rowid = ?", list(place)):
-            if isinstance(data, bytes):
-                return data
-        return b""
+        try:
+            found = self._db.execute("SELECT data FROM messages WHERE rowid = ?", list(place)).fetchone()
+        except _DAMAGE:
+            return b""
+        return found[0] if found and isinstance(found[0], bytes) else b""
+
+    def _salvaged(self, columns: str, topics: list[int] | None = None) -> Iterator[tuple]:
+        """Rows of the table of messages in its order: row id, topic, time, and more columns; over damage, row by row.
+
+        Recorders number the rows without a gap, so that a number that is not there is a message that is lost.
+        """
+        chosen = "" if topics is None else f"topic_id IN ({','.join('?' * len(topics))}) AND"
+        query = f"SELECT {columns} FROM messages WHERE {chosen} rowid > ? ORDER BY rowid"  # noqa: S608 - names of ours
+        last, last_ns, tried = 0, 0, 0
+        while True:
+            try:
+                for row in self._db.execute(query, [*(topics or []), last]):
+                    last, last_ns = row[0], _integer(row[2])
+                    yield row
+                return
+            except _DAMAGE as error:
+                detail = f"{self._name} is damaged: {error}."
+            self._damaged, before, found = True, last, None
+            end = self._end_behind(last)
+            while found is None and tried < _MOST_TRIED and last < end:
+                tried, last = tried + 1, last + 1
+                found = self._row(last, columns)
+                if found is None and topics is not None:
+                    self._lose_data(last, detail)
+            if found is None:
+                self._last_row = before
+                if topics is None:
+                    span = [(last_ns, last_ns)] if last_ns else []
+                    self._notes.account.add("cut", None, (self._name, 0), span, detail)
+                return
+            before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
+            if topics is None and last - before > 1:
+                span = [(min(before_ns, last_ns), max(before_ns, last_ns))]
+                self._notes.account.add("damaged_bytes", {"": last - before - 1}, (self._name, before), span, detail)
+            if topics is None or found[1] in topics:
+                yield found
+
+    def _end_behind(self, row: int) -> int:
+        """The last row to look for, where none is found behind `row`."""
+        if self._last_row is not None:
+            return self._last_row
+        try:
+            last = self._db.execute("SELECT max(rowid) FROM messages").fetchone()[0]
+        except _DAMAGE:
+            last = None
+        return last if isinstance(last, int) else row + _MOST_MISSED
+
+    def _row(self, row: int, columns: str) -> tuple | None:
+        try:
+            return self._db.execute(f"SELECT {columns} FROM messages WHERE rowid = ?", [row]).fetchone()  # noqa: S608
+        except _DAMAGE:
+            return None
+
+    def _lose_data(self, row: int, detail: str) -> None:
+        """A message whose topic and time can be read, but not the rest; others were missed when they were counted."""
+        found = self._row(row, "rowid, topic_id, timestamp")
+        if found is not None and found[1] in self._topics:
+            span, lost = (_integer(found[2]), _integer(found[2])), {self._topics[found[1]].topic: 1}
+            self._notes.account.add("damaged_chunk", lost, (self._name, row), [span], detail)
 
     def _connect(self, mode: str) -> sqlite3.Connection:
         db = sqlite3.connect(f"{self._path.resolve().as_uri()}?{mode}", uri=True)
         db.text_factory = lambda text: text.decode("utf-8", "replace")
         db.execute("PRAGMA trusted_schema = OFF")  # a stranger's file runs nothing
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(self._path.stat().st_size, 2**16))  # no value exceeds its file
-        db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        try:
+            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        except sqlite3.DatabaseError:
+            db.execute("PRAGMA writable_schema = ON")  # else SQLite reads no file shorter than its header says
+            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         return db
 
     def _read_topics(self) -> dict[int, Channel]:
@@ -75,15 +156,16 @@ class SqliteBag:
             raise LogError(
                 f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages."
             )
-        rows = self._rows("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
-        return {number: Channel(str(name), str(kind), str(encoding)) for number, name, kind, encoding in rows}
+        rows = self._rows("SELECT id, name, type, serialization_format FROM topics")
+        return {number: Channel(str(name), str(kind), str(encoding)) for number, name, kind, encoding in sorted(rows)}
 
     def _rows(self, query: str, values: list[int] | None = None) -> Iterator[tuple]:
         """Rows as far as the file is sound; a note where it is not."""
         try:
             yield from self._db.execute(query, values or [])
-        except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-            self._notes.add(f"{self._path.name} is damaged, read as far as it goes: {error}.")
+        except _DAMAGE as error:
+            self._damaged = True
+            self._notes.add(f"{self._name}: the list of topics is damaged, read as far as it goes: {error}.")
 
 
 def _integer(value: object) -> int:

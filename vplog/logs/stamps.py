@@ -2,61 +2,186 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.errors import LogError
+from vplog.logs.clocks import LEAST_JUMP_NS, Clock, on_one_clock
 from vplog.logs.containers import plural
+from vplog.logs.losses import runs_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from vplog.data import Ints
+    from vplog.logs.clocks import Repaired
     from vplog.logs.containers import Notes
 
 NONE: Ints = np.zeros(0, np.int64)
+_LAST_NS = 2**63 - 1
+"""Log times are unsigned; what is beyond this, year 2262, is damage."""
+_STANDING = 10
+"""A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
+_LATE_NS = 2 * 10**9
+"""ns that header stamps of one topic may be further from the log times than those of others: slow estimators."""
+_GAP_NS = 10**9
+"""ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
+_GAP_PERIODS = 10
+
+
+def _numbers() -> array[int]:
+    return array("q")
 
 
 @dataclass
 class Stamps:
     """Header stamps of one topic in file order, with the log times they fall back to."""
 
-    header_ns: list[int] = field(default_factory=list)
-    log_ns: list[int] = field(default_factory=list)
+    header_ns: array[int] = field(default_factory=_numbers)
+    log_ns: array[int] = field(default_factory=_numbers)
+
+    common: Clock | None = None
+    """The clock that all topics of the log are to be on, where that is known."""
 
     def add(self, header_ns: int, log_ns: int) -> None:
         self.header_ns.append(header_ns)
-        self.log_ns.append(log_ns)
+        self.log_ns.append(min(log_ns, _LAST_NS))
+
+    def clock(self) -> Clock | None:
+        """The clock of the header stamps; None where they follow none."""
+        found = self._on_one_clock()
+        if found is None or not found.kept.any():
+            return None
+        kept = found.stamp_ns[found.kept]
+        return Clock(found.skew_ns, int(kept.min()), int(kept.max()))
+
+    def clocks(self) -> dict[int, int]:
+        """Messages by the skew of the clock that they came on; several where it was set."""
+        found = self._on_one_clock()
+        return {} if found is None else found.counts
+
+    def _on_one_clock(self) -> Repaired | None:
+        header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
+        log_ns, header_ns = log_ns[header_ns != 0], header_ns[header_ns != 0]
+        return on_one_clock(header_ns, log_ns) if len(header_ns) else None
 
     def order(self, topic: str, notes: Notes) -> tuple[Ints, Ints]:
         """Strictly increasing stamps in ns and the row each came from. What was repaired is noted.
 
-        Header stamps align data; log times are later by the transport. Where no message has a header stamp, the log
-        times stand in; where some have none, those messages are dropped.
+        Header stamps align data; log times are later by the transport. Where most messages have no header stamp, or
+        the stamps follow no clock, the log times stand in; where some have none or a stray one, those messages are
+        lost; where the clock was set on the way, the stamps are shifted to the one of most messages.
         """
-        stamp_ns = np.array(self.header_ns, np.int64)
-        rows = np.arange(len(stamp_ns))
-        if len(stamp_ns) and not stamp_ns.any():
-            notes.add(f"{topic} has no header stamps; its log times are used instead.")
-            stamp_ns = np.array([min(t, 2**63 - 1) for t in self.log_ns], np.int64)
-        elif (unset := int((stamp_ns == 0).sum())) > 0:
-            notes.add(f"{topic}: {plural(unset, 'message')} without a header stamp dropped.")
-            rows = rows[stamp_ns != 0]
-            stamp_ns = stamp_ns[rows]
-        stamp_ns, order = increasing(stamp_ns, topic, notes)
-        return stamp_ns, rows[order]
+        header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
+        rows = np.flatnonzero(header_ns)
+        if not len(header_ns):
+            return NONE, NONE
+        if 2 * len(rows) < len(header_ns):
+            return self._by_log_times(topic, notes, log_ns, "has no header stamps")
+        _lose("no_stamp", topic, header_ns == 0, log_ns, notes)
+        if len(np.unique(header_ns[rows])) * _STANDING < len(rows):
+            return self._by_log_times(topic, notes, log_ns, "has header stamps that do not advance")
+        found = on_one_clock(header_ns[rows], log_ns[rows], self.common.skew_ns if self.common else None)
+        if found is None:
+            return self._by_log_times(topic, notes, log_ns, "has header stamps that follow no clock")
+        if found.jumps:
+            times = "once" if found.jumps == 1 else f"{found.jumps} times"
+            notes.add(f"{topic}: the clock of the header stamps was set {times}; the log times tell by how much.")
+        if found.log_jumps:
+            times = plural(found.log_jumps, "place")
+            notes.add(f"{topic}: the log times jump in {times}; the header stamps do not, and are used.")
+        _lose("stray_stamp", topic, ~found.kept, log_ns[rows], notes)
+        rows, stamp_ns = rows[found.kept], found.stamp_ns[found.kept]
+        stamp_ns = _on_common(stamp_ns, found.skew_ns, self.common, topic, notes)
+        return _in_order(topic, notes, stamp_ns, rows, log_ns)
+
+    def _by_log_times(self, topic: str, notes: Notes, log_ns: Ints, why: str) -> tuple[Ints, Ints]:
+        notes.add(f"{topic} {why}; its log times are used instead.")
+        return _in_order(topic, notes, log_ns, np.arange(len(log_ns)), log_ns)
+
+
+def share_clock(topics: Iterable[Stamps]) -> None:
+    """Tell all topics of a log the clock that most of their messages are on, by how far log times are from stamps."""
+    topics = [one for one in topics if len(one.header_ns)]
+    pooled: dict[int, int] = {}
+    for one in topics:
+        for skew, count in sorted(one.clocks().items()):
+            known = next((other for other in pooled if abs(other - skew) <= LEAST_JUMP_NS), skew)
+            pooled[known] = pooled.get(known, 0) + count
+    if not pooled:
+        return
+    skew_ns = max(pooled, key=lambda skew: (pooled[skew], -skew))
+    for one in topics:
+        one.common = Clock(skew_ns, 0, 0)
+    covered = [one for one in topics if any(abs(skew - skew_ns) <= LEAST_JUMP_NS for skew in one.clocks())]
+    log_ns = [int(ns) - skew_ns for one in covered for ns in (min(one.log_ns), max(one.log_ns))]
+    for one in topics:
+        one.common = Clock(skew_ns, min(log_ns), max(log_ns))
+
+
+def _on_common(stamp_ns: Ints, skew_ns: int, common: Clock | None, topic: str, notes: Notes) -> Ints:
+    """Stamps of another clock than the common one moved to it by the log times, where they cover no time of it.
+
+    Where they do, they may be right and only recorded late: that is for the reader to decide.
+    """
+    if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= _LATE_NS:
+        return stamp_ns
+    shift = skew_ns - common.skew_ns
+    first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
+    apart = first_ns > common.last_ns or last_ns < common.first_ns
+    if not apart or first_ns + shift < 0 or last_ns + shift > _LAST_NS:
+        notes.add(
+            f"{topic}: by the log times, the header stamps are {abs(shift) / 1e9:.1f} s "
+            f"{'earlier' if shift > 0 else 'later'} than those of other topics. Were they recorded late, or is a "
+            "clock wrong?"
+        )
+        return stamp_ns
+    notes.add(
+        f"{topic}: the header stamps are of another clock than those of most messages, {abs(shift) / 1e9:.3f} s apart "
+        "by the log times; they are shifted to it, and right to the jitter of the log times."
+    )
+    return stamp_ns + shift
+
+
+def _in_order(topic: str, notes: Notes, stamp_ns: Ints, rows: Ints, log_ns: Ints) -> tuple[Ints, Ints]:
+    ordered, order = increasing(stamp_ns, topic, notes)
+    repeated = np.ones(len(stamp_ns), bool)
+    repeated[order] = False
+    _lose("repeated_stamp", topic, repeated, log_ns[rows], notes)
+    _note_gaps(topic, ordered, notes)
+    return ordered, rows[order]
+
+
+def _lose(reason: str, topic: str, lost: np.ndarray, log_ns: Ints, notes: Notes) -> None:
+    if lost.any():
+        notes.account.add(reason, {topic: int(lost.sum())}, (topic, 0), runs_of(lost, log_ns))
+
+
+def _note_gaps(topic: str, stamp_ns: Ints, notes: Notes) -> None:
+    steps = np.diff(stamp_ns)
+    if not len(steps):
+        return
+    gaps = np.flatnonzero(steps > max(_GAP_NS, _GAP_PERIODS * float(np.median(steps))))
+    if len(gaps):
+        longest = gaps[np.argmax(steps[gaps])]
+        at_s = (stamp_ns[longest] - stamp_ns[0]) / 1e9
+        notes.add(
+            f"{topic}: {plural(len(gaps), 'gap')}, the longest {steps[longest] / 1e9:.1f} s, {at_s:.1f} s behind its "
+            "first message."
+        )
 
 
 def increasing(stamp_ns: Ints, what: str, notes: Notes) -> tuple[Ints, Ints]:
-    """The stamps sorted, the first of equal ones kept, and the row each came from; both repairs are noted."""
+    """The stamps sorted, the first of equal ones kept, and the row each came from; sorting is noted."""
     if late := int((np.diff(stamp_ns) < 0).sum()):
         notes.add(f"{what}: {plural(late, 'stamp')} out of order; sorted.")
     order = np.argsort(stamp_ns, kind="stable")
     ordered = stamp_ns[order]
     first = np.ones(len(ordered), bool)
     first[1:] = np.diff(ordered) > 0
-    if repeated := int((~first).sum()):
-        notes.add(f"{what}: {plural(repeated, 'message')} with the stamp of an earlier one dropped.")
     return ordered[first], order[first]
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog import geometry
 from vplog.data import Gps, Odometry
 from vplog.logs.containers import plural
 from vplog.logs.stamps import Stamps
-from vplog.logs.transforms import usable_pose
+from vplog.logs.transforms import clean, is_usable
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
 
+_UNKNOWN = [float("nan")] * 36
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -27,46 +30,50 @@ class PoseTrack:
     """Collects the poses of one odometry topic."""
 
     def __init__(self, topic: str) -> None:
-        self._topic = topic
-        self._stamps = Stamps()
-        self._poses: list[Floats] = []
-        self._covariance: list[Floats | None] = []
+        self.topic = topic
+        self.stamps = Stamps()
+        self._poses = array("d")
+        """x y z, x y z w of every pose."""
+        self._covariances = array("d")
+        """36 numbers of every pose, NaN where it has none."""
+        self._bare = True
+        """No pose has a covariance."""
         self._dropped = 0
         self.child = ""
         """The frame that moves, as the first message names it."""
+        self.parent = ""
+        """The frame that it moves in."""
 
     def add(self, message: PoseMessage, log_ns: int) -> None:
-        self.child = self.child or message.child
-        pose = usable_pose(message.position, message.quaternion)
-        if pose is None:
+        self.child = self.child or clean(message.child)
+        self.parent = self.parent or clean(message.frame)
+        if not is_usable(position := message.position.tolist(), quaternion := message.quaternion.tolist()):
             self._dropped += 1
             return
-        self._stamps.add(message.stamp_ns, log_ns)
-        self._poses.append(pose)
-        self._covariance.append(message.covariance)
+        self.stamps.add(message.stamp_ns, log_ns)
+        self._poses.extend((*position, *quaternion))
+        self._bare = self._bare and message.covariance is None
+        self._covariances.extend(_UNKNOWN if message.covariance is None else message.covariance.ravel().tolist())
 
     def finish(self, notes: Notes) -> Odometry | None:
         """The odometry, or None where no pose is usable."""
         if self._dropped:
-            notes.add(f"{self._topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
-        stamp_ns, rows = self._stamps.order(self._topic, notes)
+            notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
+        stamp_ns, rows = self.stamps.order(self.topic, notes)
         if not len(rows):
             return None
-        poses = np.array(self._poses)[rows]
-        unknown = np.full((6, 6), np.nan)
-        logged = [self._covariance[row] for row in rows]
-        covariance = body_covariance(poses, np.array([unknown if c is None else c for c in logged]))
+        values = np.frombuffer(self._poses).reshape(-1, 7)[rows]
+        poses = geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
+        covariance = body_covariance(poses, np.frombuffer(self._covariances).reshape(-1, 6, 6)[rows])
         usable = np.isfinite(covariance).all((1, 2))
         if usable.all():
             return Odometry(stamp_ns, poses, covariance)
         if usable.any():
             bad = plural(int((~usable).sum()), "covariance")
-            notes.add(f"{self._topic}: {bad} that no noise can have (zero, negative or not finite) taken as unknown.")
+            notes.add(f"{self.topic}: {bad} that no noise can have (zero, negative or not finite) taken as unknown.")
             return Odometry(stamp_ns, poses, covariance)
-        why = (
-            "carries no covariance" if all(c is None for c in logged) else "has no usable covariance (zero or invalid)"
-        )
-        notes.add(f"{self._topic} {why}; the noise of its motion is a guess.")
+        why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
+        notes.add(f"{self.topic} {why}; the noise of its motion is a guess.")
         return Odometry(stamp_ns, poses, None)
 
 
@@ -92,8 +99,8 @@ class FixTrack:
     """Collects the fixes of one GPS topic."""
 
     def __init__(self, topic: str) -> None:
-        self._topic = topic
-        self._stamps = Stamps()
+        self.topic = topic
+        self.stamps = Stamps()
         self._fixes: list[FixMessage] = []
         self.frame = ""
         """Of the antenna, by the first fix."""
@@ -105,14 +112,14 @@ class FixTrack:
             self._dropped += 1
             return
         self.frame = self.frame or message.frame
-        self._stamps.add(message.stamp_ns, log_ns)
+        self.stamps.add(message.stamp_ns, log_ns)
         self._fixes.append(message)
 
     def finish(self, notes: Notes) -> Gps | None:
         """The fixes, or None where none is usable. Altitudes may be NaN."""
         if self._dropped:
-            notes.add(f"{self._topic}: {plural(self._dropped, 'message')} without a fix dropped.")
-        stamp_ns, rows = self._stamps.order(self._topic, notes)
+            notes.add(f"{self.topic}: {plural(self._dropped, 'message')} without a fix dropped.")
+        stamp_ns, rows = self.stamps.order(self.topic, notes)
         if not len(rows):
             return None
         fixes = [self._fixes[row] for row in rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,8 @@ class FrameTree:
 
     def __init__(self, transforms: Iterable[TransformMessage]) -> None:
         self._from: dict[str, dict[str, Floats]] = {}
+        self.edges: list[tuple[str, str]] = []
+        """Parent and child of each transform."""
         self.dropped = 0
         """Transforms that were NaN, infinite or without rotation."""
         for transform in transforms:
@@ -34,6 +37,7 @@ class FrameTree:
             if parent_from_child is None or parent == child:
                 self.dropped += 1
                 continue
+            self.edges.append((parent, child))
             self._from.setdefault(parent, {})[child] = parent_from_child
             self._from.setdefault(child, {})[parent] = geometry.inverse(parent_from_child)
 
@@ -64,8 +68,13 @@ def clean(frame: str) -> str:
 
 def usable_pose(position: Floats, quaternion: Floats) -> Floats | None:
     """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond FARTHEST_M) or no rotation is set."""
-    placed = bool((np.abs(position) < FARTHEST_M).all())  # False for NaN
-    length = float(np.abs(quaternion).max())
-    if not placed or not np.isfinite(quaternion).all() or not SMALLEST < length < 1 / SMALLEST:
+    if not is_usable(position.tolist(), quaternion.tolist()):
         return None
     return geometry.pose(geometry.rotation(quaternion), position)
+
+
+def is_usable(position: list[float], quaternion: list[float]) -> bool:
+    """Whether `usable_pose` of these x y z and x y z w is one; plain numbers, since odometry asks for each message."""
+    placed = all(abs(value) < FARTHEST_M for value in position)  # False for NaN
+    turned = all(map(math.isfinite, quaternion)) and SMALLEST < max(map(abs, quaternion)) < 1 / SMALLEST
+    return placed and turned

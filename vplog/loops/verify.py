@@ -71,7 +71,7 @@ def drive_of(
 def verify_between(
     proposals: Proposals, later: Drive, earlier: Drive, threads: int = 1, progress: Progress | None = None
 ) -> Closures:
-    """The ledger of proposals whose queries are rows of `later` and whose matches are rows of `earlier`, in their order.
+    """The ledger of proposals whose queries are rows of `later` and whose matches are rows of `earlier`, in order.
 
     Both may be the same drive. `progress(done, total)` counts candidates and is called from the caller's thread. The
     result does not depend on `threads`. Candidates are worked through by map frame, whose landmarks are made once, and

@@ -36,8 +36,9 @@ class DirectionSettings(Settings):
     """What is kept of two views that agree, where landmarks are too few or too far for metres."""
 
     keep: bool = False
-    """Whether such a row gets turn and direction: its verdict stays, its `scale` is `none`, its pose is that of a
-    camera translation of length one, and its information says nothing of that length."""
+    """Whether such a row gets turn and direction, for the solve to take where they fit (`direction_only`): its `scale`
+    is `none`, its pose is that of a camera translation of length one, and its information says nothing of that
+    length."""
     min_inliers: int = Field(default=30, ge=8)
     """Matches that must agree; a line is a weak test, so more than for a pose."""
     log10_false_alarms: float = Field(default=-6.0, le=0)

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.results import messages, tables
+from vplog.results import messages, places_map, tables
 from vplog.results.atomic import replacing
+from vplog.results.layouts import layouts
+from vplog.results.mcap import TOPICS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,11 +22,18 @@ _HEADER = {
     "vplog.version": "Version of vplog that wrote the file.",
 }
 
+_MAP_HEADER = {
+    "vplog.descriptor": "The columns behind the poses, one for each part of a descriptor, as JSON: name, type, and "
+    "where the column is bytes the number of its values, which are little endian.",
+}
+
 
 def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
     """Write the contracts into a folder; the files written, in order. The pipeline's JSON Schema comes from outside:
     the settings of all stages are known only to the pipeline."""
     texts = {"vplog.LoopClosure.proto": messages.loop_closure_proto()}
+    topics = [{"topic": name, "schema": kind, "description": about} for name, (kind, about) in TOPICS.items()]
+    texts["result.mcap.json"] = json.dumps({"file": "result.mcap", "topics": topics}, indent=2) + "\n"
     texts["pipeline.schema.json"] = json.dumps(pipeline_schema, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
     for name, schema in table_schemas().items():
         texts[f"{name}.json"] = json.dumps(_contract(name, schema), indent=2, ensure_ascii=False) + "\n"
@@ -42,8 +51,10 @@ def table_schemas() -> dict[str, pa.Schema]:
         "keyframes": tables.KEYFRAMES,
         "descriptors": tables.descriptors_schema(pa.binary()),
         "closures": tables.CLOSURES,
+        "joins": tables.JOINS,
         "edges": tables.EDGES,
         "trajectory": tables.TRAJECTORY,
+        "map": pa.schema([*places_map.PLACE, tables.descriptors_schema(pa.binary()).field("descriptor")]),
     }
 
 
@@ -52,7 +63,7 @@ def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
     for column in schema:
         metadata = {key.decode(): value.decode() for key, value in column.metadata.items()}
         kind = _kind(column.type)
-        if (name, column.name) == ("descriptors", "descriptor"):
+        if column.name == "descriptor":
             kind = "any"
         columns.append(
             {
@@ -63,7 +74,10 @@ def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
                 "description": metadata["description"],
             }
         )
-    return {"table": name, "file": f"{name}.parquet", "metadata": _HEADER, "columns": columns}
+    contract = {"table": name, "file": f"{name}.parquet", "metadata": _HEADER, "columns": columns}
+    if name == "map":
+        contract |= {"file": "named by `vplog map export -o`", "metadata": {**_HEADER, **_MAP_HEADER}}
+    return {**contract, "descriptor": layouts()} if columns[-1]["name"] == "descriptor" else contract
 
 
 def _kind(kind: pa.DataType) -> str:
@@ -72,4 +86,6 @@ def _kind(kind: pa.DataType) -> str:
         return f"{_kind(kind.value_type)}[{kind.list_size}]"
     if pa.types.is_list(kind):
         return f"{_kind(kind.value_type)}[]"
+    if pa.types.is_dictionary(kind):
+        return _kind(kind.value_type)
     return {"float": "float32", "double": "float64"}.get(str(kind), str(kind))

@@ -1,17 +1,21 @@
 """result.mcap: the run as Foxglove and rerun show it, every message in protobuf with the schema beside it.
 
-Frames: `map` is the root, `base_link` the body, `camera` fixed on the body.
+Frames: `map` is the root, `base_link` the body, `camera` fixed on the body. Topics are listed in `TOPICS`.
 """
 
 from __future__ import annotations
 
+import heapq
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.GeoJSON_pb2 import GeoJSON
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -20,28 +24,62 @@ from mcap.writer import CompressionType, Writer
 import vplog
 from vplog import geometry
 from vplog.data import EdgeKind, Verdict
+from vplog.results import foxglove, geo
 from vplog.results.atomic import replacing
 from vplog.results.messages import descriptor_set, loop_closure_class
+from vplog.results.run_record import canonical_json
+from vplog.results.shown import Shown
 from vplog.results.tables import covariance_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from google.protobuf.message import Message
 
     from vplog.data import Camera, Closures, Floats, Ints, Keyframes, PoseGraph
+    from vplog.results.foxglove import Part
     from vplog.results.tables import TableMetadata
 
-Part = tuple[list[float], list[float]]
-"""Position in m and quaternion x y z w of one pose, as plain numbers."""
+    Timed = tuple[int, str, Message]
+    """Log time in ns, topic, message."""
 
-MAP, BODY, CAMERA = "map", "base_link", "camera"
-
-_GREY, _GREEN, _RED = (0.6, 0.6, 0.6, 1.0), (0.1, 0.8, 0.2, 1.0), (0.9, 0.1, 0.1, 1.0)
-_THICKNESS_PX = 2.0
-"""Lines keep their width on the screen at any zoom."""
 _CHUNK_BYTES = 1 << 20
 """A reader inflates one chunk at a time; 1 MiB is what the format's own tools write."""
+
+PICTURES, REFERENCE, FIXES, EARTH = "/closures/picture", "/reference/image", "/gps", "/gps/optimised"
+_CAMERA = "/cam/NAME"
+TOPICS = {
+    "/path/optimised": ("foxglove.PosesInFrame", "The keyframes as solved, at the start and the end of the drive."),
+    "/path/odometry": ("foxglove.PosesInFrame", "The odometry, laid on the first solved keyframe."),
+    "/path/optimised_points": ("foxglove.PointCloud", "The positions of the same, green."),
+    "/path/odometry_points": ("foxglove.PointCloud", "The positions of the same, grey."),
+    "/graph": ("foxglove.SceneUpdate", "Odometry grey, accepted closures green, those the solver rejected red."),
+    "/graph/rejected": ("foxglove.SceneUpdate", "Candidates that geometry rejected, faint red."),
+    "/tf_static": ("foxglove.FrameTransforms", "The camera on the body."),
+    "/tf": ("foxglove.FrameTransforms", "The body in the map, at each keyframe."),
+    "/loop_closures": ("vplog.LoopClosure", "The ledger: one message for each candidate, at its query's stamp."),
+    FIXES: ("foxglove.LocationFix", "The log's satellite fixes."),
+    EARTH: ("foxglove.GeoJSON", "The path and the accepted closures on earth, where there are fixes."),
+    REFERENCE: ("foxglove.CompressedImage", "The library image that explains the keyframe of this stamp best."),
+    "/reference/annotations": (
+        "foxglove.ImageAnnotations",
+        "The boxes mined on it, numbered as the keyframe's windows.",
+    ),
+    PICTURES: ("foxglove.CompressedImage", "Some candidates drawn; frame_id is closure_ROW of the ledger."),
+    f"{_CAMERA}/image": ("foxglove.CompressedImage", "The keyframe, downsized, at the log's own stamp."),
+    f"{_CAMERA}/calibration": ("foxglove.CameraCalibration", "The camera's, at the size of these images."),
+    f"{_CAMERA}/annotations": (
+        "foxglove.ImageAnnotations",
+        "The parts found on the reference, numbered as their boxes.",
+    ),
+}
+"""Schema and meaning of every topic; NAME stands for the camera."""
+
+
+def camera_topic(camera: Camera) -> str:
+    """`/cam/NAME`, the name of the camera in letters that no viewer takes for something else."""
+    return f"/cam/{re.sub('[^0-9A-Za-z_.-]+', '_', camera.name).strip('_') or 'camera'}"
 
 
 def write_mcap(
@@ -52,124 +90,157 @@ def write_mcap(
     closures: Closures,
     metadata: TableMetadata,
     camera: Camera | None = None,
+    shown: Shown | None = None,
 ) -> None:
     """Write the run; `world_from_body` (N, 4, 4) are the solved poses of the keyframes.
 
-    Messages are in the order of their log time, which is the stamp of the keyframe they are about; what is about
-    the whole drive stands at its start, and the solved path once more at its end.
+    Messages are in the order of their log time, which is the stamp of the keyframe or fix they are about; what is
+    about the whole drive stands at its start, and the solved path once more at its end.
     """
-    loop_closure = loop_closure_class()
+    shown = shown or Shown()
     with replacing(path) as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=f"vplog {vplog.__version__}")
         header = {key.removeprefix("vplog."): text for key, text in metadata.record().items()}
-        writer.add_metadata("vplog", {**header, "drive": keyframes.drive})
-        optimised = _Channel(writer, "/path/optimised", PosesInFrame)
-        odometry = _Channel(writer, "/path/odometry", PosesInFrame)
-        # the same positions as points: rerun reads the paths, but draws point clouds
-        optimised_points = _Channel(writer, "/path/optimised_points", PointCloud)
-        odometry_points = _Channel(writer, "/path/odometry_points", PointCloud)
-        scene = _Channel(writer, "/graph", SceneUpdate)
-        static = _Channel(writer, "/tf_static", FrameTransforms)
-        transforms = _Channel(writer, "/tf", FrameTransforms)
-        ledger = _Channel(writer, "/loop_closures", loop_closure)
-
-        bodies, relative = _parts(world_from_body), _parts(closures.match_from_query)
-        covariance = covariance_of(closures.information)
-        rows = np.argsort(closures.query, kind="stable")
-        first_row = np.searchsorted(closures.query[rows], np.arange(len(keyframes.stamp_ns) + 1))
-        for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
-            if node == 0:
-                world_from_odom = world_from_body[0] @ geometry.inverse(keyframes.odom_from_body[0])
-                optimised.write(stamp_ns, _path(stamp_ns, bodies))
-                drifted = world_from_odom @ keyframes.odom_from_body
-                odometry.write(stamp_ns, _path(stamp_ns, _parts(drifted)))
-                optimised_points.write(stamp_ns, _points(stamp_ns, world_from_body, _GREEN))
-                odometry_points.write(stamp_ns, _points(stamp_ns, drifted, _GREY))
-                scene.write(stamp_ns, _scene(stamp_ns, world_from_body, graph, closures))
-                if camera is not None:
-                    [part] = _parts(camera.body_from_camera[None])
-                    static.write(stamp_ns, _transform(stamp_ns, BODY, CAMERA, part))
-            transforms.write(stamp_ns, _transform(stamp_ns, MAP, BODY, bodies[node]))
-            for row in rows[first_row[node] : first_row[node + 1]].tolist():
-                parts = relative[row], covariance[row]
-                ledger.write(stamp_ns, _loop_closure(loop_closure(), row, closures, *parts, keyframes.stamp_ns))
-            if node == len(keyframes.stamp_ns) - 1:
-                optimised.write(stamp_ns, _path(stamp_ns, bodies))
+        about = {name: canonical_json(value) for name, value in shown.about.items()}
+        writer.add_metadata("vplog", {**header, "drive": keyframes.drive, **about})
+        if len(keyframes.stamp_ns):
+            start_ns = int(keyframes.stamp_ns[0])
+            for number, data in sorted(shown.references.items()):
+                writer.add_attachment(start_ns, start_ns, f"reference-{number}.jpg", "image/jpeg", data)
+        channels = _Channels(writer, camera)
+        solved = _solved(keyframes, world_from_body, graph, closures, camera, shown)
+        seen = _seen(keyframes, closures, camera, shown) if camera is not None else iter(())
+        for stamp_ns, topic, message in heapq.merge(solved, seen, _fixes(shown), key=lambda timed: timed[0]):
+            channels.write(stamp_ns, topic, message)
         writer.finish()
 
 
-class _Channel:
-    """One topic of the file, with the schema of its messages."""
+def _solved(
+    keyframes: Keyframes, world_from_body: Floats, graph: PoseGraph, closures: Closures, camera: Camera | None,
+    shown: Shown,
+) -> Iterator[Timed]:  # fmt: skip
+    """Paths, graph, transforms and ledger."""
+    loop_closure = loop_closure_class()
+    bodies, relative = foxglove.parts(world_from_body), foxglove.parts(closures.match_from_query)
+    covariance = covariance_of(closures.information)
+    rows = np.argsort(closures.query, kind="stable")
+    first_row = np.searchsorted(closures.query[rows], np.arange(len(keyframes.stamp_ns) + 1))
+    for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
+        if node == 0:
+            drifted = world_from_body[0] @ geometry.inverse(keyframes.odom_from_body[0]) @ keyframes.odom_from_body
+            yield stamp_ns, "/path/optimised", foxglove.path(stamp_ns, bodies)
+            yield stamp_ns, "/path/odometry", foxglove.path(stamp_ns, foxglove.parts(drifted))
+            # the same positions as points: rerun reads the paths, but draws point clouds
+            yield stamp_ns, "/path/optimised_points", foxglove.points(stamp_ns, world_from_body, foxglove.GREEN)
+            yield stamp_ns, "/path/odometry_points", foxglove.points(stamp_ns, drifted, foxglove.GREY)
+            yield stamp_ns, "/graph", _graph(stamp_ns, world_from_body, graph, closures)
+            yield stamp_ns, "/graph/rejected", _rejected(stamp_ns, world_from_body, closures)
+            if camera is not None:
+                [part] = foxglove.parts(camera.body_from_camera[None])
+                yield stamp_ns, "/tf_static", foxglove.transform(stamp_ns, foxglove.BODY, foxglove.CAMERA, part)
+            if shown.earth is not None:
+                tree = geo.feature_collection(shown.earth, world_from_body, keyframes.stamp_ns, closures)
+                yield stamp_ns, EARTH, foxglove.geojson(tree)
+        yield stamp_ns, "/tf", foxglove.transform(stamp_ns, foxglove.MAP, foxglove.BODY, bodies[node])
+        for row in rows[first_row[node] : first_row[node + 1]].tolist():
+            pose = relative[row], covariance[row]
+            yield stamp_ns, "/loop_closures", _loop_closure(loop_closure(), row, closures, *pose, keyframes.stamp_ns)
+        if node and node == len(keyframes.stamp_ns) - 1:
+            yield stamp_ns, "/path/optimised", foxglove.path(stamp_ns, bodies)
 
-    def __init__(self, writer: Writer, topic: str, message: type[Message]) -> None:
+
+def _seen(keyframes: Keyframes, closures: Closures, camera: Camera, shown: Shown) -> Iterator[Timed]:
+    """The camera's pictures with what was found in them, at their exact stamps, and the pictures of closures."""
+    topic, size = camera_topic(camera), shown.image_size
+    if shown.image is None:
+        size = camera.width, camera.height  # annotations then are drawn on the log's own images
+    sizes = {number: _jpeg_size(data) for number, data in shown.references.items()}
+    pictures = sorted(shown.pictures, key=lambda row: (int(closures.query[row]), row))
+    for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
+        if shown.image is not None or shown.explained is not None:
+            yield stamp_ns, f"{topic}/calibration", foxglove.calibration(stamp_ns, camera, size)
+        if shown.image is not None:
+            yield stamp_ns, f"{topic}/image", foxglove.image(stamp_ns, foxglove.CAMERA, shown.image(node))
+        found = shown.explained(node) if shown.explained is not None else None
+        if found is not None and len(found.references):
+            first = int(found.references[0])
+            title = f"explained by {', '.join(f'reference {number}' for number in found.references[:3])}"
+            windows = np.where(np.isfinite(found.boxes), found.windows, np.nan)
+            yield stamp_ns, f"{topic}/annotations", foxglove.boxes(stamp_ns, windows, size, title)
+            if first in sizes:
+                data = foxglove.image(stamp_ns, f"reference_{first}", shown.references[first])
+                yield stamp_ns, REFERENCE, data
+                named = foxglove.boxes(stamp_ns, found.boxes, sizes[first], f"reference {first}")
+                yield stamp_ns, "/reference/annotations", named
+        while pictures and int(closures.query[pictures[0]]) == node:
+            row = pictures.pop(0)
+            yield stamp_ns, PICTURES, foxglove.image(stamp_ns, f"closure_{row}", shown.pictures[row])
+
+
+def _fixes(shown: Shown) -> Iterator[Timed]:
+    if shown.gps is not None:
+        for row, stamp_ns in enumerate(shown.gps.stamp_ns.tolist()):
+            yield stamp_ns, FIXES, foxglove.fix(shown.gps, row)
+
+
+class _Channels:
+    """The topics of the file, each with the schema of its messages, from its first message on."""
+
+    def __init__(self, writer: Writer, camera: Camera | None) -> None:
         self._writer = writer
-        schema = writer.register_schema(message.DESCRIPTOR.full_name, "protobuf", descriptor_set(message))
-        self._id = writer.register_channel(topic, "protobuf", schema)
-        self._sequence = 0
+        known = (
+            *(CameraCalibration, CompressedImage, FrameTransforms, GeoJSON, ImageAnnotations, LocationFix, PointCloud),
+            *(PosesInFrame, SceneUpdate, loop_closure_class()),
+        )
+        classes: dict[str, type[Message]] = {message.DESCRIPTOR.full_name: message for message in known}
+        name = _CAMERA if camera is None else camera_topic(camera)
+        self._classes = {topic.replace(_CAMERA, name): classes[kind] for topic, (kind, _) in TOPICS.items()}
+        self._schemas: dict[str, int] = {}
+        self._ids: dict[str, int] = {}
+        self._sequence = dict.fromkeys(self._classes, 0)
 
-    def write(self, stamp_ns: int, message: Message) -> None:
-        data = message.SerializeToString(deterministic=True)
-        self._writer.add_message(self._id, stamp_ns, data, publish_time=stamp_ns, sequence=self._sequence)
-        self._sequence += 1
+    def write(self, stamp_ns: int, topic: str, message: Message) -> None:
+        if topic not in self._ids:
+            self._ids[topic] = self._register(topic)
+        data, sequence = message.SerializeToString(deterministic=True), self._sequence[topic]
+        self._writer.add_message(self._ids[topic], stamp_ns, data, publish_time=stamp_ns, sequence=sequence)
+        self._sequence[topic] = sequence + 1
 
-
-def _path(stamp_ns: int, parts: list[Part]) -> PosesInFrame:
-    message = PosesInFrame(frame_id=MAP)
-    message.timestamp.FromNanoseconds(stamp_ns)
-    for position, quaternion in parts:
-        pose = message.poses.add()
-        pose.position.x, pose.position.y, pose.position.z = position
-        pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = quaternion
-    return message
-
-
-def _points(stamp_ns: int, poses: Floats, color: tuple[float, float, float, float]) -> PointCloud:
-    """The positions of poses (R, 4, 4), all in one colour."""
-    packed = np.zeros(len(poses), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
-    packed["position"] = poses[:, :3, 3]
-    packed["color"] = np.round(255 * np.array(color))
-    message = PointCloud(frame_id=MAP, point_stride=packed.itemsize, data=packed.tobytes())
-    message.timestamp.FromNanoseconds(stamp_ns)
-    message.pose.orientation.w = 1.0
-    for at, name in enumerate("xyz"):
-        message.fields.add(name=name, offset=4 * at, type=PackedElementField.FLOAT32)
-    for at, name in enumerate(("red", "green", "blue", "alpha")):
-        message.fields.add(name=name, offset=12 + at, type=PackedElementField.UINT8)
-    return message
+    def _register(self, topic: str) -> int:
+        """The topic's number, with its schema where no other topic has brought it."""
+        message = self._classes[topic]
+        name = message.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(message))
+        return self._writer.register_channel(topic, "protobuf", self._schemas[name])
 
 
-def _transform(stamp_ns: int, parent: str, child: str, part: Part) -> FrameTransforms:
-    message = FrameTransforms()
-    transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
-    transform.timestamp.FromNanoseconds(stamp_ns)
-    position, quaternion = part
-    transform.translation.x, transform.translation.y, transform.translation.z = position
-    transform.rotation.x, transform.rotation.y, transform.rotation.z, transform.rotation.w = quaternion
-    return message
-
-
-def _scene(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: Closures) -> SceneUpdate:
+def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: Closures) -> SceneUpdate:
     """Odometry edges grey, accepted closures green, closures that the robust solve rejected red."""
-    message = SceneUpdate()
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
     accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
     rejected = np.array([verdict == Verdict.REJECTED_BY_SOLVER for verdict in closures.verdict], bool)
-    for name, a, b, color in (
-        ("odometry", graph.a[odometry], graph.b[odometry], _GREY),
-        ("closures accepted", closures.match[accepted], closures.query[accepted], _GREEN),
-        ("closures rejected by the solver", closures.match[rejected], closures.query[rejected], _RED),
-    ):
-        entity = message.entities.add(frame_id=MAP, id=name)
-        entity.timestamp.FromNanoseconds(stamp_ns)
-        entity.metadata.add(key="edges", value=str(len(a)))
-        lines = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=_THICKNESS_PX, scale_invariant=True)
-        lines.pose.orientation.w = 1.0
-        lines.color.CopyFrom(Color(r=color[0], g=color[1], b=color[2], a=color[3]))
-        ends = np.stack([world_from_body[a, :3, 3], world_from_body[b, :3, 3]], axis=1).reshape(-1, 3)
-        for x, y, z in ends.tolist():
-            lines.points.add(x=x, y=y, z=z)
-    return message
+    ends = world_from_body[:, :3, 3]
+    named = [
+        ("odometry", np.stack([ends[graph.a[odometry]], ends[graph.b[odometry]]], 1), foxglove.GREY),
+        ("closures accepted", _between(ends, closures, accepted), foxglove.GREEN),
+        ("closures rejected by the solver", _between(ends, closures, rejected), foxglove.RED),
+    ]
+    return foxglove.lines(stamp_ns, named)
+
+
+def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
+    """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
+    kept = (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER)
+    rejected = np.array([verdict not in kept for verdict in closures.verdict], bool)
+    ends = _between(world_from_body[:, :3, 3], closures, rejected)
+    return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
+
+
+def _between(positions: Floats, closures: Closures, wanted: Any) -> Floats:
+    """(S, 2, 3) the ends of closures."""
+    return np.stack([positions[closures.match[wanted]], positions[closures.query[wanted]]], axis=1)
 
 
 def _loop_closure(
@@ -177,7 +248,7 @@ def _loop_closure(
 ) -> Message:
     message.timestamp.FromNanoseconds(int(stamp_ns[closures.query[row]]))
     message.match_timestamp.FromNanoseconds(int(stamp_ns[closures.match[row]]))
-    message.frame_id = BODY
+    message.frame_id = foxglove.BODY
     for name in ("query", "match", "rank", "support", "matches", "landmarks", "inliers", "reverse_inliers"):
         setattr(message, name, int(getattr(closures, name)[row]))
     message.shared_references.extend(closures.shared_references[row].tolist())
@@ -199,6 +270,9 @@ def _loop_closure(
     return message
 
 
-def _parts(poses: Floats) -> list[Part]:
-    """The parts of poses (R, 4, 4), all at once: row by row, numpy takes most of the time of a large file."""
-    return list(zip(poses[:, :3, 3].tolist(), geometry.quaternion(poses[:, :3, :3]).tolist(), strict=True))
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Width and height in px."""
+    import cv2
+
+    height, width = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)).shape
+    return width, height

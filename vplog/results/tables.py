@@ -23,7 +23,7 @@ from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from vplog.data import Floats, Solution
@@ -109,6 +109,13 @@ CLOSURES = pa.schema(
         _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
     ]
 )
+JOINS = pa.schema(
+    [
+        _column("query_drive", pa.string(), "", "Drive of the query keyframe, the later one given."),
+        _column("match_drive", pa.string(), "", "Drive of the match keyframe."),
+        *CLOSURES,
+    ]
+)
 EDGES = pa.schema(
     [
         _column("a", pa.int32(), "row", "Keyframe."),
@@ -163,17 +170,30 @@ def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:
 
 def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadata: TableMetadata) -> None:
     """closures.parquet, the ledger with the stamps of both keyframes and each verdict's sentence."""
-    columns = {
+    _write(path, "closures", CLOSURES, _ledger_columns(closures, keyframes, keyframes), metadata)
+
+
+def write_joins(path: Path, ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], metadata: TableMetadata) -> None:
+    """joins.parquet: the ledgers of pairs of drives, the later one (its keyframes are the queries) and the earlier."""
+    parts = []
+    for later, earlier, closures in ledgers:
+        drives = {"query_drive": [later.drive] * len(closures), "match_drive": [earlier.drive] * len(closures)}
+        parts.append(_arrays(JOINS, {**drives, **_ledger_columns(closures, later, earlier)}))
+    table = pa.concat_tables([pa.Table.from_arrays(part, schema=JOINS) for part in parts] or [JOINS.empty_table()])
+    _write_table(path, "joins", table.combine_chunks(), metadata)
+
+
+def _ledger_columns(closures: Closures, query: Keyframes, match: Keyframes) -> dict[str, Any]:
+    return {
         **{name: getattr(closures, name) for name in (*_PLAIN_LEDGER, "shared_references", "shared_overlap", "scale")},
-        "query_stamp_ns": keyframes.stamp_ns[closures.query],
-        "match_stamp_ns": keyframes.stamp_ns[closures.match],
+        "query_stamp_ns": query.stamp_ns[closures.query],
+        "match_stamp_ns": match.stamp_ns[closures.match],
         **_pose_values("", closures.match_from_query),
         "information": closures.information,
         "covariance": covariance_of(closures.information),
         "verdict": [verdict.value for verdict in closures.verdict],
         "reason": [verdict.sentence for verdict in closures.verdict],
     }
-    _write(path, "closures", CLOSURES, columns, metadata)
 
 
 _PLAIN_LEDGER = (
@@ -344,8 +364,15 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def _write(path: Path, name: str, schema: pa.Schema, columns: dict[str, Any], metadata: TableMetadata) -> None:
-    arrays = [_array(columns[column.name], column) for column in schema]
-    table = pa.Table.from_arrays(arrays, schema=_with_metadata(schema, name, metadata))
+    _write_table(path, name, pa.Table.from_arrays(_arrays(schema, columns), schema=schema), metadata)
+
+
+def _arrays(schema: pa.Schema, columns: dict[str, Any]) -> list[pa.Array]:
+    return [_array(columns[column.name], column) for column in schema]
+
+
+def _write_table(path: Path, name: str, table: pa.Table, metadata: TableMetadata) -> None:
+    table = table.cast(_with_metadata(table.schema, name, metadata))
     with replacing(path) as stream:
         pq.write_table(table, stream, compression="zstd", row_group_size=ROWS_PER_GROUP)
 

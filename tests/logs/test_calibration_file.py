@@ -1,0 +1,162 @@
+"""Calibration from a file beside the log, in each of the formats that calibration tools write."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from vplog import logs
+from vplog.errors import LogError
+from vplog.logs import TopicChoice
+from vplog.logs.calibration_file import camera_for, read_calibrations
+
+from .drives import HEIGHT, WIDTH, Drive, ros_messages, write_ros2
+from .test_stereo import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT, SIZE, check, drive
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+K = [[150.0, 0.0, 31.0], [0.0, 151.0, 22.0], [0.0, 0.0, 1.0]]
+D = [-0.1, 0.02, 0.001, -0.002, 0.0]
+
+
+def matrix(rows: Any) -> dict:
+    array = np.array(rows, float)
+    return {"rows": array.shape[0], "cols": array.size // array.shape[0], "data": array.ravel().tolist()}
+
+
+def camera_info() -> dict:
+    """As camera_calibration writes it."""
+    return {
+        "image_width": WIDTH, "image_height": HEIGHT, "camera_name": "front", "distortion_model": "plumb_bob",
+        "camera_matrix": matrix(K), "distortion_coefficients": matrix([D]),
+        "rectification_matrix": matrix(np.eye(3)), "projection_matrix": matrix(np.column_stack([K, np.zeros(3)])),
+    }  # fmt: skip
+
+
+def kalibr(rostopics: tuple[str, str] = ("/cam0/image_raw", "/cam1/image_raw")) -> dict:
+    return {
+        f"cam{i}": {
+            "camera_model": "pinhole", "intrinsics": [150.0 + i, 151.0, 31.0, 22.0], "distortion_model": "radtan",
+            "distortion_coeffs": D[:4], "resolution": [WIDTH, HEIGHT], "rostopic": topic,
+            **({"T_cn_cnm1": RIGHT_FROM_LEFT.tolist()} if i else {}),
+        }
+        for i, topic in enumerate(rostopics)
+    }  # fmt: skip
+
+
+def write(path: Path, tree: Any) -> Path:
+    path.write_text(yaml.safe_dump(tree))
+    return path
+
+
+def test_camera_info_takes_the_place_of_the_logs_own(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "drive", ros_messages(Drive(), 2))
+    file = write(tmp_path / "front.yaml", camera_info())
+    camera = logs.open(path, TopicChoice(calibration_file=file)).camera()
+    np.testing.assert_array_equal(camera.matrix, K)
+    np.testing.assert_array_equal(camera.distortion, D)
+    assert camera.distortion_model == "plumb_bob"
+    np.testing.assert_allclose(camera.body_from_camera, Drive().body_from_camera, atol=1e-9)  # still the log's
+    with pytest.raises(LogError, match="--camera-info-topic or the file"):
+        logs.open(path, TopicChoice(calibration_file=file, camera_info="/cam/camera_info"))
+
+
+def test_a_folder_of_images_is_calibrated_by_a_file(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i in range(2):
+        cv2.imwrite(str(folder / f"{i}.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    placed = np.eye(4)
+    placed[:3, 3] = 0.1, 0.2, 0.3
+    sensor = {
+        "sensor_type": "camera", "T_BS": matrix(placed), "rate_hz": 20, "resolution": [WIDTH, HEIGHT],
+        "camera_model": "pinhole", "intrinsics": [150.0, 151.0, 31.0, 22.0],
+        "distortion_model": "radial-tangential", "distortion_coefficients": D[:4],
+    }  # fmt: skip
+    camera = logs.open(folder, TopicChoice(calibration_file=write(tmp_path / "sensor.yaml", sensor))).camera()
+    np.testing.assert_array_equal(camera.matrix, K)
+    np.testing.assert_array_equal(camera.body_from_camera, placed)
+    uncalibrated = camera_info() | {"camera_matrix": matrix(np.zeros((3, 3)))}
+    log = logs.open(folder, TopicChoice(calibration_file=write(tmp_path / "zero.yaml", uncalibrated)))
+    assert log.camera().matrix is None
+    assert "K[0] = 0" in " ".join(log.warnings)
+
+
+def test_kalibrs_camchain_by_topic_and_by_name(tmp_path: Path) -> None:
+    path = write(tmp_path / "camchain.yaml", kalibr())
+    cameras = read_calibrations(path)
+    assert camera_for(cameras, "/cam1/image_raw", path).calibration.matrix[0, 0] == 151.0
+    assert camera_for(cameras, "/cam0/image_raw/compressed", path).calibration.matrix[0, 0] == 150.0
+    assert camera_for(cameras, "/rig/cam1/image", path).name == "cam1"
+    with pytest.raises(LogError, match=r"cam0 \(/cam0/image_raw\), cam1"):
+        camera_for(cameras, "/front", path)
+    assert cameras[1].from_first is not None
+    np.testing.assert_allclose(cameras[1].from_first, RIGHT_FROM_LEFT, atol=1e-6)
+    assert (cameras[0].calibration.model, len(cameras[0].calibration.distortion)) == ("plumb_bob", 4)
+
+
+def test_camchain_makes_a_pair_without_any_calibration_in_the_log(tmp_path: Path) -> None:
+    names = ("/stereo/left/image_raw", "/stereo/right/image_raw")
+    tree = kalibr(names)
+    for part, lens in zip(tree.values(), PINHOLES, strict=True):
+        fx, fy, cx, cy = lens.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        part |= {"intrinsics": [fx, fy, cx, cy], "distortion_coeffs": lens.distortion[:4].tolist()}
+        part["resolution"] = list(SIZE)
+    path = drive(tmp_path, PINHOLES, RIGHT_FROM_LEFT)
+    log = logs.open(path, TopicChoice(calibration_file=write(tmp_path / "camchain.yaml", tree)))
+    check(log)
+    assert log.camera().baseline_m == pytest.approx(BASELINE_M, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "no mapping"),
+        ("- 1", "no mapping"),
+        ("a: [", "not YAML"),
+        ("a: 1", "neither camera_matrix nor intrinsics"),
+        ("camera_matrix: {data: [1, 2]}", "where 9 numbers"),
+        ("intrinsics: [1, 2, 3, .nan]", "where 4 numbers"),
+        ("camera_model: omni\nintrinsics: [1, 2, 3, 4]", "camera_model 'omni'"),
+        ("intrinsics: [1, 2, 3, 4]\ndistortion_model: fov", "distortion_model 'fov'"),
+        ("intrinsics: [1, 2, 3, 4]\nresolution: [1, -5]", "no size"),
+        ("intrinsics: [1, 2, 3, 4]\nT_BS: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "no rotation"),
+        ("a: &a [1]\nb: &b [*a, *a]\nintrinsics: [*b, *b]", "where 4 numbers"),
+    ],
+)
+def test_what_is_no_calibration_is_said_in_a_line(text: str, why: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(LogError) as error:
+        read_calibrations(path)
+    assert why in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+TREES = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(["camera_matrix", "intrinsics", "cam0", "data", "T_cn_cnm1", "resolution"]), inner
+        )
+    ),
+    max_leaves=12,
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@given(TREES)
+def test_any_yaml_is_cameras_or_a_known_error(tmp_path: Path, tree: Any) -> None:
+    path = write(tmp_path / "any.yaml", tree)
+    try:
+        assert all(np.isfinite(camera.calibration.matrix).all() for camera in read_calibrations(path))
+    except LogError as error:
+        assert "any.yaml" in str(error)

@@ -1,0 +1,170 @@
+"""Header stamps whose clock jumps, stands, is another or was never set, against the true times."""
+
+from __future__ import annotations
+
+from array import array
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vplog import logs
+from vplog.logs.clocks import on_one_clock
+from vplog.logs.containers import Notes
+from vplog.logs.stamps import Stamps, share_clock
+
+from .drives import START_NS, Drive, ros_messages, write_ros2
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SECOND = 10**9
+PERIOD_NS = 100_000_000
+JITTER_NS = 20_000_000
+"""Log times are up to this later than the true ones."""
+
+
+def times(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """True times and log times of a topic."""
+    true_ns = START_NS + PERIOD_NS * np.arange(count)
+    return true_ns, true_ns + np.random.default_rng(seed).integers(0, JITTER_NS, count)
+
+
+def stamps(header_ns: np.ndarray, log_ns: np.ndarray) -> Stamps:
+    return Stamps(array("q", header_ns.tolist()), array("q", log_ns.tolist()))
+
+
+steps = st.integers(2, 10**8).flatmap(lambda s: st.sampled_from([s * SECOND, -s * SECOND]))
+
+
+@given(st.integers(20, 80), st.lists(st.tuples(st.integers(1, 9), steps), max_size=3))
+def test_a_clock_that_is_set_is_followed(count: int, jumps: list[tuple[int, int]]) -> None:
+    """After the repair all stamps differ from the true times by one constant, up to the jitter of the log times."""
+    jumps = [(8 * at, step) for at, step in jumps if 8 * at <= count - 8]
+    true_ns, log_ns = times(count)
+    header_ns = true_ns.copy()
+    for at, step in jumps:
+        header_ns[at:] += step
+    found = on_one_clock(header_ns, log_ns)
+    assert found is not None
+    assert found.kept.all()
+    errors = found.stamp_ns - true_ns
+    assert errors.max() - errors.min() <= JITTER_NS
+    assert (found.jumps > 0) == (len(np.unique(header_ns - true_ns)) > 1)
+
+
+@given(st.integers(20, 80), st.data())
+def test_stray_stamps_are_told_and_nothing_else(count: int, data: st.DataObject) -> None:
+    true_ns, log_ns = times(count)
+    stray = sorted(data.draw(st.sets(st.integers(0, count // 6 - 1), max_size=4)))
+    rows = [6 * row for row in stray]
+    header_ns = true_ns.copy()
+    for row in rows:
+        header_ns[row] += data.draw(steps)
+    header_ns = np.maximum(header_ns, 1)
+    found = on_one_clock(header_ns, log_ns)
+    assert found is not None
+    assert np.flatnonzero(~found.kept).tolist() == rows
+    np.testing.assert_array_equal(found.stamp_ns[found.kept], true_ns[found.kept])
+
+
+@given(st.integers(-(10**18), 10**18), st.floats(0.2, 5.0))
+def test_any_clock_that_runs_is_left_as_it_is(offset_ns: int, rate: float) -> None:
+    """A simulation's, at any rate, and one far from the recorder's."""
+    true_ns, log_ns = times(50)
+    header_ns = ((true_ns - START_NS) * rate).astype(np.int64) + START_NS + offset_ns
+    found = on_one_clock(header_ns, log_ns)
+    assert found is not None
+    assert found.kept.all()
+    np.testing.assert_array_equal(found.stamp_ns, header_ns)
+
+
+def test_a_recorder_whose_clock_is_set_changes_no_stamp() -> None:
+    true_ns, log_ns = times(50)
+    log_ns[25:] += 3600 * SECOND
+    stamp_ns, rows = stamps(true_ns, log_ns).order("/t", notes := Notes())
+    np.testing.assert_array_equal(stamp_ns, true_ns)
+    assert len(rows) == 50
+    assert notes.lines == ["/t: the log times jump in 1 place; the header stamps do not, and are used."]
+
+
+def test_a_real_gap_is_no_jump_and_is_told() -> None:
+    true_ns, log_ns = times(50)
+    true_ns[25:] += 60 * SECOND
+    log_ns[25:] += 60 * SECOND
+    stamp_ns, _ = stamps(true_ns, log_ns).order("/t", notes := Notes())
+    np.testing.assert_array_equal(stamp_ns, true_ns)
+    assert notes.lines == ["/t: 1 gap, the longest 60.1 s, 2.4 s behind its first message."]
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        (lambda true: np.where(np.arange(len(true)) % 3 == 0, true, 0), "has no header stamps"),
+        (lambda true: np.full(len(true), true[0]), "has header stamps that do not advance"),
+        (lambda true: true + 50 * SECOND * (np.arange(len(true)) // 10) ** 2, "has header stamps that follow no clock"),
+    ],
+)
+def test_stamps_that_are_none_give_way_to_the_log_times(header: object, said: str) -> None:
+    true_ns, log_ns = times(300)
+    stamp_ns, _ = stamps(header(true_ns), log_ns).order("/t", notes := Notes())  # type: ignore[operator]
+    np.testing.assert_array_equal(stamp_ns, log_ns)
+    assert said in notes.lines[0]
+
+
+def test_what_is_dropped_is_counted_and_placed() -> None:
+    true_ns, log_ns = times(50)
+    header_ns = true_ns.copy()
+    header_ns[7], header_ns[20], header_ns[30] = 0, header_ns[19], 5 * SECOND
+    stamp_ns, rows = stamps(header_ns, log_ns).order("/t", notes := Notes())
+    np.testing.assert_array_equal(stamp_ns, np.delete(true_ns, [7, 20, 30]))
+    np.testing.assert_array_equal(rows, np.delete(np.arange(50), [7, 20, 30]))
+    found = {loss.reason: (loss.messages, loss.spans_ns) for loss in notes.account.losses}
+    assert found == {
+        "no_stamp": (1, ((log_ns[7], log_ns[7]),)),
+        "repeated_stamp": (1, ((log_ns[20], log_ns[20]),)),
+        "stray_stamp": (1, ((log_ns[30], log_ns[30]),)),
+    }
+
+
+def test_topics_end_on_the_clock_that_most_messages_are_on() -> None:
+    """The camera's clock is set back early on, the odometry's never: most of the images are on the wrong one."""
+    true_ns, log_ns = times(100)
+    camera = stamps(np.where(np.arange(100) < 20, true_ns, true_ns - 50 * SECOND), log_ns)
+    true2_ns, log2_ns = times(200, seed=1)
+    odometry = stamps(true2_ns, log2_ns)
+    share_clock([camera, odometry])
+    assert np.abs(camera.order("/camera", Notes())[0] - true_ns).max() <= JITTER_NS
+    np.testing.assert_array_equal(odometry.order("/odometry", Notes())[0], true2_ns)
+
+
+def test_a_topic_on_another_clock_is_moved_where_it_fits_nowhere_and_told_of_where_it_may_be_right() -> None:
+    true_ns, log_ns = times(100)
+    for offset, moved in ((-1_000_000 * SECOND, True), (5 * SECOND, False)):
+        camera, odometry = stamps(true_ns, log_ns), stamps(true_ns[::2] + offset, log_ns[::2])
+        share_clock([camera, odometry])
+        camera.order("/camera", quiet := Notes())
+        stamp_ns, _ = odometry.order("/odometry", notes := Notes())
+        assert (np.abs(stamp_ns - true_ns[::2]).max() <= JITTER_NS) == moved
+        assert quiet.lines == []
+        assert ("of another clock" if moved else "Were they recorded late") in notes.lines[0]
+
+
+def test_a_clock_that_is_set_in_a_whole_log(tmp_path: Path) -> None:
+    """Every topic's clock is set an hour ahead in the middle: images and odometry stay together."""
+    messages = []
+    for turn in range(8):
+        for m in ros_messages(Drive(), 2):
+            m.stamp_ns += turn * SECOND // 2
+            if m.topic != "/tf_static":
+                stamp_ns = m.stamp_ns + 3600 * SECOND * (turn >= 4)
+                m.message.header.stamp.sec, m.message.header.stamp.nanosec = divmod(stamp_ns, SECOND)
+            messages.append(m)
+    log = logs.open(write_ros2(tmp_path / "drive", messages))
+    odometry = log.odometry()
+    assert odometry is not None
+    np.testing.assert_array_equal(np.diff(log.stamps()), PERIOD_NS)
+    np.testing.assert_array_equal(odometry.stamp_ns, log.stamps())
+    assert "the clock of the header stamps was set once" in " ".join(log.warnings)

@@ -1,0 +1,79 @@
+"""A finished run in the formats of other tools."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import ResultError
+from vplog.report import gather_tracks
+from vplog.results import geo, poses, tables, tum
+from vplog.results.atomic import replacing
+from vplog.results.places_map import write_map
+from vplog.results.rrd import write_rrd
+from vplog.retell import finished
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog.report import Tracks
+    from vplog.results.shown import Earth
+
+FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+
+
+def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
+    """Write the run in `folder` as one of `FORMATS`; what was written. Raises ResultError."""
+    tracks = gather_tracks(folder, finished(folder))
+    written = [str(path)]
+    match kind:
+        case "tum":
+            tum.write_tum(path, tracks.after)
+        case "kitti":
+            written.append(str(poses.write_kitti(path, tracks.after)))
+        case "euroc":
+            poses.write_euroc(path, tracks.after)
+        case "g2o":
+            _copy(folder / "graph.g2o", path)
+        case "geojson":
+            closures = tables.read_closures(folder / "closures.parquet")
+            where = _earth(folder, kind, tracks)
+            tree = geo.feature_collection(where, tracks.world_from_body, tracks.keyframes.stamp_ns, closures)
+            geo.write_geojson(path, tree)
+        case "geoparquet":
+            header = tables.read_metadata(folder / "trajectory.parquet")
+            geo.write_geoparquet(path, tracks.after, _earth(folder, kind, tracks), header)
+        case "rrd":
+            closures = tables.read_closures(folder / "closures.parquet")
+            write_rrd(
+                path, tracks.keyframes, tracks.world_from_body, closures, tracks.before, tracks.after, tracks.earth
+            )
+        case _:
+            raise ResultError(f"No format {kind!r}. Formats: {', '.join(FORMATS)}.")
+    return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}
+
+
+def export_map(folders: Sequence[Path], path: Path) -> dict[str, Any]:
+    """Write the places of finished runs as one map. Raises ResultError."""
+    for folder in folders:
+        finished(folder)
+    return write_map(path, folders)
+
+
+def _copy(source: Path, path: Path) -> None:
+    try:
+        data = source.read_bytes()
+    except OSError as error:
+        raise ResultError(f"Cannot read {source}: {error.strerror}. Run `vplog run` again to write it anew.") from None
+    with replacing(path) as stream:
+        stream.write(data)
+
+
+def _earth(folder: Path, kind: str, tracks: Tracks) -> Earth:
+    if tracks.earth is None:
+        others = ", ".join(one for one in FORMATS if not one.startswith("geo"))
+        raise ResultError(
+            f"The run in {folder} has no three satellite fixes within the drive, so {kind} has no place on earth for "
+            f"it. Other formats: {others}."
+        )
+    return tracks.earth

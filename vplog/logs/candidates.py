@@ -1,0 +1,58 @@
+"""The topics of a log that could play a part, and what the first message of each says of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vplog.logs.images import image_size, is_depth
+from vplog.logs.messages import BadMessageError, CalibrationMessage, ImageMessage, decode, kind_of
+from vplog.logs.select import Candidate
+from vplog.logs.transforms import clean
+from vplog.logs.video import codec_of
+
+if TYPE_CHECKING:
+    from vplog.logs.containers import Channel, Container, Contents
+
+
+def read_candidates(container: Container, contents: Contents) -> list[Candidate]:
+    """Every topic that could play a part; the first message of each tells depth from grey, its frame and its codec."""
+    kinds = {channel: kind_of(channel) for channel in contents.counts}
+    asked = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
+    firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
+    left = set(asked)
+    for message in container.messages(asked) if asked else ():
+        if message.channel not in left:
+            continue
+        try:
+            record = decode(message.channel, message.data)
+        except BadMessageError:
+            continue  # the next one may be sound
+        if isinstance(record, ImageMessage | CalibrationMessage):
+            firsts[message.channel] = record
+            left.discard(message.channel)
+        if not left:
+            break
+    return [
+        _candidate(channel, contents.counts[channel], kind, firsts.get(channel))
+        for channel, kind in kinds.items()
+        if kind
+    ]
+
+
+def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | CalibrationMessage | None) -> Candidate:
+    role, codec, encoding, size = kind, "", "", None
+    if kind == "tf" and channel.topic.rstrip("/").endswith("static"):
+        role = "tf_static"
+    if isinstance(first, ImageMessage):
+        codec, encoding = codec_of(first.encoding) if first.compressed else "", first.encoding
+        size = image_size(first.data) if first.compressed else (first.width, first.height)
+        if not codec and (is_depth(first) or _named_depth(channel.topic, first)):
+            role = "depth"
+    calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
+    frame = clean(first.frame) if first else ""
+    return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0))
+
+
+def _named_depth(topic: str, first: ImageMessage) -> bool:
+    """Where the encoding leaves it open: old compressedDepth says only `png`, RealSense records depth as mono16."""
+    return topic.endswith("/compressedDepth") or (first.encoding == "mono16" and "depth" in topic.lower())

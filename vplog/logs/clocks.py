@@ -1,0 +1,91 @@
+"""Header stamps against log times: which of the two jumped, and what the stamps are without the jump.
+
+A header stamp says when something was measured, and aligns topics; but clocks are set while a drive runs, simulations
+start again at zero, and single stamps are damaged. The log time is late by the transport but steady, so it is the
+check: between two messages of a topic both should advance alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from vplog.data import Ints
+
+LEAST_JUMP_NS = 1_000_000_000
+"""ns; stamps and log times part by less than a second when a computer is busy, and by hours when a clock is set."""
+_PERIODS = 10
+"""A jump is also longer than so many periods of the topic: slow topics may be late by one."""
+_LEAST_RUN = 5
+"""Messages of one clock in a row; fewer are damaged stamps, not a clock that was set."""
+_MOST_CLOCKS = 20
+"""A clock is set a few times in a drive; what jumps to more values than these is none."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a topic's header stamps, by the log times, and the time its stamps cover."""
+
+    skew_ns: int
+    """Log time less header stamp, the median."""
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Repaired:
+    """Stamps of one topic on one clock."""
+
+    stamp_ns: Ints
+    """(M,) in file order."""
+    kept: np.ndarray
+    """(M,) bool, false where a stamp is far from those beside it, so that its time is not known."""
+    skew_ns: int
+    """Of the clock that all are on."""
+    jumps: int
+    """Times that the header's clock was set; the stamps behind each are shifted back by what the log times say."""
+    log_jumps: int
+    """Times that the recorder's clock was set; the stamps are right without it."""
+    counts: dict[int, int]
+    """Messages by the skew of the clock that they came on."""
+
+
+def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
+    """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1.
+
+    Where there are several clocks, `reference_ns` is the skew of the one to end on, that of most messages of all
+    topics; None takes that of most of these.
+    """
+    step, log_step = np.diff(header_ns), np.diff(log_ns)
+    period = float(np.median(np.minimum(np.abs(step), np.abs(log_step)))) if len(step) else 0.0
+    limit = max(LEAST_JUMP_NS, _PERIODS * period)
+    apart = np.abs(step - log_step) > limit
+    steady, log_steady = np.abs(step) <= limit, np.abs(log_step) <= limit
+    bounds = [0, *(np.flatnonzero(apart & log_steady & ~steady) + 1).tolist(), len(header_ns)]
+    least = min(_LEAST_RUN, max(b - a for a, b in pairwise(bounds)))
+    runs = [slice(a, b) for a, b in pairwise(bounds) if b - a >= least]
+    skews = [int(np.median(log_ns[run] - header_ns[run])) for run in runs]
+    counts: dict[int, int] = {}
+    clocks = []
+    for run, skew in zip(runs, skews, strict=True):  # a stray stamp parts one clock's run in two
+        clocks.append(next((known for known in counts if abs(known - skew) <= limit), skew))
+        counts[clocks[-1]] = counts.get(clocks[-1], 0) + run.stop - run.start
+        if len(counts) > _MOST_CLOCKS:
+            return None
+    chosen = max(counts, key=lambda skew: (counts[skew], -skew))
+    if reference_ns is not None and len(counts) > 1:
+        near = min(counts, key=lambda skew: (abs(skew - reference_ns), skew))
+        chosen = near if abs(near - reference_ns) <= limit else reference_ns
+    stamp_ns, kept = header_ns.copy(), np.zeros(len(header_ns), bool)
+    for run, skew, clock in zip(runs, skews, clocks, strict=True):
+        shift = 0 if clock == chosen else skew - chosen
+        shifted = [int(header_ns[run].min()) + shift, int(header_ns[run].max()) + shift]
+        kept[run] = min(shifted) >= 0 and max(shifted) < 2**63
+        if shift and kept[run.start]:
+            stamp_ns[run] += shift
+    jumps = sum(a != b for a, b in pairwise(clocks))
+    return Repaired(stamp_ns, kept, chosen, jumps, int((apart & steady & ~log_steady).sum()), counts)

@@ -1,0 +1,229 @@
+"""What of a log could not be used: counted by topic, placed in time, and said in one line each.
+
+Times are log times, as the recorder wrote them: they are there even where a message's own stamp is the damage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from vplog.data import Ints
+
+Span = tuple[int, int]
+"""First and last ns of something, both included."""
+
+REASONS = {
+    "cut": "behind the place where the file is cut off or unreadable to its end",
+    "missing_file": "in storage files that are missing or unreadable",
+    "damaged_bytes": "in bytes that hold no record",
+    "damaged_chunk": "in damaged chunks or pages",
+    "unknown_channel": "of channels that nothing defines",
+    "packed": "that do not unpack",
+    "undecodable": "that cannot be decoded",
+    "empty_image": "without image data",
+    "undecodable_image": "whose image cannot be decoded",
+    "no_stamp": "without a header stamp",
+    "stray_stamp": "with a header stamp far from those beside it",
+    "repeated_stamp": "with the stamp of an earlier one",
+}
+"""Every reason a message is lost for, as it follows `3 messages`."""
+_MOST_SPANS = 64
+"""Spans that one loss lists; the last of more reaches over the rest."""
+_NAMED = 4
+"""Topics that a sentence names."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Messages of one topic that were lost for one reason."""
+
+    reason: str
+    """One of REASONS."""
+    topic: str
+    """Empty where it is not known whose messages they were."""
+    messages: int | None
+    """None where it is not known how many: nothing whole in the log counted them."""
+    of: int | None
+    """Messages of the topic that were recorded, by the index, the statistics or the metadata; None where none says."""
+    spans_ns: tuple[Span, ...]
+    """Log times of the first and last message of each run of lost ones, in order; empty where not known."""
+    detail: str = ""
+    """What was found, in a sentence, the first time."""
+
+
+@dataclass
+class _Lost:
+    messages: int | None
+    spans: list[Span]
+    detail: str
+
+
+_OUTSIDE = ("cut", "missing_file", "damaged_bytes", "unknown_channel")
+"""Reasons for which messages never came to light, so that no count of what was found has them."""
+_HOW_MANY_OPEN = (*_OUTSIDE, "damaged_chunk")
+"""Reasons that may leave open how many messages they took."""
+
+
+@dataclass
+class Account:
+    """The losses of one log while it is read. What is found twice, in two passes over a file, is counted once."""
+
+    start_ns: int | None = None
+    """Log time that sentences count from."""
+    _recorded: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Messages by topic of each file, as far as anything says."""
+    _found: dict[tuple[str, str], dict[tuple[str, int], _Lost]] = field(default_factory=dict)
+    _settled: set[tuple[str, tuple[str, int]]] = field(default_factory=set)
+
+    def add(
+        self, reason: str, counts: Mapping[str, int] | None, key: tuple[str, int], spans: list[Span], detail: str = ""
+    ) -> None:
+        """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all.
+
+        `key`, a file or topic and a place in it, makes the same loss found again replace itself.
+        """
+        if counts is None and (reason, key) in self._settled:
+            return
+        for topic, count in ({"": None} if counts is None else counts).items():
+            self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)
+
+    def know(self, file: str, recorded: Mapping[str, int], start_ns: int) -> None:
+        """How many messages of each topic were recorded in a file, as it says itself, and when the first."""
+        self._recorded[file] = dict(recorded)
+        if start_ns:
+            self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
+
+    def settle(
+        self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
+    ) -> dict[str, int]:
+        """Give the losses in these files that nothing counted their numbers: what was recorded, less what was found
+        and what is counted already. `end_ns` is when the recording ended. Gives what no loss explains.
+        """
+        if not recorded:
+            return {}
+        short = {topic: count - found.get(topic, 0) - self._outside(topic, files) for topic, count in recorded.items()}
+        short = {topic: count for topic, count in short.items() if count > 0}
+        left_open = [
+            (reason, key, lost)
+            for reason in _HOW_MANY_OPEN
+            for key, lost in self._found.get((reason, ""), {}).items()
+            if key[0] in files
+        ]
+        if not left_open:
+            return short
+        for reason, key, _ in left_open:
+            del self._found[reason, ""][key]
+            self._settled.add((reason, key))
+        reason, key, _ = left_open[0]
+        spans = merged([span for _, _, lost in left_open for span in lost.spans])
+        if reason == "cut" and spans and end_ns is not None:
+            spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
+        detail = " ".join(dict.fromkeys(lost.detail for _, _, lost in left_open))
+        self.add(reason, short or {"": 0}, key, spans, detail)
+        return {}
+
+    def _outside(self, topic: str, files: Collection[str]) -> int:
+        places = [lost for reason in _OUTSIDE for lost in self._found.get((reason, topic), {}).items()]
+        return sum(lost.messages or 0 for key, lost in places if key[0] in files)
+
+    @property
+    def losses(self) -> list[Loss]:
+        """By reason in the order of REASONS, then topic; the same for any order of reading."""
+        totals: dict[str, int] = {}
+        for recorded in self._recorded.values():
+            for topic, count in recorded.items():
+                totals[topic] = totals.get(topic, 0) + count
+        found = []
+        order = list(REASONS)
+        known = sorted(self._found.copy().items(), key=lambda item: (order.index(item[0][0]), item[0]))
+        for (reason, topic), places in known:  # copies: workers that decode images may add to them meanwhile
+            lost = [one for _, one in sorted(places.copy().items(), key=lambda item: item[0])]
+            if not lost:
+                continue
+            counts = [one.messages for one in lost if one.messages is not None]
+            messages = sum(counts) if len(counts) == len(lost) else None
+            spans = merged([span for one in lost for span in one.spans])
+            found.append(Loss(reason, topic, messages, totals.get(topic), tuple(spans), lost[0].detail))
+        return found
+
+    @property
+    def sentences(self) -> list[str]:
+        """One for each reason."""
+        losses = self.losses
+        groups = {reason: [loss for loss in losses if loss.reason == reason] for reason in REASONS}
+        return [self._sentence(reason, group) for reason, group in groups.items() if group]
+
+    def _sentence(self, reason: str, group: list[Loss]) -> str:
+        known = [loss.messages for loss in group if loss.messages is not None]
+        total = sum(known)
+        what = "an unknown number of messages"
+        if known:
+            what = "no message" if not total else f"{total} message{'s' * (total > 1)}"
+        if known and len(known) < len(group):
+            what += " and more that nothing counts,"
+        named = [f"{loss.topic}{_count(loss)}" for loss in group if loss.topic]
+        which = ", ".join(named[:_NAMED]) + _more(len(named) - _NAMED)
+        spans = merged([span for loss in group for span in loss.spans_ns])
+        when = f", {self._when(spans)}" if spans else ""
+        detail = next((f" {loss.detail}" for loss in group if loss.detail), "")
+        return f"Lost: {what} {REASONS[reason]}{when}{f': {which}' if which else ''}.{detail}"
+
+    def _when(self, spans: list[Span]) -> str:
+        first, last = (f"{(ns - (self.start_ns or 0)) / 1e9:.3f}" for ns in (spans[0][0], spans[-1][1]))
+        where = f" in {len(spans)} places" if len(spans) > 1 else ""
+        return f"at t={first} s" if first == last else f"from t={first} to {last} s{where}"
+
+
+def _more(topics: int) -> str:
+    return "" if topics <= 0 else " and another topic" if topics == 1 else f" and {topics} more topics"
+
+
+def _count(loss: Loss) -> str:
+    if loss.messages is None:
+        return ""
+    return f" {loss.messages}" + (f" of {loss.of}" if loss.of is not None else "")
+
+
+def merged(spans: list[Span]) -> list[Span]:
+    """The spans in order, overlapping ones joined, at most _MOST_SPANS."""
+    result: list[Span] = []
+    for start, stop in sorted(spans):
+        if result and (start <= result[-1][1] or len(result) == _MOST_SPANS):
+            result[-1] = result[-1][0], max(stop, result[-1][1])
+        else:
+            result.append((start, stop))
+    return result
+
+
+def runs_of(lost: np.ndarray, log_ns: Ints) -> list[Span]:
+    """Log times of the runs of lost messages; `lost` (M,) bool and log_ns (M,) in file order."""
+    edges = np.diff(np.concatenate([[0], lost.astype(np.int8), [0]]))
+    starts, stops = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    times = [log_ns[a:b] for a, b in zip(starts, stops, strict=True)]
+    return merged([(int(run.min()), int(run.max())) for run in times])
+
+
+@dataclass
+class Runs:
+    """Runs of lost messages among the sound ones of one topic, as they come by."""
+
+    messages: int = 0
+    spans: list[Span] = field(default_factory=list)
+    _open: bool = False
+
+    def lost(self, log_ns: int) -> None:
+        self.messages += 1
+        if self.spans and (self._open or len(self.spans) == _MOST_SPANS):
+            self.spans[-1] = min(self.spans[-1][0], log_ns), max(self.spans[-1][1], log_ns)
+        else:
+            self.spans.append((log_ns, log_ns))
+        self._open = True
+
+    def sound(self) -> None:
+        self._open = False

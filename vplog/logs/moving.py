@@ -1,0 +1,158 @@
+"""Frames that move: the transforms of tf topics become an odometry, by the chain from its root to the body.
+
+Those of a tf topic that never change are static transforms: logs older than tf_static have no others.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.data import Odometry
+from vplog.logs.stamps import Stamps
+from vplog.logs.transforms import FARTHEST_M, SMALLEST, clean
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Ints
+    from vplog.logs.containers import Notes
+    from vplog.logs.messages import TransformMessage
+    from vplog.logs.transforms import FrameTree
+
+_BODIES = ("base_link", "base_footprint")
+"""Names of the body, ROS REP 105 and 120, in order of preference."""
+_ROOTS = ("odom", "map", "world")
+"""Names of frames that stand still (ROS REP 105): odom first, whose poses do not jump."""
+_DEEPEST = 100
+"""Links of the longest chain that is followed: real trees have ten, and damage may close a circle."""
+
+Edge = tuple[str, str]
+"""Parent and child."""
+
+
+@dataclass
+class _Link:
+    """One edge of the frame tree over time."""
+
+    first: TransformMessage
+    times_ns: list[tuple[int, int]] = field(default_factory=list)
+    """Stamp and log time of the first and the last sample before it moved."""
+    moves: bool = False
+    stamps: Stamps = field(default_factory=Stamps)
+    values: array[float] = field(default_factory=lambda: array("d"))
+    """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
+
+    def keep(self, transform: TransformMessage, time_ns: tuple[int, int]) -> None:
+        if not self.moves:
+            self.times_ns[1:] = [time_ns]  # the first stays
+            return
+        for before_ns in self.times_ns:
+            self._append(self.first, before_ns)
+        self.times_ns.clear()
+        self._append(transform, time_ns)
+
+    def _append(self, transform: TransformMessage, time_ns: tuple[int, int]) -> None:
+        self.stamps.add(*time_ns)
+        self.values.extend((*transform.position, *transform.quaternion))
+
+
+class MovingFrames:
+    """Collects the transforms of tf topics."""
+
+    def __init__(self, keep: bool) -> None:
+        self._keep = keep
+        """Keep every sample, for odometry; else only what tells whether a frame moves."""
+        self._links: dict[Edge, _Link] = {}
+
+    def add(self, transforms: list[TransformMessage], log_ns: int) -> None:
+        for transform in transforms:
+            edge = clean(transform.parent), clean(transform.child)
+            link = self._links.get(edge)
+            if link is None:
+                link = self._links[edge] = _Link(transform)
+            link.moves = link.moves or _differ(link.first, transform)
+            if self._keep:
+                link.keep(transform, (transform.stamp_ns, log_ns))
+
+    def still(self) -> list[TransformMessage]:
+        """Transforms that were the same whenever they were sent."""
+        return [link.first for _, link in sorted(self._links.items()) if not link.moves]
+
+    def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:
+        """The poses of the body in the frame that stands still, and the frames from there down to the body.
+
+        None and no frames where no chain moves.
+        """
+        chain = self._chain(tree)
+        moving = [edge for edge in chain if edge in self._links and self._links[edge].moves]
+        if not moving:
+            return None, []
+        frames = [chain[0][0], *(child for _, child in chain)]
+        names = " -> ".join(frames)
+        tracks = {edge: self._track(edge, topic, notes) for edge in moving}
+        pace = max(moving, key=lambda edge: len(tracks[edge][0]))
+        first_ns = max((stamps[0] for stamps, _ in tracks.values() if len(stamps)), default=0)
+        last_ns = min((stamps[-1] for stamps, _ in tracks.values() if len(stamps)), default=0)
+        at_ns = tracks[pace][0]
+        at_ns = at_ns[(at_ns >= first_ns) & (at_ns <= last_ns)]
+        if not len(at_ns) or not all(len(stamps) for stamps, _ in tracks.values()):
+            notes.add(f"{topic}: the transforms {names} have no time in common; there is no odometry.")
+            return None, []
+        poses = np.tile(np.eye(4), (len(at_ns), 1, 1))
+        for edge in chain:
+            if edge in tracks:
+                stamps, samples = tracks[edge]
+                poses = poses @ (samples if len(stamps) == 1 else geometry.interpolate_at(stamps, samples, at_ns))
+            else:
+                still = tree.between(*edge)
+                poses = poses @ (np.eye(4) if still is None else still)
+        notes.add(f"Odometry is {names} of {topic}, which carries no covariance; the noise of its motion is a guess.")
+        return Odometry(at_ns, poses, None), frames
+
+    def _chain(self, tree: FrameTree) -> list[Edge]:
+        """Edges from the frame that stands still down to the body; empty where nothing moves."""
+        moving = {edge for edge, link in self._links.items() if link.moves}
+        parents = {child: parent for parent, child in (*tree.edges, *sorted(self._links))}
+        up = {body: _upwards(body, parents) for body in (*_BODIES, *sorted(child for _, child in moving))}
+        named = [body for body in _BODIES if moving.intersection(up[body])]
+        body = named[0] if named else self._unnamed(moving, up)
+        chain = up.get(body, [])[::-1]
+        for root in _ROOTS:
+            below = [i for i, (parent, _) in enumerate(chain) if parent == root]
+            if below and moving.intersection(chain[below[0] :]):
+                return chain[below[0] :]
+        return chain
+
+    def _unnamed(self, moving: set[Edge], up: dict[str, list[Edge]]) -> str:
+        """The body of a log that names none: what moves in a frame that stands still, with the fewest links between
+        (an arm moves on the body), then the most samples, then the name."""
+        children = [child for _, child in sorted(moving) if child not in _ROOTS]
+        rooted = [child for child in children if any(parent in _ROOTS for parent, _ in up[child])] or children
+        samples = {child: len(self._links[parent, child].values) for parent, child in moving}
+        return min(rooted, key=lambda c: (len(moving.intersection(up[c])), -samples[c], c), default="")
+
+    def _track(self, edge: Edge, topic: str, notes: Notes) -> tuple[Ints, Floats]:
+        """Increasing stamps of one link and its poses (T, 4, 4), those out of range left out."""
+        link = self._links[edge]
+        values = np.array(link.values).reshape(-1, 7)
+        stamp_ns, rows = link.stamps.order(f"{topic} {edge[0]} -> {edge[1]}", notes)
+        largest = np.abs(values[rows, 3:]).max(axis=1)
+        usable = (np.abs(values[rows, :3]) < FARTHEST_M).all(axis=1) & (largest > SMALLEST) & (largest < 1 / SMALLEST)
+        values = values[rows[usable]]
+        return stamp_ns[usable], geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
+
+
+def _upwards(frame: str, parents: dict[str, str]) -> list[Edge]:
+    """Edges from a frame to the top of its tree."""
+    result: list[Edge] = []
+    while frame in parents and len(result) < _DEEPEST:
+        result.append((parents[frame], frame))
+        frame = parents[frame]
+    return result
+
+
+def _differ(a: TransformMessage, b: TransformMessage) -> bool:
+    return not (np.array_equal(a.position, b.position) and np.array_equal(a.quaternion, b.quaternion))

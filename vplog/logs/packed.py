@@ -1,0 +1,51 @@
+"""Files that are zstd-compressed as a whole (rosbag2's compression mode FILE), unpacked beside the drive's run."""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import tempfile
+from pathlib import Path
+
+import zstandard
+
+from vplog.errors import LogError
+from vplog.logs.compression import FREE_BYTES, MAX_RATIO
+
+_BLOCK = 2**20
+"""Bytes that are written at once."""
+_SPARE = 2**30
+"""Bytes of disk that are left free for others."""
+
+
+def unpacked(path: Path) -> Path:
+    """A temporary file with what `path` holds, removed when the process ends. A cut one is unpacked as far as it goes.
+
+    Raises LogError where it is no zstd data, would fill the disk, or claims more than its bytes justify.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="vplog-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    target = folder / path.name.removesuffix(".zstd").removesuffix(".zst")
+    most = max(FREE_BYTES, MAX_RATIO * path.stat().st_size)
+    room = shutil.disk_usage(folder).free - _SPARE
+    written = 0
+    with path.open("rb") as file, target.open("wb") as out:
+        stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
+        while True:
+            try:
+                block = stream.read(_BLOCK)
+            except zstandard.ZstdError as error:
+                if not written:
+                    raise LogError(f"{path} cannot be unpacked: {error}.") from None
+                break  # what came before is a log that is cut here
+            if not block:
+                break
+            written += out.write(block)
+            if written > most:
+                raise LogError(f"{path} unpacks to more than {MAX_RATIO} times its size, which no log does.")
+            if written > room:
+                raise LogError(
+                    f"{path} unpacks to more than the {room / 1e9:.1f} GB that are free in {folder.parent}. "
+                    "Unpack it elsewhere with `zstd -d`, or set TMPDIR to a larger disk."
+                )
+    return target

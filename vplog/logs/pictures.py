@@ -1,0 +1,106 @@
+"""The images of a log by their row in time: camera, right and depth images, each with its message or its video."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.errors import LogError
+from vplog.logs.containers import plural
+from vplog.logs.frames import Decoded, Encoded
+from vplog.logs.images import grey
+from vplog.logs.messages import BadMessageError, ImageMessage, decode
+from vplog.logs.video import VideoStream
+
+if TYPE_CHECKING:
+    from vplog.data import Float32s
+    from vplog.logs.containers import Channel, Container, Notes, Place
+    from vplog.logs.content import Content
+
+_TRIED = 10
+"""Images tried for the size of all; a drive whose first second is damaged is not usable."""
+
+
+class Pictures:
+    """Reads images where `content` says they lie."""
+
+    def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
+        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
+        self._container, self._image = container, image
+        self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
+        self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
+        """What was read, without the images before a video's first key frame."""
+
+    def image(self, row: int) -> Encoded | Decoded:
+        if self._image is None:
+            raise LogError("No image topic is chosen.")
+        if self._video is None:
+            return Encoded(self._image, self._container.read(self.content.places[row]))
+        try:
+            return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])), "")
+        except BadMessageError as error:
+            return Decoded(self._image, None, str(error))
+
+    def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
+        """The depth or right image of a row; None where there is none."""
+        place = places[row]
+        return None if channel is None or place is None else Encoded(channel, self._container.read(place))
+
+    def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
+        """Frame, and width and height of the first image that decodes.
+
+        Raises LogError where none of the first few does, and where it is a video that needs PyAV.
+        """
+        video, reason = self._video if channel == self._image else None, ""
+        for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
+            try:
+                message = decode(channel, self._container.read(place))
+                if isinstance(message, ImageMessage):
+                    rows = self.content.stream_rows
+                    height, width = (grey(message) if video is None else video.frame(int(rows[i]))).shape
+                    return message.frame, (width, height)
+            except BadMessageError as error:
+                reason = str(error)
+        raise LogError(f"{channel.topic} in {log} has no image that can be decoded: {reason}.")
+
+    def first_depth(self, channel: Channel) -> Float32s | None:
+        """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
+        failure = None
+        rows = [row for row, place in enumerate(self.content.depth_places) if place is not None]
+        for row in rows[:_TRIED]:
+            found = self.beside(channel, self.content.depth_places, row)
+            try:
+                return None if found is None else found.depth_m(int(self.content.stamp_ns[row]))
+            except LogError as error:
+                failure = failure or error
+        if failure is not None:
+            raise failure
+        return None
+
+    def _stream(self, image: Channel, codec: str, places: list[Place]) -> VideoStream:
+        def payload(row: int) -> bytes:
+            try:
+                message = decode(image, self._container.read(places[row]))
+            except BadMessageError:
+                return b""
+            return message.data if isinstance(message, ImageMessage) else b""
+
+        return VideoStream(codec, image.topic, payload, len(places))
+
+    def _from_first_key(self, video: VideoStream, content: Content, notes: Notes) -> Content:
+        first = video.first_key()
+        kept = content.stream_rows >= (len(content.stream) if first is None else first)
+        if self._image is not None and (lost := int((~kept).sum())):
+            why = "without a key frame before them" if first is None else "before the first key frame"
+            notes.add(f"{self._image.topic}: {plural(lost, 'image')} {why} cannot be decoded; left out.")
+        rows = np.flatnonzero(kept).tolist()
+        return replace(
+            content,
+            stamp_ns=content.stamp_ns[kept],
+            places=[content.places[row] for row in rows],
+            stream_rows=content.stream_rows[kept],
+            depth_places=[content.depth_places[row] for row in rows],
+            right_places=[content.right_places[row] for row in rows],
+        )

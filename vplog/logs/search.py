@@ -1,0 +1,42 @@
+"""Records found again behind damage: a bounded search for the next place in a file that can be one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import re
+    from collections.abc import Callable
+    from typing import BinaryIO
+
+_BLOCK = 2**20
+"""Bytes that are searched at once."""
+_MOST_TRIED = 500_000
+"""Places that are looked at in one file, about a second's work; a stranger's file may be made of false ones."""
+
+
+class Search:
+    """Looks for a pattern in one file; what it costs is bounded over the life of the object."""
+
+    def __init__(self, file: BinaryIO, length: int) -> None:
+        self._file, self._length, self._left = file, length, _MOST_TRIED
+
+    def first(self, pattern: re.Pattern[bytes], start: int, accept: Callable[[int], bool]) -> int | None:
+        """The first offset from `start` on where the pattern matches and `accept(offset)` holds, else None.
+
+        The pattern matches at most 64 bytes, so that none is missed between two blocks.
+        """
+        position = start
+        while position < self._length and self._left > 0:
+            self._file.seek(position)
+            block = self._file.read(_BLOCK + 64)
+            for match in pattern.finditer(block):
+                if match.start() >= _BLOCK:
+                    break
+                self._left -= 1
+                if self._left <= 0:
+                    return None
+                if accept(position + match.start()):
+                    return position + match.start()
+            position += _BLOCK
+        return None

@@ -1,0 +1,90 @@
+"""The trajectory on the earth: GeoJSON (RFC 7946) and GeoParquet 1.1, both WGS84, longitude before latitude."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from vplog import geometry
+from vplog.data import Verdict
+from vplog.geodesy import geodetic
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Closures, Floats, Ints, Trajectory
+    from vplog.results.shown import Earth
+
+_DEGREE_DIGITS, _METRE_DIGITS = 8, 3
+"""Decimals of GeoJSON: 1e-8 degrees are a millimetre."""
+_POINT_Z = struct.pack("<BI", 1, 1001)
+"""Head of a point in ISO WKB: little endian, POINT Z (OGC 06-103r4, table 4)."""
+
+
+def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
+    """(T, 3) longitude and latitude in degrees and altitude in m of poses (T, 4, 4)."""
+    enu = geometry.transform(earth.enu_from_world, world_from_body[:, :3, 3])
+    return geodetic(enu, earth.origin)[:, [1, 0, 2]]
+
+
+def feature_collection(earth: Earth, world_from_body: Floats, stamp_ns: Ints, closures: Closures) -> dict[str, Any]:
+    """GeoJSON of keyframes (N, 4, 4): the path as one line, and of each accepted closure the line between its ends."""
+    where = [_rounded(row) for row in on_earth(earth, world_from_body).tolist()]
+    features = []
+    if len(where) > 1:
+        about = {"name": "optimised", "start_ns": str(stamp_ns[0]), "end_ns": str(stamp_ns[-1])}
+        features.append(_line(where, about))
+    accepted = [row for row, verdict in enumerate(closures.verdict) if verdict == Verdict.ACCEPTED]
+    for row in accepted:
+        query, match = int(closures.query[row]), int(closures.match[row])
+        about = {"name": "closure", "closure": row, "query": query, "match": match}
+        features.append(_line([where[match], where[query]], about))
+    return {"type": "FeatureCollection", "features": features}
+
+
+def write_geojson(path: Path, tree: dict[str, Any]) -> None:
+    with replacing(path) as stream:
+        stream.write((json.dumps(tree, separators=(",", ":"), allow_nan=False) + "\n").encode())
+
+
+def write_geoparquet(path: Path, trajectory: Trajectory, earth: Earth, header: dict[str, str]) -> None:
+    """One point with altitude for every sample, as GeoParquet 1.1 (geoparquet.org/releases/v1.1.0).
+
+    `header` is what the run's own tables say of it.
+    """
+    where = on_earth(earth, trajectory.world_from_body)
+    points = pa.array([_POINT_Z + row.tobytes() for row in where.astype("<f8")], pa.binary())
+    low, high = (where.min(0), where.max(0)) if len(where) else (np.zeros(3), np.zeros(3))
+    geo = {
+        "version": "1.1.0",
+        "primary_column": "geometry",
+        "columns": {
+            "geometry": {
+                "encoding": "WKB",
+                "geometry_types": ["Point Z"],
+                "bbox": [*low.tolist(), *high.tolist()],
+            }
+        },
+    }
+    schema = pa.schema(
+        [pa.field("stamp_ns", pa.int64(), False), pa.field("geometry", pa.binary(), False)],
+        metadata={**header, "vplog.table": "geo", "geo": json.dumps(geo)},
+    )
+    table = pa.Table.from_arrays([pa.array(trajectory.stamp_ns, pa.int64()), points], schema=schema)
+    with replacing(path) as stream:
+        pq.write_table(table, stream, compression="zstd")
+
+
+def _line(where: list[list[float]], properties: dict[str, Any]) -> dict[str, Any]:
+    geometry_ = {"type": "LineString", "coordinates": where}
+    return {"type": "Feature", "geometry": geometry_, "properties": properties}
+
+
+def _rounded(row: list[float]) -> list[float]:
+    return [round(row[0], _DEGREE_DIGITS), round(row[1], _DEGREE_DIGITS), round(row[2], _METRE_DIGITS)]

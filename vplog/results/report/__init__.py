@@ -1,0 +1,1 @@
+"""report.html: one file that any browser opens, without a network."""

@@ -1,0 +1,73 @@
+"""A recording for rerun: both paths, the closures, the moving body, and the places on earth where they are known."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import geometry
+from vplog.data import Verdict
+from vplog.errors import ResultError
+from vplog.results.geo import on_earth
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Closures, Floats, Keyframes, Trajectory
+    from vplog.results.shown import Earth
+
+_GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
+_APPLICATION = "vplog"
+
+
+def write_rrd(
+    path: Path, keyframes: Keyframes, world_from_body: Floats, closures: Closures, before: Trajectory,
+    after: Trajectory, earth: Earth | None,
+) -> None:  # fmt: skip
+    """Write with rerun's own SDK. Raises ResultError where it is not installed, or cannot write."""
+    try:
+        import rerun as rr
+    except ImportError:
+        raise ResultError(
+            "The .rrd format is written by rerun's SDK, which is not installed: pip install rerun-sdk"
+        ) from None
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    recording = rr.RecordingStream(_APPLICATION, recording_id=f"vplog-{keyframes.drive}")
+    try:
+        recording.save(part)
+        _log(recording, rr, keyframes, world_from_body, closures, before, after, earth)
+        recording.disconnect()
+        part.replace(path)
+    except OSError as error:
+        raise ResultError(f"Cannot write {path}: {error.strerror or error}.") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _log(
+    recording: Any, rr: Any, keyframes: Keyframes, world_from_body: Floats, closures: Closures, before: Trajectory,
+    after: Trajectory, earth: Earth | None,
+) -> None:  # fmt: skip
+    recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for name, trajectory, colour in (("odometry", before, _GREY), ("optimised", after, _BLUE)):
+        strip = rr.LineStrips3D([trajectory.world_from_body[:, :3, 3]], colors=[colour])
+        recording.log(f"map/path/{name}", strip, static=True)
+    ends = world_from_body[:, :3, 3]
+    for name, verdict, colour in (
+        ("accepted", Verdict.ACCEPTED, _GREEN),
+        ("rejected_by_solver", Verdict.REJECTED_BY_SOLVER, _RED),
+    ):
+        rows = [row for row, one in enumerate(closures.verdict) if one == verdict]
+        lines = np.stack([ends[closures.match[rows]], ends[closures.query[rows]]], axis=1).reshape(-1, 2, 3)
+        recording.log(f"map/closures/{name}", rr.LineStrips3D(lines, colors=[colour]), static=True)
+    if earth is not None:
+        where = on_earth(earth, after.world_from_body)[:, [1, 0]]
+        recording.log("earth/optimised", rr.GeoLineStrings(lat_lon=[where], colors=[_BLUE]), static=True)
+    quaternions = geometry.quaternion(world_from_body[:, :3, :3])
+    recording.send_columns(
+        "map/body",
+        indexes=[rr.TimeColumn("stamp", timestamp=keyframes.stamp_ns.astype("datetime64[ns]"))],
+        columns=rr.Transform3D.columns(translation=ends, quaternion=quaternions),
+    )

@@ -1,0 +1,114 @@
+"""The report of a finished run, made anew: against a truth, or with pictures from the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import geometry, logs
+from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.evaluate.closure_curve import closure_curves
+from vplog.evaluate.pairs import poses_at
+from vplog.evaluate.truth import read_truth
+from vplog.evaluation import evaluate
+from vplog.extract import extract_frames
+from vplog.loops.propose import candidate_stops
+from vplog.pipeline import Pipeline
+from vplog.report import write_report
+from vplog.results import mcap_read, run_record, tables
+from vplog.results.previews import shrink
+from vplog.results.report.content import Judged
+from vplog.show import Seen, choose_examples, draw_closures
+
+if TYPE_CHECKING:
+    from vplog.data import Bytes, Features
+
+
+def report(
+    folder: Path,
+    path: Path | None = None,
+    truth: str | None = None,
+    log: Path | None = None,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+) -> dict[str, Any]:
+    """Write report.html of the run in `folder`, to `path` where given; what was written.
+
+    `truth` is a TUM file or `gps`; `log` the drive, read again where result.mcap has no pictures of closures.
+    Raises VplogError with one line.
+    """
+    record = finished(folder)
+    judged = judge(folder, record, truth, topics) if truth is not None else None
+    pictures = None
+    if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
+        pictures = pictures_from(log, folder, record, threads)
+    written = write_report(folder, record, path, judged, pictures)
+    return {"report": str(written), "bytes": written.stat().st_size, "truth": truth}
+
+
+def finished(folder: Path) -> dict[str, Any]:
+    """run.json of a run that came to its end. Raises ResultError."""
+    record = run_record.read_run_json(folder / "run.json")
+    if not record.get("finished"):
+        raise ResultError(
+            f"The run in {folder} did not finish. Run it again: vplog run {record.get('log')} -o {folder}"
+        )
+    return record
+
+
+def judge(folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None = None) -> Judged:
+    """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
+    scores = evaluate(folder, truth, topics)
+    if truth == "gps":
+        return Judged(truth, scores)
+    known = read_truth(Path(truth))
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    closures = tables.read_closures(folder / "closures.parquet")
+    stops = candidate_stops(keyframes, _pipeline(folder, record).propose)
+    found = closure_curves(keyframes, closures, known, stops)
+    at, inside = poses_at(known, keyframes.stamp_ns)
+    world_from_truth, _ = geometry.umeyama(at[inside][:, :3, 3], world_from_body[inside][:, :3, 3])
+    # of the truth only what the drive covers, so that the map is that of the drive
+    during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
+    path = geometry.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
+    return Judged(Path(truth).name, scores, path, found.true, found.known, found.curves)
+
+
+def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int) -> dict[int, bytes]:
+    """Pictures of closures drawn from the log itself. Raises LogError or ResultError."""
+    pipeline = _pipeline(folder, record)
+    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    closures = tables.read_closures(folder / "closures.parquet")
+    library = folder / "library"
+    if not (library / "library.json").is_file():
+        library = Path(str((record.get("library") or {}).get("from")))
+    state = pipeline.places.load(library, threads)
+    column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+    if made_by != state.hash:
+        raise LibraryError(f"{library} is not the library of the run in {folder}; its report stays without pictures.")
+    opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
+    settings = pipeline.pictures.model_copy(update={"megapixels": pipeline.pictures.megapixels or 0.15})
+    rows = choose_examples(closures, settings.closures)
+    nodes = np.unique(np.concatenate([closures.query[rows], closures.match[rows]])) if rows else np.zeros(0, np.int32)
+    stamps = keyframes.stamp_ns[nodes]
+    if not np.isin(stamps, opened.stamps()).all():
+        raise ResultError(f"{opened.name} has no frames of these stamps: is it the log of {folder}?")
+    images: dict[int, Bytes] = {}
+    features: dict[int, Features] = {}
+    frames = extract_frames(opened.frames(stamps), pipeline.features, threads)
+    for node, (_, frame, found, why) in zip(nodes.tolist(), frames, strict=True):
+        if frame is None or found is None:
+            raise ResultError(why)
+        images[node], features[node] = shrink(frame.image, settings.megapixels), found
+    places = state.from_arrow(column)
+    seen = Seen(images.__getitem__, features.__getitem__, opened.camera(), state, places)
+    return draw_closures(rows, seen, closures, pipeline.verify, settings.quality, threads)
+
+
+def _pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
+    try:
+        return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
+    except SettingsError as error:
+        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None
