@@ -95,6 +95,10 @@ def print_evaluation(found: dict[str, Any]) -> None:
             f"(precision {share['precision']}); {closures['revisits_found']} of {closures['revisits']} revisits found "
             f"(recall {share['recall']}); {closures['opposite']} in the opposite direction"
         )
+    residuals = found.get("residuals")
+    if residuals and residuals["to_truth"] is not None:
+        near = "" if residuals["to_neighbours"] is None else f", {residuals['to_neighbours']:.2f} to its neighbours"
+        print(f"residuals median {residuals['to_truth']:.2f} sigma to the truth{near} (honest ones have about 1)")
     for when in ("before", "after"):
         rpe = found.get(f"rpe_{when}")
         drift = (

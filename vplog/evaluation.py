@@ -11,7 +11,7 @@ import numpy as np
 from vplog import logs
 from vplog.data import Trajectory
 from vplog.errors import ResultError, TruthError
-from vplog.evaluate import closures, gps, trajectory
+from vplog.evaluate import closures, gps, residuals, trajectory
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import run_record, tables
@@ -47,6 +47,7 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
         "rpe_before": asdict(trajectory.rpe(before, known)),
         "rpe_after": asdict(trajectory.rpe(after, known)),
         "closures": asdict(closures.score_closures(keyframes, ledger, known, stops)),
+        "residuals": asdict(residuals.score_residuals(keyframes, ledger, known)),
     }
 
 

@@ -44,6 +44,8 @@ COSTS = {
 TIME_BAR = 1.5
 BICOCCA_BAR = 1.1
 SIZES = (1_000, 10_000, 100_000)
+ROBUST_POSES = 10_000
+"""Largest made graph that the robust solve is timed on too; 100 000 poses with 35 000 closures take it many minutes."""
 
 
 def folder() -> Path:
@@ -323,8 +325,9 @@ def made_time(poses: int, rounds: int) -> Figure:
         path = Path(place) / "city.g2o"
         write_g2o(path, graph, graph.world_from_body)
         figure = least_squares_time(f"a city of {poses} poses", path, None, None, rounds)
-    robust: list[Solution] = []
-    spent = seconds(lambda: robust.append(method("gnc")(graph)), time.perf_counter)
-    counts = Counter(str(kind) for kind in graph.kind)
-    facts = {**figure.facts, **counts, "gnc_seconds": round(spent, 2), "gnc_reason": robust[0].reason}
+    facts = {**figure.facts, **Counter(str(kind) for kind in graph.kind)}
+    if poses <= ROBUST_POSES:
+        robust: list[Solution] = []
+        spent = seconds(lambda: robust.append(method("gnc")(graph)), time.perf_counter)
+        facts |= {"gnc_seconds": round(spent, 2), "gnc_reason": robust[0].reason}
     return replace(figure, facts=facts)

@@ -1,0 +1,76 @@
+"""Errors as large as they claim have a median near 1, whatever a truth that drifts between two visits says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vplog import geometry
+from vplog.data import Closures, Keyframes, Trajectory, Verdict
+from vplog.evaluate.residuals import score_residuals
+
+SIGMA = np.repeat([0.003, 0.05], 3)
+LAP = 200
+
+
+def drive(claimed: float = 1.0) -> tuple[Keyframes, Closures, Trajectory]:
+    """Two laps, the second 0.3 m beside the first, and a closure from every keyframe of it."""
+    random = np.random.default_rng(0)
+    turn = np.linspace(0, 2 * np.pi, LAP, endpoint=False)
+    zero = np.zeros(LAP)
+    rotation = geometry.so3_exp(np.stack([zero, zero, turn], axis=1))
+    laps = [geometry.pose(rotation, np.stack([r * np.cos(turn), r * np.sin(turn), zero], axis=1)) for r in (50.0, 50.3)]
+    poses = np.concatenate(laps)
+    stamps = np.arange(2 * LAP, dtype=np.int64) * 10**9
+    match, query = np.arange(LAP, dtype=np.int32), np.arange(LAP, 2 * LAP, dtype=np.int32)
+    z = geometry.between(poses[match], poses[query]) @ geometry.exp(random.normal(size=(LAP, 6)) * SIGMA)
+    zeros, ones, unknown = np.zeros(LAP, np.int32), np.ones(LAP, np.float32), np.full(LAP, np.nan)
+    ledger = Closures(
+        query=query,
+        match=match,
+        rank=zeros,
+        score=ones,
+        support=zeros,
+        shared_references=[np.empty(0, np.uint16)] * LAP,
+        shared_overlap=[np.empty(0, np.float32)] * LAP,
+        matches=zeros,
+        landmarks=zeros,
+        inliers=zeros,
+        spread=ones,
+        reverse_inliers=zeros,
+        scale=["odometry"] * LAP,
+        match_from_query=z,
+        information=np.tile(np.diag(1.0 / (claimed * SIGMA) ** 2), (LAP, 1, 1)),
+        verdict=[Verdict.ACCEPTED] * LAP,
+        residual_before=unknown,
+        residual_after=unknown,
+        weight=unknown,
+    )
+    return Keyframes("laps", stamps, poses), ledger, Trajectory(stamps, poses)
+
+
+@pytest.mark.parametrize("claimed", [0.5, 1.0, 4.0])
+def test_medians_are_the_errors_in_units_of_the_claim(claimed: float) -> None:
+    found = score_residuals(*drive(claimed))
+    assert found.closures == LAP
+    assert found.pairs == LAP - 1
+    assert found.to_truth == pytest.approx(0.94 / claimed, rel=0.08)
+    assert found.to_neighbours == pytest.approx(0.94 / claimed, rel=0.08)
+
+
+def test_a_truth_that_is_off_between_the_laps_spoils_the_one_figure_and_not_the_other() -> None:
+    keyframes, ledger, truth = drive()
+    off = truth.world_from_body.copy()
+    off[LAP:, 2, 3] += 1.0
+    found = score_residuals(keyframes, ledger, replace(truth, world_from_body=off))
+    assert found.to_truth is not None
+    assert found.to_truth > 5
+    assert found.to_neighbours == pytest.approx(0.94, rel=0.08)
+
+
+def test_nothing_accepted_is_no_figure() -> None:
+    keyframes, ledger, truth = drive()
+    found = score_residuals(keyframes, replace(ledger, verdict=[Verdict.TOO_FAR] * LAP), truth)
+    assert (found.closures, found.to_truth, found.pairs, found.to_neighbours) == (0, None, 0, None)

@@ -1,0 +1,77 @@
+"""Do closures know how well they know? Their errors against the truth, in units of what they claim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+from vplog.data import Verdict
+from vplog.evaluate.pairs import poses_at
+
+if TYPE_CHECKING:
+    from vplog.data import Closures, Floats, Ints, Keyframes, Trajectory
+
+_NEAR = 5
+"""Keyframes that the ends of two closures may be apart to be neighbours; the truth between them is short, and good."""
+
+
+@dataclass(frozen=True)
+class ResidualScore:
+    """Medians of sqrt(e' C^-1 e / 6): honest covariances have about 1 (0.94 for Gaussian errors)."""
+
+    closures: int
+    """Accepted ones with a covariance and a truth."""
+    to_truth: float | None
+    """Of the closures against the truth. A truth that is itself off between two visits counts as their error."""
+    pairs: int
+    """Closures with an accepted neighbour."""
+    to_neighbours: float | None
+    """Of each closure against the next one near it, moved by the truth over the few keyframes between them: what the
+    truth is off between two visits cancels, and so does what neighbours share, so it may be less."""
+
+
+def score_residuals(keyframes: Keyframes, closures: Closures, truth: Trajectory) -> ResidualScore:
+    """Of the accepted closures of a ledger."""
+    poses, known = poses_at(truth, keyframes.stamp_ns)
+    accepted = np.array([verdict is Verdict.ACCEPTED for verdict in closures.verdict], bool)
+    usable = accepted & known[closures.query] & known[closures.match] & np.isfinite(closures.information).all((1, 2))
+    rows = np.flatnonzero(usable)
+    query, match = closures.query[rows], closures.match[rows]
+    measured = closures.match_from_query[rows]
+    covariance = np.asarray(np.linalg.inv(closures.information[rows]), np.float64)
+    to_truth = _normalised(geometry.between(poses[match], poses[query]), measured, covariance)
+    this, following = _neighbours(query.astype(np.int64), match.astype(np.int64))
+    moved = geometry.between(poses[query[following]], poses[query[this]])  # the next query's frame from this one's
+    predicted = geometry.between(poses[match[following]], poses[match[this]]) @ measured[this] @ geometry.inverse(moved)
+    turned = geometry.adjoint(moved)
+    both = covariance[following] + turned @ covariance[this] @ np.swapaxes(turned, 1, 2)
+    to_neighbours = _normalised(predicted, measured[following], both)
+    return ResidualScore(len(rows), _median(to_truth), len(this), _median(to_neighbours))
+
+
+def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:
+    """Positions of closures, and of the next one in order of queries whose ends are near but not both the same."""
+    order = np.lexsort((match, query))
+    this, following = [], []
+    for at, row in enumerate(order[:-1].tolist()):
+        for other in order[at + 1 :].tolist():
+            if query[other] - query[row] > _NEAR:
+                break
+            if query[other] > query[row] and abs(match[other] - match[row]) <= _NEAR:
+                this.append(row)
+                following.append(other)
+                break
+    return np.array(this, np.int64), np.array(following, np.int64)
+
+
+def _normalised(expected: Floats, measured: Floats, covariance: Floats) -> Floats:
+    error = geometry.log(geometry.between(measured, expected))
+    chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+    return np.sqrt(np.maximum(chi2, 0.0) / 6.0)
+
+
+def _median(values: Floats) -> float | None:
+    return float(np.median(values)) if len(values) else None
