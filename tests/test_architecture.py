@@ -22,7 +22,7 @@ PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
     {"data", "settings", "timing"},
-    {"geometry", "geodesy"},
+    {"geometry", "geodesy", "remote"},
     {"tum"},
     {"stages", "references"},
     {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},

@@ -8,6 +8,7 @@ import logging
 import math
 import os
 import sys
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -28,7 +29,7 @@ from vplog.cli_print import (
 from vplog.errors import VplogError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from vplog.evaluate.place_truth import TruthChoice
     from vplog.logs import TopicChoice
@@ -54,9 +55,11 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     arguments = _parser().parse_args(argv)
+    arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
-        arguments.verb(arguments)
+        with _at_hand(arguments):
+            arguments.verb(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -74,6 +77,38 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
+
+
+def _place(text: str) -> Path:
+    """What an argument names: a path, or what is read and written by URL (vplog/remote.py)."""
+    if "://" not in text:
+        return Path(text)
+    from vplog.remote import located
+
+    try:
+        return located(text)
+    except VplogError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+@contextmanager
+def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
+    """Run folders and libraries named by URL are copied for the verb; what it writes to one is sent when it is done."""
+    places = {name: getattr(arguments, name, None) for name in ("run", "runs", "library", "output")}
+    if not any("://" in str(place) for place in places.values()):
+        yield
+        return
+    from vplog.remote import local_copy, local_output
+
+    with ExitStack() as stack:
+        for name, place in places.items():
+            if place is None:
+                continue
+            if name == "runs":
+                arguments.runs = [stack.enter_context(local_copy(run)) for run in place]
+            else:
+                setattr(arguments, name, stack.enter_context((local_output if name == "output" else local_copy)(place)))
+        yield
 
 
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
@@ -138,11 +173,11 @@ def run(arguments: argparse.Namespace) -> None:
                 arguments.logs[0], arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
             ).record
     if arguments.json:
-        print_json({"run": str(arguments.output), **found})
+        print_json({"run": str(arguments.shown), **found})
     elif len(arguments.logs) > 1:
-        print_joint(arguments.output, found)
+        print_joint(arguments.shown, found)
     else:
-        print_run(arguments.output, found)
+        print_run(arguments.shown, found)
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -385,19 +420,19 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     def output(sub: argparse.ArgumentParser, text: str) -> None:
-        sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=text)
+        sub.add_argument("-o", "--output", type=_place, required=True, metavar="OUT", help=text)
 
     _add_info(add("info", info, topics))
     sub = add("library", library, topics, threads, settings)
-    sub.add_argument("logs", type=Path, nargs="+", metavar="LOG")
+    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG")
     output(sub, "folder of the library")
     sub = add("run", run, topics, threads, settings)
-    sub.add_argument("logs", type=Path, nargs="+", metavar="LOG")
+    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG")
     output(sub, "run folder")
-    sub.add_argument("--library", type=Path, metavar="LIB", help="reference library (default: made from the drive)")
+    sub.add_argument("--library", type=_place, metavar="LIB", help="reference library (default: made from the drive)")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub = add("evaluate", evaluate, topics)
-    sub.add_argument("run", type=Path, metavar="RUN")
+    sub.add_argument("run", type=_place, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
     sub = add("compare", compare, topics, threads, settings, truth)
     _add_comparison(sub)
@@ -436,12 +471,12 @@ def _add_results(
     threads: argparse.ArgumentParser,
 ) -> None:  # fmt: skip
     sub = add("report", report, topics, threads)
-    sub.add_argument("run", type=Path, metavar="RUN")
+    sub.add_argument("run", type=_place, metavar="RUN")
     sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
-    sub.add_argument("--log", type=Path, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
+    sub.add_argument("--log", type=_place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="page (default: RUN/report.html)")
     sub = add("export", export)
-    sub.add_argument("run", type=Path, metavar="RUN")
+    sub.add_argument("run", type=_place, metavar="RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
     whole = add("map", export_map)
@@ -449,7 +484,7 @@ def _add_results(
     text = "the places of one run or many, in one file"
     sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
     sub.set_defaults(verb=export_map)
-    sub.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    sub.add_argument("runs", type=_place, nargs="+", metavar="RUN")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.parquet", help="file to write")
 
 
@@ -472,24 +507,26 @@ def _truth_options() -> argparse.ArgumentParser:
 
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("log", type=Path, metavar="LOG")
+    sub.add_argument("log", type=_place, metavar="LOG")
     sub.add_argument("--html", type=Path, metavar="FILE.html", help="also write a page with pictures of the drive")
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("query", type=Path, metavar="QUERY", help="drive whose frames are looked for")
-    sub.add_argument("map", type=Path, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
+    sub.add_argument("query", type=_place, metavar="QUERY", help="drive whose frames are looked for")
+    sub.add_argument("map", type=_place, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
     sub.add_argument(
         "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
     )
     sub.add_argument("--sequence", type=_at_least_one, metavar="L", help="also match sequences of L frames")
-    sub.add_argument("--library", type=Path, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
+    sub.add_argument(
+        "--library", type=_place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)"
+    )
     sub.add_argument("--library-seed", type=_at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
     sub.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for compare.json, scores and curves")
 
 
 def _add_study(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="drives, each query and map in turn")
+    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
     sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
     sub.add_argument(
         "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="of libraries (default: 10,20,50,100)"
@@ -502,7 +539,7 @@ def _add_study(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_explain(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("run", type=Path, metavar="RUN")
+    sub.add_argument("run", type=_place, metavar="RUN")
     which = sub.add_mutually_exclusive_group(required=True)
     which.add_argument(
         "--closure", type=_closure, metavar="K|QUERY:MATCH",
@@ -512,7 +549,7 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "-o", "--output", type=Path, metavar="PICTURE.png", help="picture, .png or .svg (default: RUN/closure-K.png)"
     )
-    sub.add_argument("--log", type=Path, metavar="LOG", help="the run's log, where it has moved since")
+    sub.add_argument("--log", type=_place, metavar="LOG", help="the run's log, where it has moved since")
     sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
 
 

@@ -14,6 +14,7 @@ from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, gps, residuals, trajectory
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.remote import located
 from vplog.results import run_record, tables
 
 
@@ -34,7 +35,7 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     if truth == "gps":
-        return {"truth": "gps", **_against_gps(Path(_recorded(record, folder, str, "log")), before, after, topics)}
+        return {"truth": "gps", **_against_gps(located(_recorded(record, folder, str, "log")), before, after, topics)}
     known = read_truth(Path(truth))
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")

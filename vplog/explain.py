@@ -13,6 +13,7 @@ from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.explain_picture import Side, View, draw
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
+from vplog.remote import located
 from vplog.results import run_record, tables
 from vplog.shared_view import find_agreement, find_boxes
 
@@ -59,7 +60,7 @@ def explain(
     words = explain_words.tell(row, keyframes, world_from_body, siblings, pipeline, reason)
     shown = None
     if not words_only:
-        found = log or Path(str(record.get("log")))
+        found = log or located(str(record.get("log")))
         if not found.exists():
             raise ResultError(f"The log of the run, {found}, is not there any more. Say where it is with --log PATH.")
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")

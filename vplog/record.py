@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import vplog
 from vplog.data import Verdict
 from vplog.errors import SettingsError
+from vplog.remote import RemotePath
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -57,14 +58,16 @@ def _version(package: str) -> str:
 
 
 def hash_inputs(path: Path) -> dict[str, str]:
-    """sha256 of every file of a log, by name."""
+    """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole."""
     files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
     result = {}
     for file in files:
+        name = str(file.relative_to(path)) if path.is_dir() else file.name
+        if isinstance(file, RemotePath):
+            result[name] = file.version()
+            continue
         with file.open("rb") as stream:
-            result[str(file.relative_to(path)) if path.is_dir() else file.name] = hashlib.file_digest(
-                stream, "sha256"
-            ).hexdigest()
+            result[name] = hashlib.file_digest(stream, "sha256").hexdigest()
     return result
 
 

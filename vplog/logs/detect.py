@@ -10,12 +10,13 @@ from vplog.logs import image_folder, mcap_file, ros1_bag, sqlite_bag
 from vplog.logs.containers import Notes, plural
 from vplog.logs.image_folder import ImageFolder
 from vplog.logs.mcap_file import McapFile
-from vplog.logs.packed import unpacked
+from vplog.logs.packed import fetched, unpacked
 from vplog.logs.parts import Part, in_order_of_time
 from vplog.logs.recorded import RecordedLog
 from vplog.logs.ros1_bag import Ros1Bag
 from vplog.logs.ros2_folder import Chain, Counted, Metadata, MetadataError, ZstdMessages, read_metadata, split_parts
 from vplog.logs.sqlite_bag import SqliteBag
+from vplog.remote import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,13 +35,14 @@ _KNOWN = "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder) or a folder of
 
 def open_log(path: Path, choice: TopicChoice) -> Log:
     """The log at `path`. Raises LogError where there is none that vplog reads."""
-    path, notes = Path(path), Notes()
+    path, notes = located(path), Notes()
     try:
         if not path.exists():
             raise LogError(f"No log at {path}: there is no such file or folder.")
         return _open_folder(path, choice, notes) if path.is_dir() else _open_file(path, choice, notes)
     except OSError as error:
-        raise LogError(f"Cannot read {path}: {error.strerror or error}.") from None
+        reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
+        raise LogError(f"Cannot read {path}: {reason}.") from None
 
 
 def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
@@ -66,12 +68,14 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
         kind = _magic(inside)
     if kind not in _READERS:
         raise LogError(_no_log(path) if inside is path else f"{path} holds something else than a log when unpacked.")
+    if kind == "db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
+        inside = fetched(inside)
     return _READERS[kind](inside, notes, name or path.name), kind
 
 
 def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
     """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
-    paths = [Path(path) for path in paths]
+    paths = [located(path) for path in paths]
     if len(paths) == 1:
         return open_log(paths[0], choice)
     notes, parts = Notes(), []

@@ -6,16 +6,34 @@ import atexit
 import shutil
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zstandard
 
 from vplog.errors import LogError
 from vplog.logs.compression import FREE_BYTES, MAX_RATIO
 
+if TYPE_CHECKING:
+    from vplog.remote import RemotePath
+
 _BLOCK = 2**20
 """Bytes that are written at once."""
 _SPARE = 2**30
 """Bytes of disk that are left free for others."""
+
+
+def fetched(path: RemotePath) -> Path:
+    """A temporary copy of a remote file, removed when the process ends. Raises LogError where the disk is too small."""
+    folder = Path(tempfile.mkdtemp(prefix="vplog-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    room, size = shutil.disk_usage(folder).free - _SPARE, path.stat().st_size
+    if size > room:
+        raise LogError(
+            f"{path} has {size / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in {folder.parent}. Set TMPDIR."
+        )
+    with path.open("rb") as file, (folder / path.name).open("wb") as out:
+        shutil.copyfileobj(file, out, _BLOCK)
+    return folder / path.name
 
 
 def unpacked(path: Path) -> Path:

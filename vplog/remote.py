@@ -1,0 +1,319 @@
+"""Files by URL: s3:// and gs:// through pyarrow, http(s):// by range requests; read in parts, written when finished.
+
+A RemotePath answers as much of pathlib's Path as logs are read with. What is asked for is read, in blocks; nothing is
+kept on disk. Credentials and endpoints come from where each service's own tools look for them (AWS_ACCESS_KEY_ID,
+AWS_ENDPOINT_URL, GOOGLE_APPLICATION_CREDENTIALS, ...).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import tempfile
+import urllib.error
+import urllib.parse
+import urllib.request
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
+
+from vplog.errors import LogError, ResultError, SettingsError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pyarrow.fs import FileInfo, FileSystem
+
+SCHEMES = ("s3", "gs", "http", "https")
+_BLOCK_BYTES = 1 << 20
+"""Read ahead of small reads: a chunk of a log; a request costs as much as some hundred kB."""
+_TIMEOUT_S = 30.0
+"""A server that says nothing for so long is taken as gone."""
+
+
+@dataclass(frozen=True)
+class Stat:
+    """What `Path.stat` is asked for."""
+
+    st_size: int
+
+
+def located(text: str | Path | RemotePath) -> Path:
+    """A local path, or where the text is a URL, a RemotePath, which answers like one.
+
+    Raises SettingsError for a scheme that is not known.
+    """
+    if isinstance(text, RemotePath):
+        return cast("Path", text)
+    if "://" not in str(text):
+        return Path(text)
+    scheme = str(text).split("://", 1)[0]
+    if scheme not in SCHEMES:
+        raise SettingsError(f"Cannot open {text}: {scheme}:// is not known. Known: {', '.join(SCHEMES)}, or a path.")
+    return cast("Path", RemotePath(str(text)))
+
+
+class RemotePath:
+    """One object, or what has this prefix, on a server."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url.rstrip("/")
+
+    def __str__(self) -> str:
+        return self._url
+
+    def __repr__(self) -> str:
+        return f"RemotePath({self._url!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RemotePath) and self._url == other._url
+
+    def __hash__(self) -> int:
+        return hash(self._url)
+
+    def __lt__(self, other: RemotePath) -> bool:
+        return self._url < other._url
+
+    def __truediv__(self, name: str) -> RemotePath:
+        return RemotePath(f"{self._url}/{name}")
+
+    @property
+    def scheme(self) -> str:
+        return self._url.split("://", 1)[0]
+
+    @property
+    def name(self) -> str:
+        return PurePosixPath(urllib.parse.urlsplit(self._url).path).name
+
+    @property
+    def stem(self) -> str:
+        return PurePosixPath(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        return PurePosixPath(self.name).suffix
+
+    def resolve(self) -> RemotePath:
+        return self
+
+    def relative_to(self, folder: RemotePath) -> PurePosixPath:
+        return PurePosixPath(self._url).relative_to(PurePosixPath(str(folder)))
+
+    def exists(self) -> bool:
+        return self._kind != "none"
+
+    def is_file(self) -> bool:
+        return self._kind == "file"
+
+    def is_dir(self) -> bool:
+        return self._kind == "folder"
+
+    def stat(self) -> Stat:
+        return Stat(self._length)
+
+    def version(self) -> str:
+        """What changes when the object does, without reading it: its length and time, or the server's tag."""
+        if self._is_http:
+            return f"length {self._length}, {self._head.get('ETag') or self._head.get('Last-Modified') or 'no tag'}"
+        return f"length {self._length}, time {self._info.mtime_ns}"
+
+    def open(self, mode: str = "rb") -> BinaryIO:
+        """A stream that reads what is asked for. Raises OSError."""
+        if mode != "rb":
+            raise ValueError(f"a remote file is opened with mode rb, not {mode}")
+        raw: Any = _HttpRanges(self._url, self._length) if self._is_http else _Ranges(*self._place, self._length)
+        return io.BufferedReader(raw, _BLOCK_BYTES)
+
+    def read_bytes(self) -> bytes:
+        with self.open() as stream:
+            return stream.read()
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        return self.read_bytes().decode(encoding)
+
+    def iterdir(self) -> Iterator[RemotePath]:
+        """What is right below, in order of names. HTTP servers do not list: nothing."""
+        yield from self._below(recursive=False)
+
+    def rglob(self, _: str = "*") -> Iterator[RemotePath]:
+        yield from self._below(recursive=True)
+
+    @property
+    def _is_http(self) -> bool:
+        return self.scheme in ("http", "https")
+
+    @cached_property
+    def _place(self) -> tuple[FileSystem, str]:
+        from pyarrow import fs
+
+        place = urllib.parse.unquote(self._url.split("://", 1)[1])
+        if self.scheme == "gs":
+            return fs.GcsFileSystem(), place
+        endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+        region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
+        known = {"endpoint_override": endpoint, "region": region}
+        return fs.S3FileSystem(
+            request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, **{k: v for k, v in known.items() if v}
+        ), place
+
+    @cached_property
+    def _info(self) -> FileInfo:
+        system, place = self._place
+        return system.get_file_info(place)
+
+    @cached_property
+    def _head(self) -> dict[str, str]:
+        request = urllib.request.Request(self._url, method="HEAD")  # noqa: S310 (the scheme is checked)
+        try:
+            with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:  # noqa: S310
+                return dict(answer.headers)
+        except urllib.error.HTTPError as error:
+            if error.code in (404, 410):
+                return {}
+            raise OSError(f"the server says {error.code} {error.reason}") from None
+
+    @cached_property
+    def _kind(self) -> str:
+        if self._is_http:
+            return "file" if self._head else "none"
+        from pyarrow.fs import FileType
+
+        return {FileType.File: "file", FileType.Directory: "folder"}.get(self._info.type, "none")
+
+    @property
+    def _length(self) -> int:
+        if not self._is_http:
+            return int(self._info.size or 0)
+        length = self._head.get("Content-Length", "")
+        if not length.isdigit():
+            raise OSError("the server does not say how long the file is")
+        return int(length)
+
+    def _below(self, recursive: bool) -> Iterator[RemotePath]:
+        if self._is_http:
+            return
+        from pyarrow.fs import FileSelector
+
+        system, place = self._place
+        for found in sorted(system.get_file_info(FileSelector(place, recursive=recursive)), key=lambda one: one.path):
+            yield RemotePath(f"{self._url}{found.path[len(place) :]}")
+
+
+class _Ranges(io.RawIOBase):
+    """Random access to an object; every read is a request for just these bytes."""
+
+    def __init__(self, system: FileSystem, place: str, length: int) -> None:
+        self._file, self._at, self._length = system.open_input_file(place), 0, length
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._length}[whence]
+        self._at = max(start + offset, 0)
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        wanted = min(len(buffer), max(self._length - self._at, 0))
+        if wanted == 0:
+            return 0
+        data = self._fetch(self._at, wanted)
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        if not self.closed and getattr(self, "_file", None) is not None:
+            self._file.close()
+        super().close()
+
+    def _fetch(self, start: int, count: int) -> bytes:
+        return self._file.read_at(count, start)
+
+
+class _HttpRanges(_Ranges):
+    """The same of a file on a web server (RFC 9110, section 14)."""
+
+    def __init__(self, url: str, length: int) -> None:
+        self._url, self._at, self._length, self._file = url, 0, length, None
+
+    def _fetch(self, start: int, count: int) -> bytes:
+        wanted = {"Range": f"bytes={start}-{start + count - 1}"}
+        request = urllib.request.Request(self._url, headers=wanted)  # noqa: S310 (the scheme is checked)
+        try:
+            with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:  # noqa: S310
+                if answer.status != 206 and not (start == 0 and count == self._length):
+                    raise OSError("the server does not answer range requests; download the file first")
+                return answer.read(count)
+        except urllib.error.HTTPError as error:
+            raise OSError(f"the server says {error.code} {error.reason}") from None
+
+
+@contextmanager
+def local_copy(path: Path | RemotePath) -> Iterator[Path]:
+    """A remote folder or file as a local one for the time of the block; a local one as it is. Raises LogError."""
+    if not isinstance(path, RemotePath):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="vplog-") as folder:
+        target = Path(folder) / (path.name or "remote")
+        try:
+            if not path.exists():
+                raise LogError(f"There is nothing at {path}.")
+            _download(path, target)
+        except OSError as error:
+            raise LogError(f"Cannot read {path}: {_reason(error)}.") from None
+        yield target
+
+
+def _download(path: RemotePath, target: Path) -> None:
+    files = [path] if path.is_file() else [file for file in path.rglob() if file.is_file()]
+    for file in files:
+        place = target if path.is_file() else target / file.relative_to(path)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with file.open() as source, place.open("wb") as sink:
+            shutil.copyfileobj(source, sink, _BLOCK_BYTES)
+
+
+@contextmanager
+def local_output(path: Path | RemotePath) -> Iterator[Path]:
+    """Where to write what is to end at `path`: there, or for a remote one a local folder that is sent when all is done.
+
+    The run's own account, run.json, is sent last: who finds it finds everything. Nothing is sent of what failed.
+    Raises ResultError where the server does not take it, SettingsError for one that takes nothing.
+    """
+    if not isinstance(path, RemotePath):
+        yield path
+        return
+    if path.scheme not in ("s3", "gs"):
+        raise SettingsError(
+            f"Cannot write to {path}: {path.scheme}:// is for reading. Write to s3://, gs:// or a path."
+        )
+    with tempfile.TemporaryDirectory(prefix="vplog-") as folder:
+        target = Path(folder) / (path.name or "out")
+        yield target
+        files = sorted(file for file in target.rglob("*") if file.is_file())
+        files.sort(key=lambda file: file.name == "run.json" and file.parent == target)
+        try:
+            system, place = path._place
+            for file in files:
+                with (
+                    file.open("rb") as source,
+                    system.open_output_stream(f"{place}/{file.relative_to(target)}") as sink,
+                ):
+                    shutil.copyfileobj(source, sink, _BLOCK_BYTES)
+        except OSError as error:
+            raise ResultError(f"Cannot write {path}: {_reason(error)}.") from None
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__)[:300].rstrip(".")
