@@ -11,6 +11,7 @@ from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
 from vplog.graph.cross_check import cross_checked
 from vplog.graph.directions import Directions, with_directions
+from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.satellites import fixes_on
@@ -74,6 +75,8 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
         graph, solution = with_directions(graph, solution, directions, settings.solve)
         rows = np.concatenate([rows, lines])
     fixes = fixes_on(log.gps(), odometry, keyframes, settings.gps) if settings.gps.use else None
+    if fixes is not None:
+        solution = keep_odometry_if_further(graph, solution, fixes)
     refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
     return Solved(
         judge(closures, graph, refined, rows),

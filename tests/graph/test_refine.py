@@ -10,7 +10,8 @@ from vplog import geometry
 from vplog.data import EdgeKind, Gps, Keyframes, Odometry, PoseGraph
 from vplog.errors import GraphError
 from vplog.geodesy import local_enu
-from vplog.graph.consistency import residual_sigma
+from vplog.graph.consistency import keep_odometry_if_worse, odometry_chain, residual_sigma
+from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.lm import LmSettings
 from vplog.graph.refine import Refined, RefineSettings, refine
 from vplog.graph.satellites import Fixes, GpsSettings, antennas, fixes_on
@@ -190,3 +191,27 @@ def test_local_enu_holds_an_origin() -> None:
     local = local_enu(satellites(ring(30, 2)))
     np.testing.assert_array_equal(local.enu_m[0], 0.0)
     assert local.origin[0] == pytest.approx(48.0, abs=0.001)
+
+
+def test_closures_that_lead_away_from_gps_are_not_believed() -> None:
+    """All shifted alike by less than the odometry's noise claims to be: only GPS can tell."""
+    drive = misread(ring(120, loops=40, seed=1), covariance=400.0)
+    fixes = fixes_on(satellites(drive, 0.3), drive.odometry, drive.keyframes, GpsSettings())
+    sound = LmSettings()(drive.graph)
+    assert keep_odometry_if_further(drive.graph, sound, fixes) is sound
+    loops = np.array([kind == EdgeKind.LOOP for kind in drive.graph.kind])
+    measured = drive.graph.a_from_b.copy()
+    aside = np.eye(4)
+    aside[:3, 3] = [8.0, 0.0, 0.0]
+    measured[loops] = aside @ measured[loops]
+    poisoned = replace(drive.graph, a_from_b=measured)
+    bent = LmSettings()(poisoned)
+    assert keep_odometry_if_worse(poisoned, bent) is bent
+    kept = keep_odometry_if_further(poisoned, bent, fixes)
+    assert kept.reason.startswith("Odometry was kept: with 40 closures the GPS fixes are")
+    assert kept.weight[loops].sum() == 0
+    np.testing.assert_array_equal(kept.world_from_body, odometry_chain(poisoned)[0])
+    # one in ten fixes far away changes nothing
+    jumped = replace(fixes, enu_m=fixes.enu_m + np.where(np.arange(len(fixes)) % 10 == 0, 500.0, 0.0)[:, None])
+    assert keep_odometry_if_further(drive.graph, sound, jumped) is sound
+    assert keep_odometry_if_further(poisoned, bent, jumped).weight[loops].sum() == 0
