@@ -295,10 +295,6 @@ def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive:
     assert not (tmp_path / "library").exists()
 
 
-def test_two_drives_are_not_one_run(verb: Verb, drive: Drive, tmp_path: Path) -> None:
-    assert "2 logs" in verb("run", drive.log, drive.log, "-o", tmp_path / "run").error
-
-
 # Settings, folders and truths that do not fit
 
 

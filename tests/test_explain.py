@@ -78,7 +78,8 @@ def told(row: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("verdict", Verdict)
 def test_every_verdict_is_told_in_whole_sentences_and_says_what_would_change_it(verdict: Verdict) -> None:
     words = told(a_row(verdict))
-    assert words.verdict.startswith("Accepted" if verdict is Verdict.ACCEPTED else "Rejected")
+    became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, "Rejected")
+    assert words.verdict.startswith(became)
     assert verdict.sentence in words.verdict
     for text in (words.verdict, words.proposed, words.geometry, words.solver, words.change):
         assert text.endswith(".")

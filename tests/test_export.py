@@ -157,8 +157,11 @@ def test_rerun_reads_its_own(exported: Callable[[str], Path], finished: Path, tm
         ("/map/closures/accepted", 1, "LineStrips3D:strips"),
         ("/earth/optimised", 1, "GeoLineStrings:line_strings"),
         ("/map/body", len(keyframes.stamp_ns), "Transform3D:translation"),
+        ("/map/body/camera", 1, "Pinhole:image_from_camera"),
+        ("/map/body/camera/image", len(keyframes.stamp_ns), "EncodedImage:blob"),
     ):
-        assert any(f"with {rows} rows" in c and f"- {entity} -" in c and component in c for c in chunks), entity
+        found = [int(c.split("with ")[1].split()[0]) for c in chunks if f"- {entity} -" in c and component in c]
+        assert sum(found) == rows, entity
 
 
 def test_without_rerun_one_line_says_what_to_install(

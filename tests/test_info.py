@@ -8,6 +8,7 @@ import shlex
 from html.parser import HTMLParser
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -104,6 +105,28 @@ def test_the_command_runs_with_what_was_asked_for(drive: Path, tmp_path: Path) -
     arguments = cli._parser().parse_args(words[1:])
     assert cli._topics(arguments) == topics
     assert arguments.logs == [drive]
+
+
+def test_a_folder_of_images_with_files_beside_it(tmp_path: Path) -> None:
+    folder, poses = tmp_path / "images", tmp_path / "poses.tum"
+    folder.mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{1000 + i}.000.png"), np.zeros((8, 10), np.uint8))
+    poses.write_text("".join(f"{1000 + i} {2 * i} 0 0 0 0 0 1\n" for i in range(4)))
+    record = preflight(folder, TopicChoice(odometry_file=poses)).record
+    assert record["ready"]
+    assert why(record) == {"images": "used as camera"}
+    assert (record["odometry"]["source"], record["odometry"]["path_m"]) == (str(poses), 6.0)
+    assert f"--odometry-file {poses}" in record["command"]
+    assert "--odometry-file" in preflight(folder).record["problems"][0]
+    poses.write_text("1001 0 0 0 0 0 0 1\n1002 2 0 0 0 0 0 1\n")
+    short = preflight(folder, TopicChoice(odometry_file=poses)).record
+    assert short["frames"]["keyframes"] == 2
+    assert any("2 of 4 frames have no odometry" in line for line in short["warnings"])
+    poses.write_text("5 0 0 0 0 0 0 1\n6 2 0 0 0 0 0 1\n")
+    apart = preflight(folder, TopicChoice(odometry_file=poses)).record
+    assert any("no two frames have odometry" in line for line in apart["problems"])
+    assert not apart["ready"]
 
 
 def test_gaps_are_placed_in_time(tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 QUICK = ("features.max_features=600", "library.size=12", "pictures.closures=0", "pictures.megapixels=0")
 
 
-def cut(log: Path, at_ns: int, folder: Path) -> list[Path]:
-    """The messages of a log before and from a time on, in a file each; both know how the camera is mounted."""
+def cut(log: Path, at_ns: int, folder: Path, mounted: bool = True) -> list[Path]:
+    """The messages of a log before and from a time on, in a file each; one knows how the camera sits, or both."""
     files = [folder / "before.mcap", folder / "after.mcap"]
     with log.open("rb") as stream, files[0].open("wb") as one, files[1].open("wb") as other:
         writers = [Writer(one), Writer(other)]
@@ -41,7 +41,7 @@ def cut(log: Path, at_ns: int, folder: Path) -> list[Path]:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
             for part, writer in enumerate(writers):
-                if channel.topic != "/tf_static" and (message.log_time >= at_ns) != bool(part):
+                if not (mounted and channel.topic == "/tf_static") and (message.log_time >= at_ns) != bool(part):
                     continue
                 if channel.id not in channels[part]:
                     known = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -103,3 +103,12 @@ def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Ca
 
 def test_gps_of_several_drives_is_refused(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
     assert "one drive at a time" in verb("run", drive.log, drive.log, "-o", tmp_path, "--gps").error
+
+
+def test_the_parts_of_one_recording_are_one_drive(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    before, after = cut(drive.log, int(drive.stamp_ns[-14]), tmp_path, mounted=False)
+    options = [f"--set={one}" for one in (*QUICK, "propose.per_query=2")]
+    told = verb("run", after, before, "--one-drive", "-o", tmp_path / "run", "--threads", 2, "--json", *options).json
+    assert told["counts"]["frames"] == len(drive.stamp_ns)
+    assert sorted(told["inputs"]) == ["after.mcap", "before.mcap"]
+    assert verb("evaluate", tmp_path / "run", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0

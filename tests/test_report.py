@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html.parser
 import json
 import re
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog.data import Verdict
+from vplog.data import Closures, Verdict
 from vplog.evaluate.closure_curve import closure_curves
 from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
@@ -293,6 +294,19 @@ def test_a_browser_runs_nothing_of_a_strangers(verb: Verb, browser: str, hostile
     assert not console
     assert "<title>owned" not in dom
     assert cells(dom)
+
+
+def test_a_run_that_proposed_nothing_is_a_page_too(verb: Verb, browser: str, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    closures = tables.read_closures(folder / "closures.parquet")
+    none = Closures(**{field.name: getattr(closures, field.name)[:0] for field in dataclasses.fields(Closures)})
+    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    tables.write_closures(folder / "closures.parquet", none, keyframes, tables.TableMetadata({}, ""))
+    assert verb("report", folder).code == 0
+    dom, console = opened(browser, folder / "report.html", tmp_path, "--dump-dom")
+    assert not console
+    assert "Nothing was proposed" in dom
 
 
 @pytest.mark.parametrize("size", ["1280,900", "500,900"])

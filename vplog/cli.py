@@ -160,7 +160,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.set.append("gps.use=true")
     pipeline, topics = _pipeline(arguments), _topics(arguments)
     with Progress(arguments) as progress:
-        if len(arguments.logs) > 1:
+        if len(arguments.logs) > 1 and not arguments.one_drive:
             from vplog.joint import run_joint
 
             found = run_joint(
@@ -170,11 +170,11 @@ def run(arguments: argparse.Namespace) -> None:
             from vplog.pipeline import run as run_pipeline
 
             found = run_pipeline(
-                arguments.logs[0], arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
+                arguments.logs, arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
             ).record
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
-    elif len(arguments.logs) > 1:
+    elif "maps" in found:
         print_joint(arguments.shown, found)
     else:
         print_run(arguments.shown, found)
@@ -389,7 +389,7 @@ def _topics(arguments: argparse.Namespace) -> TopicChoice:
         odometry=arguments.odometry_topic,
         gps=arguments.gps_topic,
         odometry_file=arguments.odometry_file,
-        calibration_file=arguments.calibration,
+        calibration_file=arguments.calibration_file,
     )
 
 
@@ -430,6 +430,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("logs", type=_place, nargs="+", metavar="LOG")
     output(sub, "run folder")
     sub.add_argument("--library", type=_place, metavar="LIB", help="reference library (default: made from the drive)")
+    sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=_place, metavar="RUN")
@@ -459,11 +460,17 @@ def _topic_options() -> argparse.ArgumentParser:
     topics = argparse.ArgumentParser(add_help=False)
     for role in ("image", "depth", "right", "camera-info", "odometry", "gps"):
         topics.add_argument(f"--{role}-topic", metavar="TOPIC", help=f"use this {role} topic")
-    topics.add_argument("--odometry-file", type=Path, metavar="FILE.tum", help="use these poses as the odometry")
+    topics.add_argument("--odometry-file", type=_resolved, metavar="FILE.tum", help="use these poses as the odometry")
     topics.add_argument(
-        "--calibration", type=Path, metavar="FILE.yaml", help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml"
-    )
+        "--calibration", type=_resolved, metavar="FILE.yaml", dest="calibration_file",
+        help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml",
+    )  # fmt: skip
     return topics
+
+
+def _resolved(text: str) -> Path:
+    """A file that run.json names, so that the run is understood from any folder."""
+    return Path(text).resolve()
 
 
 def _add_results(

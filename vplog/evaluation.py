@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog import logs
 from vplog.data import Trajectory
 from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, gps, residuals, trajectory
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
-from vplog.remote import located
+from vplog.record import reopened
 from vplog.results import run_record, tables
+
+if TYPE_CHECKING:
+    from vplog import logs
 
 
 def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -> dict[str, Any]:
@@ -35,7 +37,7 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     if truth == "gps":
-        return {"truth": "gps", **_against_gps(located(_recorded(record, folder, str, "log")), before, after, topics)}
+        return {"truth": "gps", **_against_gps(record, before, after, topics)}
     known = read_truth(Path(truth))
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
@@ -86,10 +88,12 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
     return record
 
 
-def _against_gps(path: Path, before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None) -> dict[str, Any]:
-    fixes = logs.open(path, topics).gps()
+def _against_gps(
+    record: dict[str, Any], before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None
+) -> dict[str, Any]:
+    fixes = reopened(record, None, topics).gps()
     if fixes is None or not len(fixes.stamp_ns):
-        raise TruthError(f"{path} has no GPS fixes. Give a truth file: --truth FILE.tum")
+        raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     return {
         "ate_before": asdict(gps.ate_to_gps(before, fixes)),
         "ate_after": asdict(gps.ate_to_gps(after, fixes)),

@@ -13,7 +13,7 @@ from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.explain_picture import Side, View, draw
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
-from vplog.remote import located
+from vplog.record import reopened
 from vplog.results import run_record, tables
 from vplog.shared_view import find_agreement, find_boxes
 
@@ -60,11 +60,8 @@ def explain(
     words = explain_words.tell(row, keyframes, world_from_body, siblings, pipeline, reason)
     shown = None
     if not words_only:
-        found = log or located(str(record.get("log")))
-        if not found.exists():
-            raise ResultError(f"The log of the run, {found}, is not there any more. Say where it is with --log PATH.")
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
-        opened, file = logs.open(found, topics), picture or folder / f"closure-{number}.png"
+        opened, file = reopened(record, log, topics), picture or folder / f"closure-{number}.png"
         shown = _show(number, row, words, folder, record, pipeline, opened, file)
     return {"run": str(folder), "closure": number, "row": row, **asdict(words), "picture": shown}
 

@@ -46,8 +46,9 @@ def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
         case "rrd":
             closures = tables.read_closures(folder / "closures.parquet")
             write_rrd(
-                path, tracks.keyframes, tracks.world_from_body, closures, tracks.before, tracks.after, tracks.earth
-            )
+                path, tracks.keyframes, tracks.world_from_body, closures, tracks.before, tracks.after, tracks.earth,
+                folder / "result.mcap",
+            )  # fmt: skip
         case _:
             raise ResultError(f"No format {kind!r}. Formats: {', '.join(FORMATS)}.")
     return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}

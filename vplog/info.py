@@ -6,6 +6,7 @@ import shlex
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from vplog import logs
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 _SAMPLES = 8
 """Frames that are decoded: enough to see what the drive looks like and whether its images decode throughout."""
+PICTURE_PX = 480
+"""px across a picture that is kept: a phone's width, and half of a column on a screen."""
 _GAP_S = 1.0
 """s without a message that count as a gap, where they are also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
@@ -53,7 +56,7 @@ class Preflight:
     record: dict[str, Any]
     """Plain values, as `vplog info --json` prints them."""
     pictures: list[tuple[int, Bytes]] = field(default_factory=list)
-    """Stamp in ns and grey image of frames evenly spread over the drive, as they are decoded for a run."""
+    """Stamp in ns and grey image of frames evenly spread over the drive, not wider than PICTURE_PX."""
 
 
 def preflight(path: Path, topics: TopicChoice | None = None) -> Preflight:
@@ -65,8 +68,8 @@ def preflight(path: Path, topics: TopicChoice | None = None) -> Preflight:
     camera, odometry, gps = _camera(log, problems), log.odometry(), log.gps()
     stamp_ns = log.stamps() if camera is not None else np.zeros(0, np.int64)
     pictures, decoded = _pictures(log, stamp_ns, problems)
-    keyframes = _keyframes(log, stamp_ns, odometry, problems)
-    warnings = [line for line in dict.fromkeys(found.warnings + log.warnings) if line not in problems]
+    keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
+    warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     for topic, told in zip(found.topics, named["topics"], strict=True):
         told["rate_hz"] = _rate(topic.count, found)
@@ -112,7 +115,7 @@ def _pictures(log: Log, stamp_ns: Ints, problems: list[str]) -> tuple[list[tuple
     reason = ""
     for encoded in log.frames(stamp_ns[rows]) if len(rows) else ():
         try:
-            pictures.append((encoded.stamp_ns, encoded.decode().image))
+            pictures.append((encoded.stamp_ns, _small(encoded.decode().image)))
         except LogError as error:
             reason = reason or str(error)
     if len(rows) and not pictures:
@@ -120,24 +123,35 @@ def _pictures(log: Log, stamp_ns: Ints, problems: list[str]) -> tuple[list[tuple
     return pictures, (len(pictures), len(rows))
 
 
-def _keyframes(log: Log, stamp_ns: Ints, odometry: Odometry | None, problems: list[str]) -> int | None:
-    """How many keyframes a run would take with the default settings."""
+def _small(image: Bytes) -> Bytes:
+    """The picture, not wider than PICTURE_PX."""
+    height, width = image.shape
+    if width <= PICTURE_PX:
+        return image
+    size = PICTURE_PX, max(round(height * PICTURE_PX / width), 1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _keyframes(
+    log: Log, stamp_ns: Ints, odometry: Odometry | None, problems: list[str]
+) -> tuple[int | None, list[str]]:
+    """How many keyframes a run would take with the default settings, and which frames it would leave out."""
     if not len(stamp_ns):
-        return None
+        return None, []
     if odometry is None or len(odometry.stamp_ns) < 2:
         problems.append(
             "There is no odometry, and a trajectory is built on it: name its topic with --odometry-topic, or give "
             "poses with --odometry-file."
         )
-        return None
+        return None, []
     try:
-        found = len(select_keyframes(log.name, stamp_ns, odometry, KeyframeSettings())[0].stamp_ns)
+        keyframes, missing = select_keyframes(log.name, stamp_ns, odometry, KeyframeSettings())
     except LogError as error:
         problems.append(str(error))
-        return None
-    if found < 2:
+        return None, []
+    if len(keyframes.stamp_ns) < 2:
         problems.append("By the odometry nothing moves far enough for a second keyframe, and a graph needs two.")
-    return found
+    return len(keyframes.stamp_ns), missing
 
 
 def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:

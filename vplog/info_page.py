@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from vplog.data import Bytes
     from vplog.info import Preflight
 
-_PICTURE_PX = 480
-"""px across a picture: a phone's width, and half of a column on a screen."""
 _QUALITY = 75
 """Of the JPEG: pictures to recognise a place by, of some 20 kB each."""
 _STYLE = """
@@ -109,10 +107,6 @@ def _pictures(pictures: list[tuple[int, Bytes]], start_ns: int) -> Iterator[str]
 
 def _source(image: Bytes) -> str:
     """A picture as a data URL."""
-    height, width = image.shape
-    if width > _PICTURE_PX:
-        size = _PICTURE_PX, max(round(height * _PICTURE_PX / width), 1)
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
     data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 

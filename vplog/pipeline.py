@@ -153,7 +153,7 @@ class Run:
 
 
 def run(
-    path: Path,
+    path: Path | Sequence[Path],
     out: Path,
     pipeline: Pipeline,
     library: Path | None = None,
@@ -164,10 +164,10 @@ def run(
 ) -> Run:
     """Drive in, run folder out. Raises VplogError with one line where that cannot be.
 
-    The features of the keyframes go to the store given, for who needs them afterwards, or to one that goes with the
-    run.
+    `path` is a log, or several that are the parts of one recording, in any order. The features of the keyframes go to
+    the store given, for who needs them afterwards, or to one that goes with the run.
     """
-    log = logs.open(path, topics)
+    log = logs.open_drive(record.files_of(path), topics)
     watch, warnings = Watch(), []
     check_library(library, pipeline)
     record.begin_folder(out, pipeline, path, threads)

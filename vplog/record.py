@@ -9,16 +9,17 @@ import shutil
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import vplog
+from vplog import logs
 from vplog.data import Verdict
-from vplog.errors import SettingsError
-from vplog.remote import RemotePath
+from vplog.errors import LogError, SettingsError
+from vplog.remote import RemotePath, located
 from vplog.results import run_record
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from vplog.data import Closures, Keyframes, Odometry
@@ -26,7 +27,21 @@ if TYPE_CHECKING:
     from vplog.stages import Log
 
 
-def begin_folder(out: Path, pipeline: Settings, path: Path, threads: int) -> None:
+def files_of(drive: Path | Sequence[Path]) -> list[Path]:
+    """The files of a drive: of one log, or of a recording in several."""
+    return list(drive) if isinstance(drive, list | tuple) else [cast("Path", drive)]
+
+
+def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice | None) -> Log:
+    """The log of a run by its run.json, or the one given in its place. Raises LogError where it is not there."""
+    known = [log] if log is not None else [located(str(part)) for part in account.get("parts") or [account.get("log")]]
+    for path in known:
+        if not path.exists():
+            raise LogError(f"The log of the run, {path}, is not there any more. Say where it is with --log PATH.")
+    return logs.open_drive(known, topics)
+
+
+def begin_folder(out: Path, pipeline: Settings, path: Path | Sequence[Path], threads: int) -> None:
     """Make the run folder, with a run.json that says the run is not finished until it is."""
     if out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
@@ -39,11 +54,13 @@ def begin_folder(out: Path, pipeline: Settings, path: Path, threads: int) -> Non
         shutil.rmtree(out / "library")
 
 
-def head(pipeline: Settings, path: Path, threads: int) -> dict[str, Any]:
+def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[str, Any]:
+    files = [str(file.resolve()) for file in files_of(path)]
     packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
     return {
         "vplog": vplog.__version__,
-        "log": str(path.resolve()),
+        "log": files[0],
+        **({"parts": files} if len(files) > 1 else {}),
         "threads": threads,
         "settings": pipeline.model_dump(mode="json"),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in packages}},
@@ -57,12 +74,16 @@ def _version(package: str) -> str:
         return "unknown"
 
 
-def hash_inputs(path: Path) -> dict[str, str]:
+def hash_inputs(drive: Path | Sequence[Path]) -> dict[str, str]:
     """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole."""
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    result = {}
-    for file in files:
-        name = str(file.relative_to(path)) if path.is_dir() else file.name
+    result: dict[str, str] = {}
+    named = [
+        (str(file.relative_to(path)) if path.is_dir() else file.name, file)
+        for path in files_of(drive)
+        for file in (sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path])
+    ]
+    for own, file in named:
+        name = str(file) if own in result else own
         if isinstance(file, RemotePath):
             result[name] = file.version()
             continue

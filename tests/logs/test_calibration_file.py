@@ -102,6 +102,17 @@ def test_kalibrs_camchain_by_topic_and_by_name(tmp_path: Path) -> None:
     assert (cameras[0].calibration.model, len(cameras[0].calibration.distortion)) == ("plumb_bob", 4)
 
 
+def test_where_the_camera_sits_is_the_logs_word_first(tmp_path: Path) -> None:
+    tree = kalibr()
+    tree["cam0"]["T_cam_imu"] = np.linalg.inv(RIGHT_FROM_LEFT).tolist()
+    topics = TopicChoice(calibration_file=write(tmp_path / "chain.yaml", {"cam0": tree["cam0"]}))
+    drive, placed = Drive(), write_ros2(tmp_path / "placed", ros_messages(Drive(), 2))
+    assert np.allclose(logs.open(placed, topics).camera().body_from_camera, drive.body_from_camera, atol=1e-9)
+    found = [m for m in ros_messages(drive, 2) if m.topic != "/tf_static"]
+    bare = logs.open(write_ros2(tmp_path / "bare", found), topics)
+    np.testing.assert_allclose(bare.camera().body_from_camera, RIGHT_FROM_LEFT, atol=1e-9)
+
+
 def test_camchain_makes_a_pair_without_any_calibration_in_the_log(tmp_path: Path) -> None:
     names = ("/stereo/left/image_raw", "/stereo/right/image_raw")
     tree = kalibr(names)

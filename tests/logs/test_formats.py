@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.containers import Channel
+from vplog.logs.image_folder import ImageFolder
 from vplog.logs.messages import PoseMessage, decode
 from vplog.logs.odometry_message import read_odometry
 from vplog.stages import Log
@@ -166,6 +167,28 @@ def test_image_folder(names: list[str], stamps: list[int], note: str, tmp_path: 
     assert [int(f.decode().image[0, 0]) for f in log.frames(log.stamps())] == [2, 0, 1]
     assert note in " ".join(log.warnings)
     assert (log.camera().matrix, log.camera().width, log.odometry()) == (None, 6, None)
+
+
+def test_damaged_images_of_a_folder_keep_their_time_and_are_counted(tmp_path: Path) -> None:
+    for i in range(6):
+        (tmp_path / f"{i}.png").write_bytes(png(np.full((4, 6), i, np.uint8)))
+    (tmp_path / "0.png").write_bytes((tmp_path / "0.png").read_bytes()[:20])  # the head of an image
+    (tmp_path / "2.png").write_bytes(b"")
+    (tmp_path / "4.png").write_bytes(b"no image")
+    log = logs.open(tmp_path)
+    assert isinstance(log, ImageFolder)
+    assert log.camera().width == 6
+    np.testing.assert_array_equal(log.stamps(), np.array([0, 1, 3, 5]) * 100_000_000)
+    for frame in log.frames(log.stamps()):
+        if frame.stamp_ns:
+            assert frame.decode().image[0, 0] * 100_000_000 == frame.stamp_ns
+        else:
+            with pytest.raises(LogError, match="cannot be decoded"):
+                frame.decode()
+    assert {loss.reason: (loss.messages, loss.of) for loss in log.losses} == {
+        "empty_image": (2, 6),
+        "undecodable_image": (1, 6),
+    }
 
 
 def test_frames_are_given_in_order_of_time_and_only_those_asked_for(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.h264 import FrameNumbers
 from vplog.logs.messages import BadMessageError
-from vplog.logs.video import VideoStream, codec_of
+from vplog.logs.video import VideoStream, codec_of, packet_kind
 
-from .drives import START_NS, store, write_raw
+from .drives import START_NS, Written, store, write_foxglove, write_raw
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +45,7 @@ def pictures() -> list[np.ndarray]:
 
 
 @cache
-def packets(codec: str, b_frames: int = 0) -> list[bytes]:
+def packets(codec: str, b_frames: int = 0, x265: str = "") -> list[bytes]:
     """One payload a frame, in the order of decoding."""
     encoder = av.CodecContext.create(ENCODERS[codec], "w")
     encoder.width, encoder.height, encoder.pix_fmt = WIDTH, HEIGHT, "yuv420p"
@@ -53,7 +53,7 @@ def packets(codec: str, b_frames: int = 0) -> list[bytes]:
     encoder.gop_size, encoder.max_b_frames, encoder.thread_count = GROUP, b_frames, 1
     encoder.options = {
         "h264": {"crf": "12", "tune": "fastdecode" if b_frames else "zerolatency", "bf": str(b_frames)},
-        "hevc": {"crf": "10", "x265-params": f"bframes={b_frames}:keyint={GROUP}:log-level=none:pools=1"},
+        "hevc": {"crf": "10", "x265-params": f"{x265}bframes={b_frames}:keyint={GROUP}:log-level=none:pools=1"},
         "vp9": {"crf": "8", "b": "0", "lag-in-frames": "0", "deadline": "realtime"},
     }[codec]  # fmt: skip
     found = []
@@ -93,6 +93,20 @@ def test_frames_that_come_out_later_than_their_packets(codec: str) -> None:
     video = stream(codec, payloads)
     for row, number in enumerate(order):
         assert close(video.frame(row), number)
+
+
+def test_pictures_that_refer_back_over_a_key_frame() -> None:
+    """Open groups of H.265: what is shown before a key frame and sent behind it needs the group before."""
+    payloads = packets("hevc", 3, "open-gop=1:min-keyint=12:scenecut=0:no-scenecut=1:")
+    order = packets.pts["hevc", 3]  # type: ignore[attr-defined]
+    keys = [row for row, payload in enumerate(payloads) if packet_kind("hevc", payload) >= 3]
+    behind = [row for row in range(keys[1], COUNT) if order[row] < order[max(key for key in keys if key <= row)]]
+    assert behind, "the encoder did make open groups"
+    video = stream("hevc", payloads)
+    for row, number in enumerate(order):
+        assert close(video.frame(row), number)
+    for row in behind:
+        assert close(stream("hevc", payloads).frame(row), order[row])
 
 
 def test_only_stretches_with_frames_of_interest_are_decoded() -> None:
@@ -142,8 +156,9 @@ def test_a_missing_packet_gives_no_wrong_picture(codec: str, b_frames: int) -> N
                 shown.append(number)
             except BadMessageError:
                 continue
-        assert len(shown) >= COUNT - 1 - 2 * GROUP  # nothing is lost but the rest of that stretch
-        assert {0, 1, COUNT - 1} <= set(shown)
+        assert set(order[:missing]) <= set(shown)
+        later = missing // GROUP * GROUP + GROUP + b_frames  # where the next key frame is, and what refers back over it
+        assert set(order[later:]) <= set(shown)
 
 
 @pytest.mark.parametrize("profile", ["baseline", "main", "high", "high10"])
@@ -224,6 +239,23 @@ def test_video_in_a_log(kind: str, tmp_path: Path) -> None:
     wanted = log.stamps()[[1, 14, 15, 33]]
     for frame, row in zip(log.frames(wanted), (1, 14, 15, 33), strict=True):
         assert close(frame.decode().image, row)
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_no_frame_is_lost_where_chunks_end(encoding: str, tmp_path: Path) -> None:
+    """Chunks of one or two packets, more of them between two key frames than are kept unpacked."""
+    found = []
+    for i, payload in enumerate(packets("h264")):
+        stamp = START_NS + i * PERIOD_NS
+        message = foxglove.CompressedVideo(frame_id="camera", data=payload, format="h264")
+        message.timestamp.seconds, message.timestamp.nanos = stamp // 10**9, stamp % 10**9
+        found.append(Written("/video", "foxglove.CompressedVideo", stamp, message))
+    log = logs.open(write_foxglove(tmp_path / "drive.mcap", found, encoding, chunk_size=200))
+    assert len(log.stamps()) == COUNT
+    for frame, row in zip(log.frames(log.stamps()), range(COUNT), strict=True):
+        assert close(frame.decode().image, row)
+    (last,) = log.frames(log.stamps()[[GROUP - 1]])
+    assert close(last.decode().image, GROUP - 1)
 
 
 def test_frames_before_the_first_key_frame_are_left_out_and_counted(tmp_path: Path) -> None:

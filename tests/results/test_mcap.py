@@ -110,17 +110,22 @@ def test_transforms_put_the_body_in_the_map_and_the_camera_on_the_body(tmp_path:
         found = matrix(transform.translation, transform.rotation)
         np.testing.assert_allclose(found, RUN.solution.world_from_body[row], atol=1e-12)
     [(_, static)] = of(messages, "/tf_static")
-    assert (static.transforms[0].parent_frame_id, static.transforms[0].child_frame_id) == ("base_link", "camera")
-    found = matrix(static.transforms[0].translation, static.transforms[0].rotation)
+    root, fixed = static.transforms
+    assert (root.parent_frame_id, root.child_frame_id) == ("tf#/", "map")  # where rerun's 3D view begins
+    np.testing.assert_array_equal(matrix(root.translation, root.rotation), np.eye(4))
+    assert (fixed.parent_frame_id, fixed.child_frame_id) == ("base_link", "camera")
+    found = matrix(fixed.translation, fixed.rotation)
     np.testing.assert_allclose(found, RUN.camera.body_from_camera, atol=1e-12)
 
 
 def test_graph_shows_edges_in_the_colour_of_their_fate(tmp_path: Path) -> None:
     [(_, scene)] = of(decode(write(tmp_path / "result.mcap")), "/graph")
-    odometry, accepted, rejected = scene.entities
+    odometry, accepted, partly, rejected = scene.entities
     assert {entity.frame_id for entity in scene.entities} == {"map"}
     assert len(odometry.lines[0].points) == 2 * RUN.graph.kind.count(EdgeKind.ODOMETRY)
-    for entity, verdict in ((accepted, Verdict.ACCEPTED), (rejected, Verdict.REJECTED_BY_SOLVER)):
+    for entity, verdict in (
+        (accepted, Verdict.ACCEPTED), (partly, Verdict.DIRECTION_ONLY), (rejected, Verdict.REJECTED_BY_SOLVER),
+    ):  # fmt: skip
         row = RUN.closures.verdict.index(verdict)
         ends = RUN.solution.world_from_body[[RUN.closures.match[row], RUN.closures.query[row]], :3, 3]
         np.testing.assert_allclose([[p.x, p.y, p.z] for p in entity.lines[0].points], ends)
@@ -157,7 +162,7 @@ def test_drive_without_closures_or_keyframes(tmp_path: Path, count: int) -> None
     keyframes = Keyframes("short", RUN.keyframes.stamp_ns[:count], RUN.keyframes.odom_from_body[:count])
     graph = dataclasses.replace(RUN.graph, a=RUN.graph.a[:0], b=RUN.graph.b[:0], kind=[])
     write_mcap(tmp_path / "r", keyframes, RUN.solution.world_from_body[:count], graph, nothing, METADATA)
-    assert len(decode((tmp_path / "r").read_bytes())) == (7 if count else 0)
+    assert len(decode((tmp_path / "r").read_bytes())) == (8 if count else 0)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
@@ -180,7 +185,7 @@ def test_rerun_opens_it(tmp_path: Path) -> None:
         ("/path/optimised_points", 1, "Points3D:positions"),
         ("/path/odometry_points", 1, "Points3D:positions"),
         ("/tf", COUNT, "Transform3D:translation"),
-        ("/tf_static", 1, "Transform3D:child_frame"),
+        ("/tf_static", 2, "Transform3D:child_frame"),
         ("/graph", 1, "foxglove.SceneUpdate:message"),
         ("/loop_closures", len(RUN.closures), "vplog.LoopClosure:message"),
     ):

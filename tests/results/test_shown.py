@@ -146,7 +146,8 @@ def test_fixes_and_the_way_on_earth(tmp_path: Path) -> None:
 def test_every_candidate_of_geometry_is_in_the_graph_of_the_rejected(tmp_path: Path) -> None:
     [(_, scene)] = of(decode(write(tmp_path / "r.mcap")), "/graph/rejected")
     rejected = len(RUN.closures) - sum(
-        verdict in (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER) for verdict in RUN.closures.verdict
+        verdict in (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY, Verdict.REJECTED_BY_SOLVER)
+        for verdict in RUN.closures.verdict
     )
     assert len(scene.entities[0].lines[0].points) == 2 * rejected
 

@@ -42,7 +42,7 @@ class CalibratedCamera:
     from_first: Floats | None = None
     """(4, 4) this camera from the first one of the chain; None where the file has no chain."""
     body_from_camera: Floats | None = None
-    """(4, 4), None where the file does not say."""
+    """(4, 4) where the IMU is the body, as EuRoC and Kalibr have it; None where the file does not say."""
 
 
 def read_calibrations(path: Path) -> list[CalibratedCamera]:
@@ -88,7 +88,9 @@ def _cameras(tree: Any) -> list[CalibratedCamera]:
     for number, (name, part) in enumerate(chain):
         step = _pose(part["T_cn_cnm1"]) if "T_cn_cnm1" in part else None
         from_first = from_first if number == 0 else (None if step is None or from_first is None else step @ from_first)
-        found.append(CalibratedCamera(_text(name), _text(part.get("rostopic")), _intrinsics(part), from_first))
+        placed = geometry.inverse(_pose(part["T_cam_imu"])) if "T_cam_imu" in part else None
+        topic = _text(part.get("rostopic"))
+        found.append(CalibratedCamera(_text(name), topic, _intrinsics(part), from_first, placed))
     return found
 
 

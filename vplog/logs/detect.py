@@ -113,7 +113,9 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         raise LogError(f"{problem} Copy the whole bag folder, or give a storage file itself.")
     images = [file for file in files if image_folder.is_image(file)]
     if images:
-        return ImageFolder(path, images, notes, choice)
+        endings = {file.suffix for file in images if file.suffix}
+        damaged = {file for file in files if file.suffix in endings}.difference(images)
+        return ImageFolder(path, [*images, *damaged], notes, choice, damaged)
     found = plural(len(files), "file") if files else "nothing"
     raise LogError(f"{path} holds {found}, but no log and no images. A log is {_KNOWN}.")
 

@@ -18,12 +18,12 @@ from vplog.logs.messages import BadMessageError, ImageMessage
 from vplog.logs.stamps import increasing, rows_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from vplog.data import Bytes, Camera, Gps, Ints, Odometry
     from vplog.logs.containers import Notes
-    from vplog.logs.losses import Loss
+    from vplog.logs.losses import Account, Loss
     from vplog.logs.select import TopicChoice
 
 PERIOD_NS = 100_000_000
@@ -31,6 +31,10 @@ PERIOD_NS = 100_000_000
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM", b"P5", b"P6", b"P2", b"P3")
 _UNITS = ((11, 10**9), (14, 10**6), (17, 10**3), (20, 1))
 """Digits below which a whole number is in s, ms, us, ns, and the ns of that unit; today's have 10, 13, 16, 19."""
+
+
+_TRIED = 10
+"""Images tried for the size of all."""
 
 
 def is_image(path: Path) -> bool:
@@ -67,22 +71,38 @@ class FileFrame:
     stamp_ns: int
     camera: Camera
     path: Path
+    account: Account
+    """Of the folder: what does not decode is counted there."""
 
     def decode(self) -> Frame:
         """Raises LogError where the file is not an image."""
-        return Frame(self.stamp_ns, self.camera, _read(self.path))
+        try:
+            return Frame(self.stamp_ns, self.camera, _read(self.path))
+        except LogError:
+            name, at = self.path.parent.name, self.stamp_ns
+            self.account.add("undecodable_image", {name: 1}, (name, at), [(at, at)])
+            raise
 
 
 class ImageFolder:
     """The images of one folder, in natural order of their names or in order of the times in them."""
 
-    def __init__(self, path: Path, files: list[Path], notes: Notes, choice: TopicChoice) -> None:
+    def __init__(
+        self, path: Path, files: list[Path], notes: Notes, choice: TopicChoice, damaged: Collection[Path] = ()
+    ) -> None:
+        """`damaged` are those of `files` that are named like images, and are none: they had their time all the same."""
         files = sorted(files, key=natural_order)
         times = stamps_of([file.stem for file in files])
         if times is None:
             notes.add(f"The names in {path.name} are not times; its images are taken to be 0.1 s apart.")
             times = [i * PERIOD_NS for i in range(len(files))]
-        stamp_ns, rows = increasing(np.array(times, np.int64), path.name, notes)
+        notes.account.know(path.name, {path.name: len(files)}, min(times))
+        lost = [(time_ns, time_ns) for file, time_ns in zip(files, times, strict=True) if file in damaged]
+        if lost:
+            notes.account.add("empty_image", {path.name: len(lost)}, (path.name, 0), lost)
+        kept = [(file, time_ns) for file, time_ns in zip(files, times, strict=True) if file not in damaged]
+        files = [file for file, _ in kept]
+        stamp_ns, rows = increasing(np.array([time_ns for _, time_ns in kept], np.int64), path.name, notes)
         if len(rows) < len(files):
             notes.account.add("repeated_stamp", {path.name: len(files) - len(rows)}, (path.name, 0), [])
         self._path, self._notes, self._beside = path, notes, Beside(choice, notes)
@@ -102,7 +122,8 @@ class ImageFolder:
 
     def info(self) -> LogInfo:
         count = len(self._files)
-        topic = Topic(self.name, "image", self._files[0].suffix.lstrip(".").lower(), count, "image", True)
+        kind = self._files[0].suffix.lstrip(".").lower()
+        topic = Topic(self.name, "image", kind, count, "image", True, "image", kind)
         start_ns, end_ns = int(self._stamp_ns[0]), int(self._stamp_ns[-1])
         return LogInfo(str(self._path), "images", start_ns, end_ns, count, [topic], self.warnings)
 
@@ -114,7 +135,7 @@ class ImageFolder:
 
     def frames(self, stamp_ns: Ints) -> Iterator[FileFrame]:
         for row in rows_of(self._stamp_ns, stamp_ns, self.name):
-            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row])
+            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row], self._notes.account)
 
     def odometry(self) -> Odometry | None:
         return self._beside.odometry
@@ -124,12 +145,22 @@ class ImageFolder:
 
     @cached_property
     def _camera(self) -> Camera:
-        height, width = _read(self._files[0]).shape
+        height, width = self._first_image().shape
         known = self._beside.camera(self.name)
         camera = camera_of(self.name, known.calibration if known else None, (width, height), self._notes)
         if known is None or known.body_from_camera is None:
             return camera
         return replace(camera, body_from_camera=known.body_from_camera)
+
+    def _first_image(self) -> Bytes:
+        """The first that decodes; raises LogError where none of the first few does."""
+        reason = ""
+        for file in self._files[:_TRIED]:
+            try:
+                return _read(file)
+            except LogError as error:
+                reason = reason or str(error)
+        raise LogError(f"{self._path} has no image that can be decoded. The first: {reason}")
 
 
 def _read(path: Path) -> Bytes:

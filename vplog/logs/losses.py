@@ -90,6 +90,7 @@ class Account:
         """
         if counts is None and (reason, key) in self._settled:
             return
+        spans = [(min(span), max(span)) for span in spans]  # damage may have turned them around
         for topic, count in ({"": None} if counts is None else counts).items():
             self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)
 

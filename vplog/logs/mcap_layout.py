@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 
 from vplog.errors import LogError
 from vplog.logs.compression import KINDS
-from vplog.logs.search import Search
+from vplog.logs.search import MOST_GAPS, Search
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -112,7 +112,7 @@ class _Walk:
                 if data_ended:
                     self.layout.index_cut_at = min(position, self._length)
                     return
-                resumed = self._resume(before, position)
+                resumed = self._resume(before, position) if len(self.layout.gaps) < MOST_GAPS else None
                 if resumed is None:
                     self.layout.cut_at = min(position, self._length)
                     return
@@ -143,6 +143,8 @@ class _Walk:
             self.layout.missing.append(chunk)
 
     def at(self, position: int, length: int) -> bytes:
+        if not 0 <= position < self._length:  # offsets come from the file
+            return b""
         self._file.seek(position)
         return self._file.read(length)
 
@@ -205,9 +207,9 @@ class _Walk:
         """The next record to go on with, where there is none at `position`; the one before, at `before`, may be the
         one whose length is damaged."""
         self._read_summary()
-        known = [offset for offset in self._indexed if offset > before and self.at(offset, 1) == b"\x06"]
         if self._indexed:
-            return min(known, default=self._summary_start)
+            behind = (offset for offset in sorted(self._indexed) if offset > before)
+            return next((offset for offset in behind if self.at(offset, 1) == b"\x06"), self._summary_start)
         start = position if self._whole_chunk(before) else before + 1
         if any(chunk.compression is None for chunk in self.layout.chunks):
             found = self._search.first(_MESSAGE_START, start, self._is_message)

@@ -6,6 +6,7 @@ expected is left to that decoder, which says what is wrong.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 _POSE = 7 + 36
 """Numbers of a pose with covariance: position, quaternion, 6 x 6; the twist behind it has one fewer, 6 + 36."""
 _TWIST = 6 + 36
+_MOST_NAMED = 4096
+"""Bytes that the names of both frames may take here."""
 
 
 def read_odometry(channel: Channel, data: bytes) -> PoseMessage | None:
@@ -35,22 +38,29 @@ def read_odometry(channel: Channel, data: bytes) -> PoseMessage | None:
     # CDR: stamp at byte 4. ROS 1: a sequence number, then the stamp, at byte 4 as well.
     seconds = int.from_bytes(data[4:8], "little", signed=cdr)
     stamp_ns = nanoseconds(seconds, int.from_bytes(data[8:12], "little"))
-    position, names = 12, []
+    numbers_at = len(data) - 8 * (_POSE + _TWIST)
+    names = _names(data[12:numbers_at], cdr) if 12 < numbers_at < _MOST_NAMED else None
+    if names is None:
+        return None
+    numbers = np.frombuffer(data, "<f8", _POSE, numbers_at)
+    return PoseMessage(stamp_ns, names[0], names[1], numbers[:3], numbers[3:7], numbers[7:].reshape(6, 6))
+
+
+@lru_cache(maxsize=16)
+def _names(data: bytes, cdr: bool) -> tuple[str, str] | None:
+    """Frame and child frame, the same in every message of a topic; None where the bytes are not two strings alone."""
+    position, names = 0, []
     for _ in range(2):
         length = int.from_bytes(data[position : position + 4], "little")
         stop = position + 4 + length
         if stop > len(data) or (cdr and (not length or data[stop - 1])):
             return None
         names.append(data[position + 4 : stop - cdr])  # strings end with a zero in CDR only
-        # CDR aligns numbers to their size, counted from behind the encapsulation.
+        # CDR aligns numbers to their size, counted from behind its 4 bytes of encapsulation and 8 of stamp.
         position = stop + (-stop % 4 if cdr else 0)
-    if cdr:
-        position += -(position - 4) % 8
-    if position + 8 * (_POSE + _TWIST) != len(data):
+    if position + (-(position + 8) % 8 if cdr else 0) != len(data):
         return None
     try:
-        frame, child = (name.decode("utf-8") for name in names)
+        return names[0].decode("utf-8"), names[1].decode("utf-8")
     except UnicodeDecodeError:
         return None
-    numbers = np.frombuffer(data, "<f8", _POSE, position)
-    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:7], numbers[7:].reshape(6, 6))

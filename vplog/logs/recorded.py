@@ -174,7 +174,8 @@ class RecordedLog:
         frame, size = self._pictures.first(image, [*content.places], self._path.name)
         known = self._beside_log.camera(image.topic)
         camera = camera_of(image.topic, known.calibration if known else content.calibration, size, notes)
-        if known is not None and known.body_from_camera is not None:
+        named = content.body and frame and content.tree.between(content.body, frame) is not None
+        if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
         elif self.odometry() is not None:
             placed = body_from_camera(content.tree, content.body, frame, notes)

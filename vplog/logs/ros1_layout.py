@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs.compression import KINDS
-from vplog.logs.search import Search
+from vplog.logs.search import MOST_GAPS, Search
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -88,7 +88,7 @@ class _Walk:
             header, start, stop = self._head(position)
             op = number(header, b"op") if header is not None else -1
             if header is None or start > self._length or (stop > self._length and op != _CHUNK):
-                resumed = self._resume(before, position)
+                resumed = self._resume(before, position) if len(self.layout.gaps) < MOST_GAPS else None
                 if resumed is None:
                     self.layout.cut_at = min(position, self._length)
                     return
@@ -113,6 +113,8 @@ class _Walk:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at
 
     def at(self, position: int, length: int) -> bytes:
+        if not 0 <= position < self._length:  # offsets come from the file
+            return b""
         self._file.seek(position)
         return self._file.read(length)
 

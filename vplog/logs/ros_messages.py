@@ -91,10 +91,27 @@ def _video(message: Any) -> Record:
 def _calibration(message: Any) -> Record:
     # ROS 2 made the fields of ROS 1 lower case.
     d, k, p, r = (np.array(getattr(message, n if hasattr(message, n) else n.upper()), np.float64) for n in "dkpr")
+    window, width, height = _window(message)
+    k = window @ k.reshape(3, 3) if k.any() else k.reshape(3, 3)
+    p = window @ p.reshape(3, 4) if p.any() else p.reshape(3, 4)
     return CalibrationMessage(
-        _stamp(message), message.header.frame_id, message.width, message.height, message.distortion_model,
-        d, k.reshape(3, 3), p.reshape(3, 4), r.reshape(3, 3),
-    )  # fmt: skip
+        _stamp(message), message.header.frame_id, width, height, message.distortion_model, d, k, p, r.reshape(3, 3)
+    )
+
+
+def _window(message: Any) -> tuple[Floats, int, int]:
+    """(3, 3) from px of the full image to px of the images as they come, and the width and height of those.
+
+    K and P are of the full image; roi says which part of it is sent, and binning how many px become one.
+    """
+    roi, x, y = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
+    # Pixel centres are whole numbers, so a pixel of n begins half a pixel before the first of them.
+    window = np.array([
+        [1 / x, 0.0, (0.5 - roi.x_offset) / x - 0.5],
+        [0.0, 1 / y, (0.5 - roi.y_offset) / y - 0.5],
+        [0.0, 0.0, 1.0],
+    ])  # fmt: skip
+    return window, (roi.width or message.width) // x, (roi.height or message.height) // y
 
 
 def _odometry(message: Any) -> Record:

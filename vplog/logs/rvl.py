@@ -46,7 +46,7 @@ def _decode(data: Bytes, pixels: Uint16s) -> bool:
         while more:
             if at >= nibbles or shift > 30:
                 return False
-            byte = data[at // 8 * 4 + 3 - at % 8 // 2]
+            byte = np.int64(data[at // 8 * 4 + 3 - at % 8 // 2])
             nibble = byte >> 4 if at % 2 == 0 else byte & 15
             value |= (nibble & 7) << shift
             shift += 3

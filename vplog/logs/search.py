@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 _BLOCK = 2**20
 """Bytes that are searched at once."""
+MOST_GAPS = 1000
+"""Damaged places in one file behind which reading goes on; a file with more is read up to there."""
 _MOST_TRIED = 500_000
 """Places that are looked at in one file, about a second's work; a stranger's file may be made of false ones."""
 

@@ -10,14 +10,14 @@ from vplog.errors import LogError
 from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterable, Iterator
 
     from vplog.logs.containers import Place
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
 """What reading a damaged file raises."""
-_MOST_TRIED = 100_000
+_MOST_TRIED = 20_000
 """Rows that are looked for one by one behind damage: a second's work."""
 _MOST_MISSED = 2_000
 """Rows that may be missing in a row where the last one is not known."""
@@ -30,6 +30,8 @@ class SqliteBag:
         """`name` is what the file is called where something is said of it."""
         self._path, self._name, self._notes = path, name or path.name, notes
         self._damaged = False
+        self._holes: dict[int, int] = {}
+        """The row behind each hole, by the row before it."""
         self._last_row: int | None = None
         """The last that can be read, once that is known to be less than all."""
         log = Path(f"{path}-wal")
@@ -47,9 +49,13 @@ class SqliteBag:
         counts = dict.fromkeys(self._topics.values(), 0)
         times: list[int] = []
         unknown = 0
-        query = "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+        query = "SELECT topic_id, count(*), min(timestamp), max(timestamp), max(rowid) FROM messages GROUP BY topic_id"
         try:
-            rows = self._db.execute(query).fetchall()
+            found = self._db.execute(query).fetchall()
+            last = max((row[4] for row in found), default=0)
+            if sum(row[1] for row in found) > last:  # rows are numbered from 1: damage made the tree a circle
+                raise sqlite3.DatabaseError("rows come again")
+            rows: Iterable[tuple] = [row[:4] for row in found]
         except _DAMAGE:
             rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
         for topic, count, first, last in rows:
@@ -90,6 +96,8 @@ class SqliteBag:
         while True:
             try:
                 for row in self._db.execute(query, [*(topics or []), last]):
+                    if row[0] <= last:
+                        raise sqlite3.DatabaseError("rows come again")
                     last, last_ns = row[0], _integer(row[2])
                     yield row
                 return
@@ -98,10 +106,12 @@ class SqliteBag:
             self._damaged, before, found = True, last, None
             end = self._end_behind(last)
             while found is None and tried < _MOST_TRIED and last < end:
-                tried, last = tried + 1, last + 1
+                tried, last = tried + 1, max(last + 1, self._holes.get(last, 0))
                 found = self._row(last, columns)
                 if found is None and topics is not None:
                     self._lose_data(last, detail)
+            if found is not None and topics is None:
+                self._holes[before] = last
             if found is None:
                 self._last_row = before
                 if topics is None:

@@ -22,6 +22,8 @@ _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
 
 _UNKNOWN = [float("nan")] * 36
+_BLOCK = 2048
+"""Poses that are converted at once: 0.6 MB of covariances."""
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -62,9 +64,13 @@ class PoseTrack:
         stamp_ns, rows = self.stamps.order(self.topic, notes)
         if not len(rows):
             return None
-        values = np.frombuffer(self._poses).reshape(-1, 7)[rows]
-        poses = geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
-        covariance = body_covariance(poses, np.frombuffer(self._covariances).reshape(-1, 6, 6)[rows])
+        poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
+        logged = np.frombuffer(self._poses).reshape(-1, 7), np.frombuffer(self._covariances).reshape(-1, 6, 6)
+        for start in range(0, len(rows), _BLOCK):  # or what is needed on the way would be several times the result
+            part = slice(start, start + _BLOCK)
+            values = logged[0][rows[part]]
+            poses[part] = geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
+            covariance[part] = body_covariance(poses[part], logged[1][rows[part]])
         usable = np.isfinite(covariance).all((1, 2))
         if usable.all():
             return Odometry(stamp_ns, poses, covariance)

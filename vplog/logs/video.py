@@ -36,6 +36,7 @@ MAX_PIXELS = 2**25
 """px of a video frame that is decoded: 8K (7680 x 4320); a decoder keeps up to 16 of them."""
 _DELAY = 64
 """Packets behind a frame that are given to the decoder before the frame counts as lost: H.264 and H.265 reorder 16."""
+_BROKEN = "a video packet between its key frame and it is damaged or missing"
 _START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 _UNSEEN, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
 """What a packet is: not looked at; needs those before it; parameter sets alone; a key frame without, or with them."""
@@ -86,13 +87,22 @@ class VideoStream:
     def _advance(self, row: int) -> None:
         """Give the decoder packets until the frame of this row comes out."""
         running = self._decoder is not None and self._asked <= row
-        key = self._key_before(row, self._next if running else 0)
-        if key is not None or not running:
-            if key is None:
-                raise BadMessageError("no key frame comes before it")
+        key = self._key_before(row, self._next + 1 if running else 0)  # at a key frame that is next, it runs on
+        if key is None and not running:
+            raise BadMessageError("no key frame comes before it")
+        if key is not None:
             if key <= self._damaged <= row:
-                raise BadMessageError("a video packet between its key frame and it is damaged or missing")
+                raise BadMessageError(_BROKEN)
             self._restart(key)
+        self._run(row)
+        if row not in self._ready and key and self._codec == "hevc":
+            # pictures behind a key frame that are shown before it may refer to what comes before it (RASL, H.265 3.114)
+            earlier = self._key_before(key - 1, 0)
+            if earlier is not None and not earlier <= self._damaged <= row:
+                self._restart(earlier)
+                self._run(row)
+
+    def _run(self, row: int) -> None:
         while row not in self._ready and self._next < min(self._count, row + _DELAY):
             self._feed(self._packet(self._next), self._next, row)
             self._next += 1
@@ -103,10 +113,8 @@ class VideoStream:
     def _restart(self, key: int) -> None:
         self._av = _av(self._codec, self._topic)
         self._decoder = self._av.CodecContext.create(self._codec, "r")
-        self._decoder.options = {
-            "err_detect": "explode",
-            "max_pixels": str(MAX_PIXELS),
-        }  # a wrong picture is no picture
+        # a wrong picture is no picture
+        self._decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
         self._decoder.thread_count = 1  # with more, what damage does is a matter of chance
         self._next = key
         self._numbers = FrameNumbers() if self._codec == "h264" else None
@@ -116,29 +124,36 @@ class VideoStream:
                 self._feed(self._packet(row), row, key)
 
     def _feed(self, data: bytes, number: int, row: int) -> None:
-        if not data:  # FFmpeg takes an empty packet for the end
-            self._fail(number, row)
-        if self._numbers is not None and not self._numbers.follows(data):
-            self._fail(number, row)
+        follows = self._numbers is None or self._numbers.follows(data)
+        if not data or not follows:  # FFmpeg takes an empty packet for the end
+            return self._fail(number, row)
         packet = self._av.Packet(data)
         packet.pts = packet.dts = number
-        self._keep(packet, number, row)
+        return self._keep(packet, number, row)
 
     def _keep(self, packet: Any, number: int, row: int) -> None:
         """Decode one packet, None at the end, and keep what comes out from this row on."""
         try:
             for frame in self._decoder.decode(packet):
                 if frame.is_corrupt:
-                    self._fail(number, row)
+                    return self._fail(number, row)
                 if frame.pts is not None and frame.pts >= row:
                     self._ready[frame.pts] = _grey(frame)
         except self._av.error.FFmpegError:
-            self._fail(number, row)
+            return self._fail(number, row)
+        return None
 
     def _fail(self, number: int, row: int) -> None:
-        self._decoder, self._damaged = None, number
+        """Give the decoder up at this packet, with what it held back of those before."""
+        decoder, self._decoder, self._damaged = self._decoder, None, number
+        try:
+            for frame in decoder.decode(None) if decoder is not None else ():
+                if frame.pts is not None and row <= frame.pts < number and not frame.is_corrupt:
+                    self._ready[frame.pts] = _grey(frame)
+        except self._av.error.FFmpegError:
+            pass  # it held nothing
         if row not in self._ready:
-            raise BadMessageError("a video packet between its key frame and it is damaged or missing")
+            raise BadMessageError(_BROKEN)
 
     def _key_before(self, row: int, first: int) -> int | None:
         """The last key frame of rows first..row."""

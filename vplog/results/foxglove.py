@@ -33,8 +33,11 @@ Rgba = tuple[float, float, float, float]
 
 MAP, BODY, CAMERA = "map", "base_link", "camera"
 """Frames: the root, the body, the camera fixed on it."""
+RERUN_ROOT = "tf#/"
+"""The frame that rerun's 3D view begins with; what does not hang on it is not drawn (rerun.io, named transforms)."""
+AT_REST: Part = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 GREY, GREEN, RED, FAINT_RED = (0.6, 0.6, 0.6, 1.0), (0.1, 0.8, 0.2, 1.0), (0.9, 0.1, 0.1, 1.0), (0.9, 0.1, 0.1, 0.25)
-BLUE = (0.2, 0.5, 1.0, 1.0)
+BLUE, AMBER = (0.2, 0.5, 1.0, 1.0), (0.95, 0.7, 0.1, 1.0)
 _LINE_PX = 2.0
 """Lines keep their width on the screen at any zoom."""
 _FONT_PX = 14.0
@@ -78,13 +81,14 @@ def points(stamp_ns: int, poses: Floats, color: Rgba) -> PointCloud:
     return message
 
 
-def transform(stamp_ns: int, parent: str, child: str, part: Part) -> FrameTransforms:
+def transforms(stamp_ns: int, placed: Sequence[tuple[str, str, Part]]) -> FrameTransforms:
+    """Each frame in its parent: (parent, child, pose of the child)."""
     message = FrameTransforms()
-    one = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
-    one.timestamp.FromNanoseconds(stamp_ns)
-    position, quaternion = part
-    one.translation.x, one.translation.y, one.translation.z = position
-    one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w = quaternion
+    for parent, child, (position, quaternion) in placed:
+        one = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+        one.timestamp.FromNanoseconds(stamp_ns)
+        one.translation.x, one.translation.y, one.translation.z = position
+        one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w = quaternion
     return message
 
 

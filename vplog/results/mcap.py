@@ -54,9 +54,12 @@ TOPICS = {
     "/path/odometry": ("foxglove.PosesInFrame", "The odometry, laid on the first solved keyframe."),
     "/path/optimised_points": ("foxglove.PointCloud", "The positions of the same, green."),
     "/path/odometry_points": ("foxglove.PointCloud", "The positions of the same, grey."),
-    "/graph": ("foxglove.SceneUpdate", "Odometry grey, accepted closures green, those the solver rejected red."),
+    "/graph": (
+        "foxglove.SceneUpdate",
+        "Odometry grey, closures green, amber without metres, red where rejected by the solver.",
+    ),
     "/graph/rejected": ("foxglove.SceneUpdate", "Candidates that geometry rejected, faint red."),
-    "/tf_static": ("foxglove.FrameTransforms", "The camera on the body."),
+    "/tf_static": ("foxglove.FrameTransforms", "The camera on the body; and the map in the root of rerun's 3D view."),
     "/tf": ("foxglove.FrameTransforms", "The body in the map, at each keyframe."),
     "/loop_closures": ("vplog.LoopClosure", "The ledger: one message for each candidate, at its query's stamp."),
     FIXES: ("foxglove.LocationFix", "The log's satellite fixes."),
@@ -136,13 +139,14 @@ def _solved(
             yield stamp_ns, "/path/odometry_points", foxglove.points(stamp_ns, drifted, foxglove.GREY)
             yield stamp_ns, "/graph", _graph(stamp_ns, world_from_body, graph, closures)
             yield stamp_ns, "/graph/rejected", _rejected(stamp_ns, world_from_body, closures)
+            fixed = [(foxglove.RERUN_ROOT, foxglove.MAP, foxglove.AT_REST)]
             if camera is not None:
-                [part] = foxglove.parts(camera.body_from_camera[None])
-                yield stamp_ns, "/tf_static", foxglove.transform(stamp_ns, foxglove.BODY, foxglove.CAMERA, part)
+                fixed.append((foxglove.BODY, foxglove.CAMERA, foxglove.parts(camera.body_from_camera[None])[0]))
+            yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
             if shown.earth is not None:
                 tree = geo.feature_collection(shown.earth, world_from_body, keyframes.stamp_ns, closures)
                 yield stamp_ns, EARTH, foxglove.geojson(tree)
-        yield stamp_ns, "/tf", foxglove.transform(stamp_ns, foxglove.MAP, foxglove.BODY, bodies[node])
+        yield stamp_ns, "/tf", foxglove.transforms(stamp_ns, [(foxglove.MAP, foxglove.BODY, bodies[node])])
         for row in rows[first_row[node] : first_row[node + 1]].tolist():
             pose = relative[row], covariance[row]
             yield stamp_ns, "/loop_closures", _loop_closure(loop_closure(), row, closures, *pose, keyframes.stamp_ns)
@@ -216,31 +220,36 @@ class _Channels:
         return self._writer.register_channel(topic, "protobuf", self._schemas[name])
 
 
+_FATES = {
+    "closures accepted": (Verdict.ACCEPTED, foxglove.GREEN),
+    "closures taken without metres": (Verdict.DIRECTION_ONLY, foxglove.AMBER),
+    "closures rejected by the solver": (Verdict.REJECTED_BY_SOLVER, foxglove.RED),
+}
+"""What the solver was given, by what became of it."""
+
+
 def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: Closures) -> SceneUpdate:
-    """Odometry edges grey, accepted closures green, closures that the robust solve rejected red."""
+    """Odometry edges grey, closures in the colour of their fate."""
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
-    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
-    rejected = np.array([verdict == Verdict.REJECTED_BY_SOLVER for verdict in closures.verdict], bool)
     ends = world_from_body[:, :3, 3]
-    named = [
-        ("odometry", np.stack([ends[graph.a[odometry]], ends[graph.b[odometry]]], 1), foxglove.GREY),
-        ("closures accepted", _between(ends, closures, accepted), foxglove.GREEN),
-        ("closures rejected by the solver", _between(ends, closures, rejected), foxglove.RED),
-    ]
+    named = [("odometry", np.stack([ends[graph.a[odometry]], ends[graph.b[odometry]]], 1), foxglove.GREY)]
+    for name, (fate, color) in _FATES.items():
+        rows = [row for row, verdict in enumerate(closures.verdict) if verdict == fate]
+        named.append((name, _between(ends, closures, rows), color))
     return foxglove.lines(stamp_ns, named)
 
 
 def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
     """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
-    kept = (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER)
-    rejected = np.array([verdict not in kept for verdict in closures.verdict], bool)
-    ends = _between(world_from_body[:, :3, 3], closures, rejected)
+    given = {fate for fate, _ in _FATES.values()}
+    rows = [row for row, verdict in enumerate(closures.verdict) if verdict not in given]
+    ends = _between(world_from_body[:, :3, 3], closures, rows)
     return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
 
 
-def _between(positions: Floats, closures: Closures, wanted: Any) -> Floats:
+def _between(positions: Floats, closures: Closures, rows: list[int]) -> Floats:
     """(S, 2, 3) the ends of closures."""
-    return np.stack([positions[closures.match[wanted]], positions[closures.query[wanted]]], axis=1)
+    return np.stack([positions[closures.match[rows]], positions[closures.query[rows]]], axis=1).reshape(-1, 2, 3)
 
 
 def _loop_closure(

@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import re
 import struct
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
+from vplog import geometry
 from vplog.data import Gps
 from vplog.errors import ResultError
+from vplog.results.foxglove import CAMERA
 from vplog.results.mcap import FIXES, PICTURES
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
+
+    from mcap.reader import McapReader
+
+    from vplog.data import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,28 +43,75 @@ class Found:
     gps: Gps | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One picture of the camera."""
+
+    stamp_ns: int
+    image: bytes
+    """JPEG."""
+    matrix: Floats | None
+    """(3, 3) px at the picture's size, None where the camera is not calibrated."""
+    size: tuple[int, int]
+    """Width and height in px, as the calibration says."""
+
+
 def read_pictures(path: Path) -> Found:
     """Of a result.mcap. Raises ResultError where it is not there or damaged."""
     pictures, references, fixes = {}, {}, []
+    with _reading(path) as reader:
+        for attachment in reader.iter_attachments():
+            if named := re.fullmatch(r"reference-(\d{1,6})\.jpg", attachment.name):
+                references[int(named[1])] = attachment.data
+        for _, channel, message in reader.iter_messages(topics=[PICTURES, FIXES]):
+            if channel.topic == FIXES:
+                fixes.append(LocationFix.FromString(message.data))
+                continue
+            picture = CompressedImage.FromString(message.data)
+            if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):
+                pictures[int(named[1])] = picture.data
+    return Found(pictures, references, _gps(fixes) if fixes else None)
+
+
+def read_images(path: Path) -> Iterator[Seen]:
+    """The camera's pictures in order of time, one in memory at a time. Raises ResultError as above."""
+    with _reading(path) as reader:
+        summary = reader.get_summary()
+        topics = [channel.topic for channel in summary.channels.values()] if summary is not None else []
+        wanted = [topic for topic in topics if re.fullmatch(r"/cam/[^/]+/(image|calibration)", topic)]
+        matrix, size = None, (0, 0)
+        for _, channel, message in reader.iter_messages(topics=wanted) if wanted else ():
+            if channel.topic.endswith("/calibration"):
+                camera = CameraCalibration.FromString(message.data)
+                matrix, size = (
+                    np.reshape(camera.K, (3, 3)) if len(camera.K) == 9 else None,
+                    (camera.width, camera.height),
+                )
+            else:
+                yield Seen(message.log_time, CompressedImage.FromString(message.data).data, matrix, size)
+
+
+def read_camera_pose(path: Path) -> Floats | None:
+    """body_from_camera (4, 4), None where the file has none. Raises ResultError as above."""
+    with _reading(path) as reader:
+        for _, _, message in reader.iter_messages(topics=["/tf_static"]):
+            for one in FrameTransforms.FromString(message.data).transforms:
+                if one.child_frame_id == CAMERA:
+                    q, t = one.rotation, one.translation
+                    return geometry.pose(geometry.rotation(np.array([q.x, q.y, q.z, q.w])), np.array([t.x, t.y, t.z]))
+    return None
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[McapReader]:
     try:
         with path.open("rb") as stream:
-            reader = make_reader(stream, validate_crcs=True)
-            for attachment in reader.iter_attachments():
-                if named := re.fullmatch(r"reference-(\d{1,6})\.jpg", attachment.name):
-                    references[int(named[1])] = attachment.data
-            for _, channel, message in reader.iter_messages(topics=[PICTURES, FIXES]):
-                if channel.topic == FIXES:
-                    fixes.append(LocationFix.FromString(message.data))
-                    continue
-                picture = CompressedImage.FromString(message.data)
-                if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):
-                    pictures[int(named[1])] = picture.data
+            yield make_reader(stream, validate_crcs=True)
     except FileNotFoundError:
         raise ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.") from None
     except (OSError, McapError, DecodeError, ValueError, EOFError, struct.error) as error:
         why = (str(error).splitlines() or [type(error).__name__])[0]
         raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again to write it anew.") from None
-    return Found(pictures, references, _gps(fixes) if fixes else None)
 
 
 def _gps(fixes: list[LocationFix]) -> Gps:

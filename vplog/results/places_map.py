@@ -149,7 +149,16 @@ def _described(name: str, kind: pa.DataType) -> dict[str, Any]:
     """How the header tells a column: the type of its numbers and how many, or its own type alone."""
     if _is_bytes(kind):
         return {"name": name, "type": str(kind.value_type), "length": kind.list_size}
-    return {"name": name, "type": str(kind)}
+    return {"name": name, "type": _told(kind)}
+
+
+def _told(kind: pa.DataType) -> str:
+    """A type in words that do not hang on the names of list items, which Parquet changes."""
+    if pa.types.is_struct(kind):
+        return f"({', '.join(f'{_told(part.type)} {part.name}' for part in kind)})"
+    if pa.types.is_fixed_size_list(kind):
+        return f"{_told(kind.value_type)}[{kind.list_size}]"
+    return f"{_told(kind.value_type)}[]" if pa.types.is_list(kind) else str(kind)
 
 
 def _packed(part: pa.Array) -> pa.Array:
@@ -163,7 +172,7 @@ def _packed(part: pa.Array) -> pa.Array:
 
 def _unpacked(part: pa.Array, kind: pa.DataType) -> pa.Array:
     if not _is_bytes(kind):
-        return part
+        return part.cast(kind)
     width = kind.list_size * kind.value_type.bit_width // 8
     data = memoryview(part.buffers()[1])[part.offset * width : (part.offset + len(part)) * width]
     values = np.frombuffer(data, np.dtype(kind.value_type.to_pandas_dtype()).newbyteorder("<"))

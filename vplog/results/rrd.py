@@ -1,4 +1,4 @@
-"""A recording for rerun: both paths, the closures, the moving body, and the places on earth where they are known."""
+"""A recording for rerun: both paths, the closures, the body with its camera, and the way on earth where it is known."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.results.geo import on_earth
+from vplog.results.mcap_read import read_camera_pose, read_images
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,14 +20,18 @@ if TYPE_CHECKING:
     from vplog.results.shown import Earth
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
+_AMBER = (240, 180, 30)
 _APPLICATION = "vplog"
 
 
 def write_rrd(
     path: Path, keyframes: Keyframes, world_from_body: Floats, closures: Closures, before: Trajectory,
-    after: Trajectory, earth: Earth | None,
+    after: Trajectory, earth: Earth | None, result: Path,
 ) -> None:  # fmt: skip
-    """Write with rerun's own SDK. Raises ResultError where it is not installed, or cannot write."""
+    """Write with rerun's own SDK; the camera's pictures are those of the run's result.mcap, `result`.
+
+    Raises ResultError where the SDK is not installed, a file cannot be read, or this one not be written.
+    """
     try:
         import rerun as rr
     except ImportError:
@@ -38,6 +43,7 @@ def write_rrd(
     try:
         recording.save(part)
         _log(recording, rr, keyframes, world_from_body, closures, before, after, earth)
+        _log_camera(recording, rr, result)
         recording.disconnect()
         part.replace(path)
     except OSError as error:
@@ -57,6 +63,7 @@ def _log(
     ends = world_from_body[:, :3, 3]
     for name, verdict, colour in (
         ("accepted", Verdict.ACCEPTED, _GREEN),
+        ("without_metres", Verdict.DIRECTION_ONLY, _AMBER),
         ("rejected_by_solver", Verdict.REJECTED_BY_SOLVER, _RED),
     ):
         rows = [row for row, one in enumerate(closures.verdict) if one == verdict]
@@ -71,3 +78,19 @@ def _log(
         indexes=[rr.TimeColumn("stamp", timestamp=keyframes.stamp_ns.astype("datetime64[ns]"))],
         columns=rr.Transform3D.columns(translation=ends, quaternion=quaternions),
     )
+
+
+def _log_camera(recording: Any, rr: Any, result: Path) -> None:
+    """The camera on the body, and its pictures."""
+    placed = read_camera_pose(result)
+    if placed is not None:
+        transform = rr.Transform3D(translation=placed[:3, 3], mat3x3=placed[:3, :3])
+        recording.log("map/body/camera", transform, static=True)
+    known = False
+    for seen in read_images(result):
+        if seen.matrix is not None and not known:
+            pinhole = rr.Pinhole(image_from_camera=seen.matrix, resolution=seen.size, camera_xyz=rr.ViewCoordinates.RDF)
+            recording.log("map/body/camera", pinhole, static=True)
+            known = True
+        recording.set_time("stamp", timestamp=np.datetime64(seen.stamp_ns, "ns"))
+        recording.log("map/body/camera/image", rr.EncodedImage(contents=seen.image, media_type="image/jpeg"))

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.boxes import boxes_of, references_of, voting_map, windows_of
 from vplog.drawing import as_text, drawn
-from vplog.study.boxes import boxes_of, references_of, voting_map, windows_of
 from vplog.study.experiments import boxed
 from vplog.study.style import explain
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
+    from vplog.boxes import Boxes, BoxState
     from vplog.data import Bytes, Floats
     from vplog.study.bench import Bench
-    from vplog.study.boxes import Boxes, BoxState
     from vplog.study.experiments import Plan
 
 _SHOWN = 4

@@ -9,7 +9,7 @@ import numpy as np
 from vplog.data import Verdict
 from vplog.results.report import charts
 from vplog.results.report.ledger import ledger
-from vplog.results.report.parts import figure, inline, key, part, table, text
+from vplog.results.report.parts import KEPT, figure, inline, key, part, table, text
 
 if TYPE_CHECKING:
     from vplog.results.report.content import Content
@@ -46,7 +46,7 @@ def closures_section(content: Content) -> str:
 def _picture(row: int, content: Content) -> str:
     closures = content.closures
     verdict = closures.verdict[row]
-    kind = "accepted" if verdict is Verdict.ACCEPTED else "rejected"
+    kind = "accepted" if verdict in KEPT else "rejected"
     return (
         f'<figure id="closure-{row}"><img loading="lazy" alt="closure {row}" src="{inline(content.pictures[row])}">'
         f'<figcaption><b class="{kind}">{verdict.value}</b>, closure {row}: keyframe {closures.query[row]} as a return '
@@ -58,7 +58,7 @@ def _picture(row: int, content: Content) -> str:
 def distributions_section(content: Content) -> str:
     """What accepted and rejected candidates differ in, with the thresholds of the settings."""
     closures, settings = content.closures, part(content.record, "settings", "verify")
-    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
+    accepted = np.array([verdict in KEPT for verdict in closures.verdict], bool)
     shown = [
         ("score", closures.score, []),
         ("feature matches", closures.matches, [("least matches", settings.get("min_matches"))]),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import Verdict
+from vplog.results.report.parts import KEPT
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -52,6 +53,7 @@ def ledger(content: Content, pictures: list[int]) -> str:
         "columns": [name for name, _ in columns],
         "rows": list(map(list, zip(*(values for _, values in columns), strict=True))),
         "pictures": pictures,
+        "kept": [verdict.value for verdict in KEPT],
     }
     return (
         "<h3>The ledger</h3>\n"
@@ -68,7 +70,7 @@ def _chosen(content: Content) -> list[int]:
     closures = content.closures
     if len(closures) <= _MOST_ROWS:
         return list(range(len(closures)))
-    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
+    accepted = np.array([verdict in KEPT for verdict in closures.verdict], bool)
     order = np.lexsort((-closures.score.astype(np.float64), ~accepted))
     return sorted(order[:_MOST_ROWS].tolist())
 

@@ -88,6 +88,7 @@ def _loss(loss: dict[str, Any], content: Content) -> list[str]:
 def _trajectory(content: Content) -> str:
     ends = content.world_from_body[:, :3, 3]
     segments = [("yes", _between(ends, content.closures, Verdict.ACCEPTED))]
+    segments.append(("other", _between(ends, content.closures, Verdict.DIRECTION_ONLY)))
     segments.append(("no", _between(ends, content.closures, Verdict.REJECTED_BY_SOLVER)))
     paths = [("before", content.before.world_from_body[:, :3, 3]), ("after", content.after.world_from_body[:, :3, 3])]
     dots = []

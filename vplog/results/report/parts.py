@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Verdict
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+KEPT = (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY)
+"""What the solve took, at least in part."""
 _NAMES = {
     "before": "odometry", "after": "optimised", "truth": "truth", "gps": "GPS fixes", "yes": "accepted closures",
-    "no": "closures the solver rejected",
+    "other": "closures taken without metres", "no": "closures the solver rejected",
 }  # fmt: skip
 
 

@@ -50,7 +50,9 @@ a{color:var(--after)}
 SCRIPT = """
 "use strict";
 (() => {
-  const data = JSON.parse(document.getElementById("ledger").textContent);
+  const source = document.getElementById("ledger");
+  if (!source) return;  // nothing was proposed
+  const data = JSON.parse(source.textContent);
   const body = document.getElementById("rows"), more = document.getElementById("more");
   const filter = document.getElementById("filter"), count = document.getElementById("count");
   const verdict = data.columns.indexOf("verdict"), page = 100;
@@ -61,7 +63,7 @@ SCRIPT = """
       const a = document.createElement("a");
       a.href = "#closure-" + value; a.textContent = value; td.append(a);
     } else if (at === verdict) {
-      td.className = value === "accepted" ? "accepted" : "rejected"; td.textContent = value;
+      td.className = data.kept.includes(value) ? "accepted" : "rejected"; td.textContent = value;
     } else td.textContent = value === null ? "" : value;
     return td;
   };

@@ -1,0 +1,66 @@
+"""Calibrations as ROS sends them, for images that are a window of the sensor or have binned pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vplog.logs.messages import CalibrationMessage
+from vplog.logs.ros_messages import decode_ros
+
+from .drives import store
+
+K = np.array([[800.0, 0, 630.5], [0, 810.0, 470.25], [0, 0, 1]])
+
+
+def decoded(ros: int, roi: tuple[int, int, int, int], binning: tuple[int, int], k: np.ndarray) -> CalibrationMessage:
+    types = store(ros).types
+    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = types["std_msgs/msg/Header"](**({"seq": 0} if ros == 1 else {}), stamp=stamp, frame_id="c")
+    x, y, width, height = roi
+    region = types["sensor_msgs/msg/RegionOfInterest"](
+        x_offset=x, y_offset=y, width=width, height=height, do_rectify=False
+    )
+    p = np.column_stack([k, [-40.0, 0, 0] if k.any() else np.zeros(3)])
+    matrices = {"D": np.zeros(5), "K": k.ravel(), "R": np.eye(3).ravel(), "P": p.ravel()}
+    message = types["sensor_msgs/msg/CameraInfo"](
+        header=header, width=1280, height=960, distortion_model="plumb_bob", binning_x=binning[0],
+        binning_y=binning[1], roi=region,
+        **{name.lower() if ros == 2 else name: value for name, value in matrices.items()},
+    )  # fmt: skip
+    name = "sensor_msgs/msg/CameraInfo"
+    if ros == 2:
+        data, encoding = store(2).serialize_cdr(message, name), "cdr"
+    else:
+        data, encoding = store(1).serialize_ros1(message, name), "ros1"
+    found = decode_ros("sensor_msgs/CameraInfo", encoding, bytes(data))
+    assert isinstance(found, CalibrationMessage)
+    return found
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_the_full_image_is_as_logged(ros: int) -> None:
+    for roi in ((0, 0, 0, 0), (0, 0, 1280, 960)):
+        for binning in ((0, 0), (1, 1)):
+            found = decoded(ros, roi, binning, K)
+            np.testing.assert_array_equal(found.matrix, K)
+            assert (found.width, found.height) == (1280, 960)
+            assert found.projection[0, 3] == -40.0
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_a_window_and_binned_pixels(ros: int) -> None:
+    """The image of a point is where its full-image pixel is in the window, by the areas that pixels cover."""
+    found = decoded(ros, (100, 40, 800, 600), (2, 4), K)
+    assert (found.width, found.height) == (400, 150)
+    point = np.array([0.3, -0.2, 2.0])
+    u, v, _ = K @ point / point[2]
+    expected = [(u + 0.5 - 100) / 2 - 0.5, (v + 0.5 - 40) / 4 - 0.5]
+    np.testing.assert_allclose((found.matrix @ point / point[2])[:2], expected)
+    np.testing.assert_allclose(found.projection[:, :3], found.matrix)
+    # the baseline does not change: P[0, 3] and the focal length scale alike
+    assert found.projection[0, 3] / found.projection[0, 0] == pytest.approx(-40.0 / 800.0)
+
+
+def test_an_uncalibrated_window_stays_uncalibrated() -> None:
+    assert not decoded(2, (100, 40, 800, 600), (2, 2), np.zeros((3, 3))).matrix.any()
