@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import vplog
 from vplog import logs
 from vplog.data import Verdict
-from vplog.errors import LogError, SettingsError
+from vplog.errors import LogError, ResultError, SettingsError
 from vplog.remote import RemotePath, located
 from vplog.results import run_record
 
@@ -33,7 +33,9 @@ def files_of(drive: Path | Sequence[Path]) -> list[Path]:
 
 
 def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice | None) -> Log:
-    """The log of a run by its run.json, or the one given in its place. Raises LogError where it is not there."""
+    """The log of a run by its run.json, or the one given in its place. Raises LogError or ResultError where none is."""
+    if log is None and not isinstance(account.get("log"), str):
+        raise ResultError("The run's run.json lacks log. Run `vplog run` again to write it anew.")
     known = [log] if log is not None else [located(str(part)) for part in account.get("parts") or [account.get("log")]]
     for path in known:
         if not path.exists():

@@ -93,13 +93,13 @@ def speed(path: Path, topic: str, threads: int, rounds: int, bar: float | None) 
     )  # fmt: skip
 
 
-def growth(folder: Path, sizes_gb: tuple[float, float], bar: float) -> Figure:
-    """Peak memory of reading a large log to that of a small one, each in a process of its own."""
+def growth(folder: Path, sizes_gb: tuple[float, float], bar: float, rounds: int = 3) -> Figure:
+    """Peak memory of reading a large log to that of a small one, each time in a process of its own."""
     peaks = []
     for size_gb in sizes_gb:
         path = folder / "drive.mcap"
         write_drive(path, size_gb)
-        peaks.append(statistics.median(_peak_mb(path) for _ in range(3)))
+        peaks.append(statistics.median(_peak_mb(path) for _ in range(rounds)))
         path.unlink()
     facts = {f"peak_mb_at_{size:g}_gb": round(peak, 1) for size, peak in zip(sizes_gb, peaks, strict=True)}
     name = f"peak memory reading {sizes_gb[1]:g} GB / {sizes_gb[0]:g} GB"

@@ -214,6 +214,11 @@ def test_a_damaged_page_of_a_db3_costs_its_rows(page: float, tmp_path: Path) -> 
     outside = lost_by_topic(losses, "cut", "damaged_bytes")
     assert Counter(found) + outside == recorded
     assert sum(outside.values()) <= 12  # rows in one page of 4 kB
+    log = logs.open(folder)
+    assert isinstance(log, RecordedLog)
+    before = log.losses
+    log._container.contents()
+    assert log.losses == before
 
 
 def test_images_without_data_are_counted_and_placed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from vplog.errors import LogError
 from vplog.logs.recorded import RecordedLog
 from vplog.stages import Log
 
-from .drives import Drive, foxglove_messages, ros_messages, write_foxglove, write_raw, write_ros1, write_ros2
+from .drives import START_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_raw, write_ros1, write_ros2
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,8 +81,11 @@ def refusal(*paths: Path) -> str:
 
 def test_what_is_not_one_drive_is_refused(tmp_path: Path) -> None:
     a, b = (KINDS["mcap"](tmp_path, i, part) for i, part in enumerate((FIRST, SECOND)))
-    later = [("/other", "sensor_msgs/msg/Image", "cdr", 2 * 10**18, b"1")]
-    assert "no topic in common" in refusal(a, b, write_raw(tmp_path / "alien.mcap", later))
+    alien = ("/other", "sensor_msgs/msg/Image", "cdr")
+    later = write_raw(tmp_path / "later.mcap", [(*alien, START_NS + 10**10, b"1")])
+    assert "no topic in common" in refusal(a, b, later)
+    next_day = write_raw(tmp_path / "next_day.mcap", [(*alien, START_NS + 86_400 * 10**9, b"1")])
+    assert "24.0 hours lie between" in refusal(a, b, next_day)
     other = KINDS["ros1"](tmp_path, 5, SECOND)
     assert "different kinds (mcap, ros1)" in refusal(a, other)
     assert "no file" in refusal(a, tmp_path / "missing.mcap")

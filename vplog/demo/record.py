@@ -29,6 +29,9 @@ IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"
 DEPTH = "/camera/depth/image_raw/compressedDepth"
 DEPTH_INFO = "/camera/depth/camera_info"
+LEFT = "/camera/left/image_raw/compressed"
+"""The image of a drive with a stereo pair."""
+LEFT_INFO = "/camera/left/camera_info"
 RIGHT = "/camera/right/image_raw/compressed"
 RIGHT_INFO = "/camera/right/camera_info"
 ODOMETRY = "/odom"
@@ -39,6 +42,8 @@ TYPES = {
     CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
     DEPTH: "sensor_msgs/msg/CompressedImage",
     DEPTH_INFO: "sensor_msgs/msg/CameraInfo",
+    LEFT: "sensor_msgs/msg/CompressedImage",
+    LEFT_INFO: "sensor_msgs/msg/CameraInfo",
     RIGHT: "sensor_msgs/msg/CompressedImage",
     RIGHT_INFO: "sensor_msgs/msg/CameraInfo",
     ODOMETRY: "nav_msgs/msg/Odometry",
@@ -217,8 +222,9 @@ def _frames(scene: Scene, pool: ThreadPoolExecutor) -> Iterator[tuple[str, int, 
     for stamp, (left, depth, right) in zip(scene.stamp_ns.tolist(), (first, *rest), strict=True):
         header = _header(stamp, CAMERA_FRAME)
         compressed = TYPES[IMAGE]
-        yield IMAGE, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=left)
-        yield CAMERA_INFO, stamp, _calibration(header, scene.camera)
+        topic, calibration = (LEFT, LEFT_INFO) if baseline_m else (IMAGE, CAMERA_INFO)
+        yield topic, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=left)
+        yield calibration, stamp, _calibration(header, scene.camera)
         if depth is not None:
             yield DEPTH, stamp, _message(compressed, header=header, format="16UC1; compressedDepth png", data=depth)
             yield DEPTH_INFO, stamp, _calibration(header, scene.camera)

@@ -2,70 +2,16 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from vplog import geometry
 from vplog.data import Trajectory
 from vplog.errors import TruthError
+from vplog.tum import read_tum
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-_LINE_LIMIT = 4096
-"""Characters; eight numbers take about 200, and a file without line ends is not read whole."""
-_UNIT_TOLERANCE = 0.1
-"""Rounded quaternions are off by 1e-3 at most; more than this and the columns are something else."""
-_FORMAT = "A line is `timestamp tx ty tz qx qy qz qw` in s and m (TUM)."
-
 
 def read_truth(path: Path) -> Trajectory:
-    """A TUM file: `timestamp tx ty tz qx qy qz qw`, world_from_body, s and m, in any order.
-
-    Blank lines and what follows `#` are skipped, stamps are kept to the ns, the first of equal stamps is kept.
-    Raises TruthError with the number of the first line that does not fit.
-    """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    try:
-        with path.open(encoding="utf-8-sig") as lines:
-            number = 0
-            while line := lines.readline(_LINE_LIMIT):
-                number += 1
-                if len(line) >= _LINE_LIMIT:
-                    raise TruthError(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {_FORMAT}")
-                fields = line.partition("#")[0].split()
-                if fields:
-                    stamp_ns, row = _pose(fields, f"{path}:{number}")
-                    stamps.append(stamp_ns)
-                    rows.append(row)
-    except OSError as error:
-        raise TruthError(f"Cannot read {path}: {error.strerror}. Give a TUM file with --truth.") from None
-    except UnicodeDecodeError:
-        raise TruthError(f"{path} is not text. {_FORMAT}") from None
-    if not rows:
-        raise TruthError(f"{path} holds no pose. {_FORMAT}")
-    stamp_ns, first = np.unique(np.array(stamps, np.int64), return_index=True)
-    values = np.array(rows)[first]
-    return Trajectory(stamp_ns, geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3]))
-
-
-def _pose(fields: list[str], where: str) -> tuple[int, list[float]]:
-    if len(fields) != 8:
-        raise TruthError(f"{where} has {len(fields)} values instead of 8. {_FORMAT}")
-    try:
-        stamp = Decimal(fields[0])
-        row = [float(field) for field in fields[1:]]
-    except (InvalidOperation, ValueError):
-        raise TruthError(f"{where} holds something that is not a number. {_FORMAT}") from None
-    if not stamp.is_finite() or not np.isfinite(row).all():
-        raise TruthError(f"{where} holds a value that is not finite. {_FORMAT}")
-    # 2^63 ns are 9.2e9 s; checked by exponent first, as a Decimal may name a number that no memory can hold.
-    if stamp.adjusted() > 10 or abs(stamp) >= Decimal(2**63) / 10**9:
-        raise TruthError(f"{where}: the stamp {fields[0][:40]} is not in seconds. {_FORMAT}")
-    norm = float(np.linalg.norm(row[3:]))
-    if abs(norm - 1.0) > _UNIT_TOLERANCE:
-        raise TruthError(f"{where}: the quaternion has length {norm:.3g} instead of 1. {_FORMAT}")
-    return int((stamp * 10**9).to_integral_value()), row
+    """A TUM file, world_from_body, s and m, in any order. Raises TruthError with the first line that does not fit."""
+    return Trajectory(*read_tum(path, TruthError, "--truth"))

@@ -28,7 +28,7 @@ def open(path: Path, topics: TopicChoice | None = None) -> Log:
 def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:
     """One drive recorded in several files, given in any order; of one path, the same as `open`.
 
-    Raises LogError where the files overlap in time, differ in kind or have no topic in common.
+    Raises LogError where the files overlap in time, lie far apart, differ in kind or have no topic in common.
     """
     from vplog.logs.detect import open_drive as open_parts
 

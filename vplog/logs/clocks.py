@@ -46,8 +46,8 @@ class Repaired:
     """(M,) bool, false where a stamp is far from those beside it, so that its time is not known."""
     skew_ns: int
     """Of the clock that all are on."""
-    jumps: int
-    """Times that the header's clock was set; the stamps behind each are shifted back by what the log times say."""
+    jumps_ns: list[int]
+    """By how much the header's clock was set each time; the stamps behind are shifted back by as much."""
     log_jumps: int
     """Times that the recorder's clock was set; the stamps are right without it."""
     counts: dict[int, int]
@@ -87,5 +87,5 @@ def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None)
         kept[run] = min(shifted) >= 0 and max(shifted) < 2**63
         if shift and kept[run.start]:
             stamp_ns[run] += shift
-    jumps = sum(a != b for a, b in pairwise(clocks))
+    jumps = [before - behind for before, behind in pairwise(clocks) if before != behind]
     return Repaired(stamp_ns, kept, chosen, jumps, int((apart & steady & ~log_steady).sum()), counts)

@@ -80,15 +80,21 @@ class Account:
     """Messages by topic of each file, as far as anything says."""
     _found: dict[tuple[str, str], dict[tuple[str, int], _Lost]] = field(default_factory=dict)
     _settled: set[tuple[str, tuple[str, int]]] = field(default_factory=set)
+    """Losses that were given their numbers: found again without any, they say nothing new."""
 
     def add(
-        self, reason: str, counts: Mapping[str, int] | None, key: tuple[str, int], spans: list[Span], detail: str = ""
+        self,
+        reason: str,
+        counts: Mapping[str, int] | None,
+        key: tuple[str, int],
+        spans: list[Span],
+        detail: str = "",
     ) -> None:
         """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all.
 
         `key`, a file or topic and a place in it, makes the same loss found again replace itself.
         """
-        if counts is None and (reason, key) in self._settled:
+        if (reason, key) in self._settled and (counts is None or "" in counts):
             return
         spans = [(min(span), max(span)) for span in spans]  # damage may have turned them around
         for topic, count in ({"": None} if counts is None else counts).items():
@@ -120,13 +126,13 @@ class Account:
             return short
         for reason, key, _ in left_open:
             del self._found[reason, ""][key]
-            self._settled.add((reason, key))
         reason, key, _ = left_open[0]
         spans = merged([span for _, _, lost in left_open for span in lost.spans])
         if reason == "cut" and spans and end_ns is not None:
             spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
         detail = " ".join(dict.fromkeys(lost.detail for _, _, lost in left_open))
         self.add(reason, short or {"": 0}, key, spans, detail)
+        self._settled.update((reason, key) for reason, key, _ in left_open)
         return {}
 
     def _outside(self, topic: str, files: Collection[str]) -> int:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _OVERLAP_NS = 10**9
 """ns that one file may reach into the next: recorders split between messages that are a little out of order."""
+_LONGEST_PAUSE_NS = 3600 * 10**9
+"""ns between two files of one drive; who goes on after more than an hour has not kept the odometry running."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Part:
 def in_order_of_time(parts: list[Part]) -> list[Part]:
     """The files with messages by their first log time.
 
-    Raises LogError where they overlap, differ in kind, or have no topic in common that is of use.
+    Raises LogError where they overlap, lie far apart, differ in kind, or have no topic in common that is of use.
     """
     parts = [part for part in parts if part.contents.messages] or parts[:1]
     parts = sorted(parts, key=lambda part: (part.contents.start_ns, part.path))
@@ -42,6 +44,11 @@ def in_order_of_time(parts: list[Part]) -> list[Part]:
         if overlap_ns > _OVERLAP_NS:
             raise LogError(
                 f"{a.path} and {b.path} overlap by {overlap_ns / 1e9:.1f} s, so they are not one drive in parts. "
+                "Run each by itself."
+            )
+        if -overlap_ns > _LONGEST_PAUSE_NS:
+            raise LogError(
+                f"{-overlap_ns / 3.6e12:.1f} hours lie between {a.path} and {b.path}, so they are two drives. "
                 "Run each by itself."
             )
     useful = [{c.topic for c, count in part.contents.counts.items() if count and kind_of(c)} for part in parts]

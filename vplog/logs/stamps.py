@@ -30,6 +30,8 @@ _LATE_NS = 2 * 10**9
 _GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
+_NAMED = 4
+"""Jumps of a clock that are named."""
 
 
 def _numbers() -> array[int]:
@@ -87,9 +89,10 @@ class Stamps:
         found = on_one_clock(header_ns[rows], log_ns[rows], self.common.skew_ns if self.common else None)
         if found is None:
             return self._by_log_times(topic, notes, log_ns, "has header stamps that follow no clock")
-        if found.jumps:
-            times = "once" if found.jumps == 1 else f"{found.jumps} times"
-            notes.add(f"{topic}: the clock of the header stamps was set {times}; the log times tell by how much.")
+        if found.jumps_ns:
+            steps = ", ".join(f"{jump / 1e9:+.3f} s" for jump in found.jumps_ns[:_NAMED])
+            steps += f" and {len(found.jumps_ns) - _NAMED} times more" if len(found.jumps_ns) > _NAMED else ""
+            notes.add(f"{topic}: the clock of the header stamps was set by {steps}; the stamps are shifted back.")
         if found.log_jumps:
             times = plural(found.log_jumps, "place")
             notes.add(f"{topic}: the log times jump in {times}; the header stamps do not, and are used.")
