@@ -240,6 +240,7 @@ def run(
             },
             "descriptor_bits": state.bits,
             "counts": record.counts(log, odometry, keyframes, closures),
+            "losses": record.losses(log),
             "noise": solved.noise_source,
             "solution": {
                 "error_before": solution.error_before,

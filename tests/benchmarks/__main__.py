@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks [mining describe discovery search growth graphs] [--json]`, from the top of the checkout.
+"""`python -m tests.benchmarks [mining describe discovery search growth graphs reading] [--json]`, from the top of the checkout.
 
 Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
 """
@@ -20,6 +20,7 @@ from .discovery import discovery
 from .graphs import graphs
 from .images import drives
 from .mining import describing, mining
+from .reading import LARGE_GB, SMALL_GB, reading
 from .search import free_memory_gb, growth, search
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ MINING_BARS = {"default": 0.40, "fast": 0.25}
 """Mining on one thread, as a share of SIFT."""
 DESCRIBE_BAR = 0.7
 """Frames a second with mining, as a share of those without, on all cores."""
+READING_BARS = (0.9, 1.1)
+"""Least speed as a share of a bare mcap and cv2 loop, and most memory on a large log as a share of that on a small."""
 DISCOVERY_BAR = 1000.0
 """Times faster than the algorithm as the paper lists it."""
 SEARCH_BARS = (4.0, 40.0)
@@ -59,7 +62,7 @@ def main() -> int:
 
 
 def _arguments() -> argparse.Namespace:
-    kinds = ("mining", "describe", "discovery", "search", "growth", "graphs")
+    kinds = ("mining", "describe", "discovery", "search", "growth", "graphs", "reading")
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("what", nargs="*", metavar="WHAT", help=f"of {', '.join(kinds)}; all where none is named")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
@@ -93,6 +96,8 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "growth" in what:
         possible = [size for size in SIZES if size < SIZES[-1] or free_memory_gb() >= LARGEST_NEEDS_GB]
         yield from growth(tuple(possible), BobbSettings(), 20)
+    if "reading" in what:
+        yield from reading(rounds, *READING_BARS, (SMALL_GB, LARGE_GB))
     if "graphs" in what:
         yield from graphs(arguments.seeds, rounds)
 
