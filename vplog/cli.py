@@ -15,12 +15,15 @@ from typing import TYPE_CHECKING, NoReturn
 import vplog
 from vplog.cli_print import (
     Progress,
+    print_answers,
+    print_batch,
     print_comparison,
     print_evaluation,
     print_explanation,
     print_info,
     print_joint,
     print_json,
+    print_map,
     print_optimised,
     print_run,
     print_study,
@@ -309,6 +312,52 @@ def export_map(arguments: argparse.Namespace) -> None:
         print(f"{found['map']}: {found['places']} places of {len(found['drives'])} drives")
 
 
+def batch(arguments: argparse.Namespace) -> None:
+    """Many recorded drives to one map that grows, each drive in a process of its own."""
+    from vplog.batch import run_batch
+    from vplog.errors import ResultError
+
+    with Progress(arguments) as progress:
+        found = run_batch(
+            arguments.logs, arguments.map, _pipeline(arguments), arguments.library, _topics(arguments),
+            arguments.jobs, arguments.threads, progress,
+        )  # fmt: skip
+    if arguments.json:
+        print_json(found)
+    else:
+        print_batch(found)
+    if found["failed"]:
+        raise ResultError(
+            f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
+        )
+
+
+def info_map(arguments: argparse.Namespace) -> None:
+    """The drives, places and library of a map, and what failed."""
+    from vplog.map_query import describe_map
+
+    found = describe_map(arguments.map)
+    if arguments.json:
+        print_json(found)
+    else:
+        print_map(found)
+
+
+def query_map(arguments: argparse.Namespace) -> None:
+    """The places of a map that are most like each view of a log."""
+    from vplog.map_query import query_map as find_places
+
+    with Progress(arguments) as progress:
+        found = find_places(
+            arguments.map, arguments.log, _topics(arguments), arguments.top, arguments.sequence, arguments.output,
+            arguments.threads, progress,
+        )  # fmt: skip
+    if arguments.json:
+        print_json(found)
+    else:
+        print_answers(found)
+
+
 def config(arguments: argparse.Namespace) -> None:
     """Every setting of a pipeline, as YAML that a pipeline file may hold."""
     import yaml
@@ -432,6 +481,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--library", type=_place, metavar="LIB", help="reference library (default: made from the drive)")
     sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
+    _add_batch(add("batch", batch, topics, threads, settings))
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=_place, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
@@ -486,13 +536,41 @@ def _add_results(
     sub.add_argument("run", type=_place, metavar="RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
-    whole = add("map", export_map)
-    maps = whole.add_subparsers(required=True, metavar="VERB")
+    maps = add("map", export_map).add_subparsers(required=True, metavar="VERB")
+    sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
+    sub.set_defaults(verb=info_map)
+    sub.add_argument("map", type=_local, metavar="MAP")
+    text = "where a log's views are in a map"
+    sub = maps.add_parser("query", help=text, description=query_map.__doc__, parents=[common, topics, threads])
+    sub.set_defaults(verb=query_map)
+    sub.add_argument("map", type=_local, metavar="MAP")
+    sub.add_argument("log", type=_place, metavar="LOG")
+    sub.add_argument("--top", type=_at_least_one, default=10, metavar="K", help="places for each view (default: 10)")
+    sub.add_argument(
+        "--sequence", type=_at_least_one, metavar="L", help="views in a window, odd; 1: none (default: as the map's)"
+    )
+    sub.add_argument("-o", "--output", type=Path, metavar="FILE.parquet", help="write the answers")
     text = "the places of one run or many, in one file"
     sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
     sub.set_defaults(verb=export_map)
     sub.add_argument("runs", type=_place, nargs="+", metavar="RUN")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.parquet", help="file to write")
+
+
+def _add_batch(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG", help="a drive each")
+    sub.add_argument("-o", "--map", type=_local, required=True, metavar="MAP", help="folder of the map")
+    sub.add_argument("--jobs", type=_at_least_one, default=1, metavar="N", help="drives at once (default: 1)")
+    sub.add_argument(
+        "--library", type=_place, metavar="LIB", help="reference library (default: the map's, or one of the logs)"
+    )
+
+
+def _local(text: str) -> Path:
+    """A folder that is written to bit by bit, which storage by URL is not."""
+    if "://" in text:
+        raise argparse.ArgumentTypeError("must be a local folder")
+    return Path(text)
 
 
 def _truth_options() -> argparse.ArgumentParser:

@@ -136,6 +136,67 @@ def print_optimised(found: dict[str, Any]) -> None:
     print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
+def print_batch(found: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("drive", "state", box=None, pad_edge=False)
+    table.add_column("seconds", justify="right")
+    table.add_column("error", overflow="fold")
+    for drive in found["drives"]:
+        seconds = f"{drive['seconds']:.1f}" if drive["seconds"] else ""
+        table.add_row(escape(drive["drive"]), drive["state"], seconds, escape(drive["error"]))
+    console(sys.stdout).print(table)
+    print(
+        f"{found['map']}: {len(found['drives'])} drives, {found['failed']} failed, {found['seconds']:.1f} s, "
+        f"{found['jobs']} at once, {found['threads_per_job']} threads each"
+    )
+
+
+def print_map(found: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    known = found["library"]
+    each = "" if found["bytes_per_place"] is None else f", {found['bytes_per_place']:g} bytes a place"
+    print(
+        f"{found['map']}: {len(found['drives'])} drives, {found['places']} places{each}, {found['bytes'] / 1e6:.1f} MB"
+    )
+    print(f"library   {known['hash'] or 'none yet'}, {known['references'] or 0} references")
+    table = Table("drive", box=None, pad_edge=False)
+    for title in ("keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"):
+        table.add_column(title, justify="right")
+    for drive in found["drives"]:
+        counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
+        costs = (f"{value or 0:.1f}" for value in (drive["bytes"] / 1e6, drive["seconds"], drive["peak_memory_mb"]))
+        table.add_row(escape(drive["drive"]), *counts, *costs)
+    console(sys.stdout).print(table)
+    for drive, failure in found["failures"].items():
+        say(f"failed: {drive}: {failure['error']}")
+    for problem in found["problems"]:
+        say(f"warning: {problem}")
+
+
+def print_answers(found: dict[str, Any]) -> None:
+    """The best place of every view; all of them are in the file and in the JSON."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("view", "drive", box=None, pad_edge=False)
+    for title in ("keyframe", "score", "support"):
+        table.add_column(title, justify="right")
+    for answer in found["answers"]:
+        if answer["rank"] == 0:
+            numbers = (str(answer["keyframe"]), f"{answer['score']:.3f}", str(answer["support"]))
+            table.add_row(str(answer["query"]), escape(answer["drive"]), *numbers)
+    console(sys.stdout).print(table)
+    for warning in found["warnings"]:
+        say(f"warning: {warning}")
+    print(f"{found['log']}: {found['answered']} of {found['views']} views are like a place of {found['map']}")
+    if found["written"]:
+        print(f"written   {found['written']}")
+
+
 def print_comparison(found: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks [mining describe discovery search growth graphs reading] [--json]`, from the top of the checkout.
+"""`python -m tests.benchmarks [mining describe discovery search growth graphs reading] [--json]`, from the top.
 
 Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
 """
