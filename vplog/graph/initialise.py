@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _LINEAR_STEPS = 300
 """Conjugate gradients on a linear problem at most: with the chain as preconditioner they end after a step per loop."""
+_ROUGH_STEPS = 50
+"""The same for headings where there are more loops than that: what is left is within the reach of least squares."""
 _LOST_RAD = np.pi / 3.0
 """Noise of the heading, rad, beyond which the chain's whole circles may be wrong: half a circle is three sigmas."""
 _LINEAR_TOLERANCE = 1e-4
@@ -59,15 +61,17 @@ def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     if (1.0 / graph.information[~is_loop(graph), 2, 2]).sum() > _LOST_RAD**2:
         yaw = _turned_least(graph, weight, turn, yaw)
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
-    yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None])[:, 0]
+    many = (np.abs(graph.a - graph.b) != 1).sum() > _LINEAR_STEPS
+    steps = _ROUGH_STEPS if many else _LINEAR_STEPS
+    yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None], steps)[:, 0]
     zero = np.zeros(len(yaw))
     poses = geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
     shift = (poses[graph.a, :2, :2] @ graph.a_from_b[:, :2, 3:])[:, :, 0]
     firmness = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
-    if (np.abs(graph.a - graph.b) != 1).sum() > _LINEAR_STEPS:  # so many loops that factorising is faster
+    if many:  # factorising is faster
         poses[:, :2, 3] = _placed(graph, weight * firmness, shift)
         return poses
-    poses[:, :2, 3] = _spread(graph, weight * firmness, shift, poses[:, :2, 3])
+    poses[:, :2, 3] = _spread(graph, weight * firmness, shift, poses[:, :2, 3], _LINEAR_STEPS)
     return poses
 
 
@@ -112,7 +116,7 @@ def _placed(graph: PoseGraph, firmness: Floats, shift: Floats) -> Floats:
     return np.asarray(gtsam.utilities.extractPoint2(values), np.float64)
 
 
-def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Floats) -> Floats:
+def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Floats, steps: int) -> Floats:
     """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first stays.
 
     Conjugate gradients on the normal equations. The preconditioner is the same problem on the chain of poses alone,
@@ -141,7 +145,7 @@ def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Float
     residual = pull(firmness[:, None] * (difference - values[b] + values[a]))
     direction = step = precondition(residual)
     energy = first = (residual * step).sum(0)
-    for _ in range(_LINEAR_STEPS):
+    for _ in range(steps):
         if (energy <= _LINEAR_TOLERANCE**2 * first).all():
             break
         back = pull(firmness[:, None] * (direction[b] - direction[a]))
