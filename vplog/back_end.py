@@ -9,6 +9,7 @@ import numpy as np
 
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
+from vplog.graph.consistency import is_loop
 from vplog.graph.cross_check import cross_checked
 from vplog.graph.directions import Directions, with_directions
 from vplog.graph.gps_gate import keep_odometry_if_further
@@ -19,13 +20,19 @@ from vplog.graph.satellites import fixes_on
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Closures, Ints, Keyframes, Odometry, PoseGraph, Trajectory
+    from vplog.data import Closures, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
     from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.noise import NoiseSettings
     from vplog.graph.refine import Refined, RefineSettings
     from vplog.graph.satellites import Fixes, GpsSettings
     from vplog.graph.solve import OptimiserSettings
     from vplog.stages import Log
+
+
+_CONTRADICTED = (
+    "The odometry's covariance was not believed: with it no closure is left, and with the drift model {kept} of the "
+    "{count} verified ones agree, so it claims too little."
+)
 
 
 class BackEnd(Protocol):
@@ -62,8 +69,16 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
     """The best trajectory of a drive. Raises GraphError where there is none."""
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
-    solution = consistency.keep_odometry_if_worse(graph, settings.solve(graph))
-    solution = cross_checked(graph, solution, settings.cross_check)
+    solution = solve_gated(graph, settings)
+    if source != "model" and len(rows) and not (solution.weight[is_loop(graph)] > 0.5).any():
+        # a covariance is the least reliable thing in a log; closures that agree with a usual drift speak against it
+        usual = settings.noise.model_copy(update={"source": "model"})
+        modelled, _, _ = edge_covariance(odometry, keyframes.stamp_ns, usual)
+        other, _, _ = build.build_graph(keyframes, modelled, closures)
+        again = solve_gated(other, settings)
+        if kept := int((again.weight[is_loop(other)] > 0.5).sum()):
+            graph, solution, source = other, again, "model"
+            doubts = [*doubts, _CONTRADICTED.format(count=len(rows), kept=kept)]
     if len(lines := without_metres(closures)):
         directions = Directions(
             closures.match[lines].astype(np.int64),
@@ -86,6 +101,12 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
         source,
         doubts + repairs + (fixes.warnings if fixes else []),
     )
+
+
+def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
+    """The robust solution, or the odometry where that cannot be believed."""
+    solution = consistency.keep_odometry_if_worse(graph, settings.solve(graph))
+    return cross_checked(graph, solution, settings.cross_check)
 
 
 def without_metres(closures: Closures) -> Ints:
