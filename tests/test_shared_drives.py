@@ -14,7 +14,7 @@ from vplog.pipeline import Run, load_pipeline, run
 if TYPE_CHECKING:
     from pathlib import Path
 
-GARDENS = ("gardens_day_left", "gardens_day_right", "gardens_night_right")
+GARDENS = ("gardens_day_left", "gardens_night_right")
 
 
 def run_default(log: Path, out: Path) -> Run:
@@ -44,20 +44,20 @@ def uncalibrated(request: pytest.FixtureRequest, shared_data: Path, tmp_path_fac
 
 def test_a_street_passed_again_is_found_and_drift_removed(kitti: dict[str, Any]) -> None:
     assert kitti["ate_before"]["rmse_m"] == pytest.approx(30.8, abs=0.5)
-    assert kitti["ate_after"]["rmse_m"] < 5
+    assert kitti["ate_after"]["rmse_m"] < 2.5
 
 
 def test_street_closures_are_right(kitti: dict[str, Any]) -> None:
     closures = kitti["closures"]
     assert closures["precision"] == 1.0
-    assert closures["recall"] >= 0.6
+    assert closures["recall"] >= 0.9
     assert closures["opposite"] == 0
 
 
 def test_a_hand_held_camera_that_comes_back(seven_scenes: dict[str, Any]) -> None:
-    """The data's own calibration leaves 2 to 3 cm in a relative pose, so 5 cm is what can be asked."""
+    """The data's own calibration leaves 2 to 3 cm in a relative pose."""
     assert seven_scenes["ate_before"]["rmse_m"] == pytest.approx(0.0948, abs=0.002)
-    assert seven_scenes["ate_after"]["rmse_m"] <= 0.05
+    assert seven_scenes["ate_after"]["rmse_m"] <= 0.026
 
 
 def test_without_calibration_there_is_no_metric_closure(uncalibrated: Run) -> None:
