@@ -334,7 +334,7 @@ def batch(arguments: argparse.Namespace) -> None:
 
 def info_map(arguments: argparse.Namespace) -> None:
     """The drives, places and library of a map, and what failed."""
-    from vplog.map_query import describe_map
+    from vplog.map_info import describe_map
 
     found = describe_map(arguments.map)
     if arguments.json:

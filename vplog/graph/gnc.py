@@ -85,9 +85,10 @@ class GncSettings(Settings):
         scrutiny = Scrutiny(factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations)
         state = scrutiny(weight, poses)
         kept = int(state.weight[loops].sum())
+        taken = "1 stage" if stages == 1 else f"{stages} stages"
         found = (
             f"{kept} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. {apart} "
-            f"did not agree with it at first; {stages} stages and a look at what each costs the others decided. "
+            f"did not agree with it at first; {taken} and a look at what each costs the others decided. "
         )
         return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 

@@ -50,7 +50,7 @@ def solve_kept(
         error_after=half_chi2(graph, weight, fit.world_from_body),
         iterations=fit.iterations,
         converged=fit.converged,
-        reason=f"{found}Least squares {end} after {fit.iterations} iterations.",
+        reason=f"{found}Least squares {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
     )
 
 

@@ -47,5 +47,5 @@ def solve_robustly(
         iterations=fit.iterations,
         converged=fit.converged,
         reason=f"{kept} of {len(loops)} closures have more than half their weight. "
-        f"Robust least squares {end} after {fit.iterations} iterations.",
+        f"Robust least squares {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
     )
