@@ -536,7 +536,7 @@ def _add_results(
     sub.add_argument("run", type=_place, metavar="RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
-    maps = add("map", export_map).add_subparsers(required=True, metavar="VERB")
+    maps = add("map", info_map).add_subparsers(required=True, metavar="VERB")
     sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
     sub.set_defaults(verb=info_map)
     sub.add_argument("map", type=_local, metavar="MAP")

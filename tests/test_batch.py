@@ -1,0 +1,184 @@
+"""Drives into a map: the same bytes for any number of jobs and after any kill, and nothing done twice."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import duckdb
+import pytest
+
+from vplog import map_store
+from vplog.batch import run_batch
+from vplog.demo import SMALL, make_drive
+from vplog.errors import LibraryError, SettingsError
+from vplog.pipeline import build_library, load_pipeline
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+    from typing import Any
+
+    from conftest import Said
+
+TINY = SMALL.model_copy(update={"laps": 1.2, "frame_rate_hz": 1.5, "width": 320, "height": 180})
+"""About 25 frames."""
+QUICK = (
+    "features.max_features=300", "library.size=10", "library.seed=1", "pictures.closures=0", "pictures.megapixels=0",
+    "propose.per_query=1", "propose.gap_keyframes=15", "propose.gap_steps=15",
+)  # fmt: skip
+OPTIONS = [option for one in QUICK for option in ("--set", one)]
+
+
+def files(root: Path) -> dict[str, tuple[int, str]]:
+    """Inode and sha256 of every file that is not hidden, by name."""
+    return {
+        str(path.relative_to(root)): (path.stat().st_ino, hashlib.sha256(path.read_bytes()).hexdigest())
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+def tables(root: Path) -> dict[str, str]:
+    return {name: digest for name, (_, digest) in files(root).items() if name.endswith(".parquet")}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two drives of one name, in folders of their own."""
+    folder = tmp_path_factory.mktemp("logs")
+    return [
+        make_drive(folder / name, TINY.model_copy(update={"seed": SMALL.seed + number}), 1).log
+        for number, name in enumerate("ab")
+    ]
+
+
+@pytest.fixture(scope="module")
+def whole(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of both at once, one after the other."""
+    root = tmp_path_factory.mktemp("whole") / "map"
+    told = run_batch(logs, root, load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "computed"), ("drive-2", "computed")]
+    return root
+
+
+def test_duckdb_reads_every_table_by_drive(whole: Path) -> None:
+    for name in map_store.TABLES:
+        counted = f"select drive, count(*) from '{whole}/{name}/*/*.parquet' group by 1 order by 1"  # noqa: S608
+        rows = duckdb.execute(counted).fetchall()
+        assert [drive for drive, _ in rows] == ["drive", "drive-2"], name
+        assert all(count > 0 for _, count in rows)
+    own = duckdb.execute(
+        f"select distinct drive from read_parquet('{whole}/keyframes/*/*.parquet', hive_partitioning = false)"  # noqa: S608
+    ).fetchall()
+    assert sorted(own) == [("drive",), ("drive-2",)]
+    assert (whole / "closures/drive=drive/closures.parquet").samefile(whole / "runs/drive=drive/closures.parquet")
+
+
+def test_a_map_grows_by_its_new_drives_alone(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    """With two jobs, the library given, one drive after the other and a bad one between: the bytes of one batch."""
+    [library] = (whole / "libraries").iterdir()
+    root, bad = tmp_path / "map", tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+    verb("batch", logs[0], "-o", root, "--library", library, "--threads", 2, *OPTIONS)
+    before = files(root)
+    said = verb("batch", *logs, bad, tmp_path / "gone.bag", "-o", root, "--jobs", 2, "--threads", 2, "--json", *OPTIONS)
+    assert said.code == 1
+    assert "2 of 4 drives failed" in said.err
+    told = json.loads(said.out)
+    assert [one["state"] for one in told["drives"]] == ["unchanged", "computed", "failed", "failed"]
+    assert tables(root) == tables(whole)
+
+    after = files(root)
+    new = {name for name in after if after[name] != before.get(name)}
+    assert new - {"failures.json"} == {name for name in after if "drive=drive-2/" in name}
+    assert set(before) <= set(after)
+    failures = json.loads((root / "failures.json").read_text())
+    assert list(failures) == ["bad", "gone"]
+    assert "which no log does" in failures["bad"]["error"]
+
+    assert verb("batch", *logs, "-o", root, "--json", *OPTIONS).json["failed"] == 0  # the bad ones are not given
+    assert files(root) == after
+
+
+def test_what_is_missing_or_changed_is_done_again(
+    whole: Path, logs: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = load_pipeline("default", QUICK)
+    before = files(whole)
+    asked: list[str] = []
+
+    def refuse(task: Any) -> tuple[Any, float, str]:
+        asked.append(task.drive)
+        return task, 1.0, "not now"
+
+    monkeypatch.setattr("vplog.batch.in_process", refuse)
+    (whole / "edges" / "drive=drive" / "edges.parquet").unlink()
+    assert run_batch(logs, whole, pipeline)["failed"] == 0
+    assert asked == []
+    assert tables(whole) == {name: digest for name, (_, digest) in before.items() if name.endswith(".parquet")}
+
+    assert run_batch(logs[::-1], whole, pipeline)["failed"] == 0, "in another order they keep their names"
+    changed = load_pipeline("default", [*QUICK, "propose.per_query=2"])
+    told = run_batch(logs[:1], whole, changed)
+    assert [(one["state"], one["error"]) for one in told["drives"]] == [("failed", "not now")]
+    assert asked == ["drive"]
+    monkeypatch.setattr("vplog.map_keys.code_hash", lambda: "other code")
+    assert run_batch(logs, whole, pipeline)["failed"] == 2
+    assert asked[1:] == ["drive", "drive-2"]
+    assert {**files(whole), "map.json": 0, "failures.json": 0}.keys() == {
+        **before,
+        "map.json": 0,
+        "failures.json": 0,
+    }.keys()
+    monkeypatch.undo()
+    assert run_batch(logs, whole, pipeline)["failed"] == 0
+    assert json.loads((whole / "failures.json").read_text()) == {}
+
+
+def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp_path: Path) -> None:
+    pipeline = load_pipeline("default", QUICK)
+    before = files(whole)
+    other = tmp_path / "other"
+    build_library(logs[:1], other, pipeline)
+    with pytest.raises(LibraryError, match="would not compare"):
+        run_batch(logs, whole, pipeline, other)
+    with pytest.raises(LibraryError, match=r"places\.references"):
+        run_batch(logs, whole, load_pipeline("default", [*QUICK, "places.references=5"]))
+    with map_store.writing(whole), pytest.raises(SettingsError, match="Another `vplog batch`"):
+        run_batch(logs, whole, pipeline)
+    with pytest.raises(SettingsError, match="given twice"):
+        run_batch([logs[0], logs[0]], whole, pipeline)
+    (tmp_path / "thesis.txt").write_text("not a map")
+    with pytest.raises(SettingsError, match=r"thesis.txt|other"):
+        run_batch(logs, tmp_path, pipeline)
+    assert files(whole) == before
+
+
+def test_a_killed_batch_leaves_finished_drives_and_goes_on(whole: Path, logs: list[Path], tmp_path: Path) -> None:
+    """Killed while the first drive runs, then once it is in; what is there is whole, and the end is the same."""
+    root, reference = tmp_path / "map", tables(whole)
+    command = [sys.executable, "-m", "vplog", "batch", *map(str, logs), "-o", str(root), "--threads", "1", *OPTIONS]
+    for until in (root / ".staging", root / "runs" / "drive=drive"):
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as batch:
+            while batch.poll() is None and not until.exists():
+                time.sleep(0.02)
+            time.sleep(random.Random(until.name).uniform(0, 1))
+            os.kill(batch.pid, signal.SIGKILL)
+        finished = {folder.name for folder in root.glob("runs/*")}
+        for name, digest in tables(root).items():
+            assert ".staging" in name or digest == reference[name]
+            assert ".staging" in name or "libraries" in name or name.split("/")[1] in finished
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert tables(root) == reference
+    assert not (root / ".staging").exists()

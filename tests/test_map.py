@@ -1,0 +1,199 @@
+"""What is in a map and where a log is in it, on maps put together from one finished run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from typing import TYPE_CHECKING, cast
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from vplog import map_store
+from vplog.map_keys import drive_names
+from vplog.map_query import search
+from vplog.pipeline import load_pipeline
+from vplog.places.sequence import SequenceSettings
+from vplog.results import run_record, tables
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+    from vplog.map_store import Store
+    from vplog.stages import PlaceState
+
+    Verb = Callable[..., Said]
+
+
+def put(store: Store, name: str, run: Path, library: str, rows: slice = slice(None)) -> None:
+    """A copy of a run as a drive of the map, or some of its places."""
+    made = store.staging / name
+    shutil.copytree(run, made, ignore=shutil.ignore_patterns("library"))
+    path = made / "descriptors.parquet"
+    table = pq.read_table(path)
+    order = np.arange(len(table))[rows]
+    header = {**table.schema.metadata, b"vplog.library": library.encode()}
+    pq.write_table(table.take(pa.array(order)).replace_schema_metadata(header), path)
+    about = {"drive": name, "log": f"/logs/{name}.mcap", "key": "k", "library": library, "inputs": {}}
+    run_record.write_run_json(made / "drive.json", about)
+    map_store.publish(store, name, made)
+
+
+@pytest.fixture(scope="module")
+def library(finished: Path) -> str:
+    return json.loads((finished / "library" / "library.json").read_text())["hash"]
+
+
+@pytest.fixture
+def root(finished: Path, library: str, tmp_path: Path) -> Path:
+    """A map of three drives: every place of the run, its second half backwards, and its first ten."""
+    root = tmp_path / "map"
+    with map_store.writing(root) as store:
+        shutil.copytree(finished / "library", store.staging / "library")
+        map_store.add_library(store, store.staging / "library", library)
+        store.write_head(map_store.Head(library, load_pipeline("default").model_dump(mode="json")))
+        for name, rows in (("all", slice(None)), ("back 1/2", slice(None, 20, -1)), ("ten", slice(10))):
+            put(store, name, finished, library, rows)
+    return root
+
+
+def test_a_map_tells_what_is_in_it(root: Path, finished: Path, library: str, verb: Verb) -> None:
+    told = verb("map", "info", root, "--json").json
+    every = len(pq.read_table(finished / "keyframes.parquet"))
+    assert told["library"]["hash"] == library
+    assert {one["drive"]: one["keyframes"] for one in told["drives"]} == {
+        "all": every,
+        "back 1/2": every - 21,
+        "ten": 10,
+    }
+    assert told["places"] == 2 * every - 11
+    sizes = [path.stat().st_size for path in root.glob("descriptors/*/*.parquet")]
+    assert told["descriptor_bytes"] == sum(sizes)
+    assert told["bytes_per_place"] == pytest.approx(sum(sizes) / told["places"], abs=0.1)
+    assert "3 drives" in verb("map", "info", root).out
+    found = duckdb.execute(f"select distinct drive from '{root}/descriptors/*/*.parquet'").fetchall()  # noqa: S608
+    assert sorted(name for (name,) in found) == ["all", "back 1/2", "ten"]
+
+
+def test_a_drive_goes_with_its_folders(root: Path, verb: Verb) -> None:
+    shutil.rmtree(root / "runs" / "drive=ten")
+    told = verb("map", "info", root, "--json").json
+    assert [one["drive"] for one in told["drives"]] == ["all", "back 1/2"]
+    assert sum("drive=ten is of no drive" in problem for problem in told["problems"]) == len(map_store.TABLES)
+    for folder in root.glob("*/drive=ten"):
+        shutil.rmtree(folder)
+    told = verb("map", "info", root, "--json").json
+    assert not any("ten" in problem for problem in told["problems"])
+
+
+def test_the_best_of_the_drives_are_those_of_one_index(root: Path, library: str) -> None:
+    pipeline, store = load_pipeline("default"), map_store.Store(root)
+    state = cast("PlaceState", pipeline.places.load(store.library(library), 1))
+    views = state.from_arrow(tables.read_descriptors(store.run("all") / "descriptors.parquet")[0])
+    names, known, owner, rows = list(store.drives()), [], [], []
+    for number, name in enumerate(names):
+        places = state.from_arrow(tables.read_descriptors(store.run(name) / "descriptors.parquet")[0])
+        known += list(places)
+        owner += [number] * len(places)
+        rows += list(range(len(places)))
+    index = state.index(known)
+    answers = search(store, names, state, library, views, 7, SequenceSettings(length=1), 2)
+    for at, view in enumerate(views):
+        ranking = index.query(view, 7)
+        count = answers.count[at]
+        assert count == len(ranking.rows)
+        assert np.array_equal(answers.score[at, :count], ranking.score)
+        assert answers.drive[at, :count].tolist() == [owner[row] for row in ranking.rows]
+        assert answers.keyframe[at, :count].tolist() == [rows[row] for row in ranking.rows]
+
+
+def test_a_drive_is_found_where_it_is(root: Path, drive: Drive, verb: Verb, tmp_path: Path) -> None:
+    out, query = tmp_path / "placed.parquet", ("map", "query", root, drive.log, "--top", 3, "--sequence", 5)
+    told = verb(*query, "-o", out, "--json", "--threads", 2).json
+    table, digest = pq.read_table(out), hashlib.sha256(out.read_bytes()).hexdigest()
+    assert table.to_pylist() == told["answers"]
+    assert told["answered"] == told["views"] > 30
+    best = [answer for answer in told["answers"] if answer["rank"] == 0]
+    assert all(answer["query_stamp_ns"] == answer["stamp_ns"] for answer in best if answer["drive"] == "all")
+    assert sum(answer["keyframe"] == answer["query"] for answer in best) >= 0.9 * len(best)
+    assert "views are like a place" in verb(*query, "-o", out, "--threads", 1).out
+    assert hashlib.sha256(out.read_bytes()).hexdigest() == digest
+
+
+def test_places_of_another_library_are_refused(root: Path, finished: Path, drive: Drive, verb: Verb) -> None:
+    with map_store.writing(root) as store:
+        put(store, "stranger", finished, "f" * 64)
+    assert "places do not compare" in verb("map", "query", root, drive.log).error
+    assert any("do not compare" in problem for problem in verb("map", "info", root, "--json").json["problems"])
+    shutil.rmtree(root / "runs" / "drive=stranger")
+    path = root / "runs" / "drive=all" / "descriptors.parquet"  # drive.json says one thing, the table another
+    table = pq.read_table(path)
+    path.unlink()
+    pq.write_table(table.replace_schema_metadata({**table.schema.metadata, b"vplog.library": b"e" * 64}), path)
+    assert "places do not compare" in verb("map", "query", root, drive.log).error
+
+
+def test_what_is_no_map_is_one_line(root: Path, drive: Drive, verb: Verb, tmp_path: Path) -> None:
+    assert "is not a map" in verb("map", "info", tmp_path).error
+    assert "is not a map" in verb("map", "query", tmp_path / "gone", drive.log).error
+    record = json.loads((root / "map.json").read_text())
+    for change, why in (({"format": 99}, "format 99"), ({"library": "../.."}, "no sound library")):
+        (root / "map.json").write_text(json.dumps({**record, **change}))
+        assert why in verb("map", "info", root).error
+    (root / "map.json").write_text("{")
+    assert "is not JSON" in verb("map", "info", root).error
+    (root / "map.json").write_text(json.dumps(record))
+    (root / "runs" / "drive=ten" / "drive.json").write_text("[]")
+    assert "drive.json" in verb("map", "info", root).error
+
+
+def test_the_old_run_stays_until_the_new_one_is_there(root: Path, finished: Path, library: str) -> None:
+    """A writer killed between two renames: the next one puts the finished folder in and throws the rest away."""
+    store = map_store.Store(root)
+    store.staging.mkdir()
+    store.run("ten").rename(store.staging / "finished")
+    (store.staging / "half" / ".features").mkdir(parents=True)
+    (root / "edges" / "drive=all" / "edges.parquet").unlink()
+    with map_store.writing(root):
+        assert list(store.drives()) == ["all", "back 1/2", "ten"]
+        assert not any(store.staging.iterdir())
+    assert (root / "edges" / "drive=all" / "edges.parquet").samefile(store.run("all") / "edges.parquet")
+    assert not store.staging.exists()
+
+
+def test_tables_are_copies_where_there_are_no_links(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "no links here")
+
+    store = map_store.Store(root)
+    path, source = store.table("edges", "ten"), store.run("ten") / "edges.parquet"
+    path.unlink()
+    monkeypatch.setattr("os.link", refuse)
+    with map_store.writing(root):
+        copied = path.stat()
+    assert copied.st_ino != source.stat().st_ino
+    assert path.read_bytes() == source.read_bytes()
+    with map_store.writing(root):
+        assert path.stat().st_ino == copied.st_ino, "what holds the same is left as it is"
+
+
+def test_names_are_of_the_log_and_stay() -> None:
+    def named(names: str, paths: str, known: dict[str, tuple[str, str]], inputs: str | None = None) -> list[str]:
+        told = {drive: {"log": log, "inputs": {"f": content}} for drive, (log, content) in known.items()}
+        contents = [{"f": content} for content in (inputs or paths)]
+        return drive_names(list(names), list(paths), told, contents)
+
+    assert named("aab", "123", {}) == ["a", "a-2", "b"]
+    known = {"a": ("1", "x"), "a-2": ("2", "y")}
+    assert named("aa", "21", known) == ["a-2", "a"]
+    assert named("a", "3", known, "y") == ["a-2"], "moved: known by its content"
+    assert named("aa", "31", known, "zz") == ["a-3", "a"], "changed at its place, and a new one"
+    assert named("b", "3", known, "y") == ["b"], "another name is another drive"
