@@ -11,7 +11,7 @@ from vplog.evaluate.closures import ANGLE_DEG, RADIUS_M, _apart, _revisits
 from vplog.evaluate.pairs import poses_at
 
 if TYPE_CHECKING:
-    from vplog.data import Closures, Floats, Ints, Keyframes, Trajectory
+    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes, Trajectory
     from vplog.evaluate.closures import Bools
 
 
@@ -49,7 +49,7 @@ def closure_curves(keyframes: Keyframes, closures: Closures, truth: Trajectory, 
     )
 
 
-def _curve(value: Floats, true: Bools, query: Ints, revisit: Bools) -> Floats:
+def _curve(value: Floats, true: Bools, query: Int32s, revisit: Bools) -> Floats:
     """(P, 3) by falling value; equal values come together, as no threshold can tell them apart."""
     order = np.argsort(-value, kind="stable")
     value, true, query = value[order], true[order], query[order]
