@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.graph.drive import ledger
 from vplog import geometry
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
 from vplog.evaluate.residuals import score_residuals
@@ -26,29 +27,9 @@ def drive(claimed: float = 1.0) -> tuple[Keyframes, Closures, Trajectory]:
     stamps = np.arange(2 * LAP, dtype=np.int64) * 10**9
     match, query = np.arange(LAP, dtype=np.int32), np.arange(LAP, 2 * LAP, dtype=np.int32)
     z = geometry.between(poses[match], poses[query]) @ geometry.exp(random.normal(size=(LAP, 6)) * SIGMA)
-    zeros, ones, unknown = np.zeros(LAP, np.int32), np.ones(LAP, np.float32), np.full(LAP, np.nan)
-    ledger = Closures(
-        query=query,
-        match=match,
-        rank=zeros,
-        score=ones,
-        support=zeros,
-        shared_references=[np.empty(0, np.uint16)] * LAP,
-        shared_overlap=[np.empty(0, np.float32)] * LAP,
-        matches=zeros,
-        landmarks=zeros,
-        inliers=zeros,
-        spread=ones,
-        reverse_inliers=zeros,
-        scale=["odometry"] * LAP,
-        match_from_query=z,
-        information=np.tile(np.diag(1.0 / (claimed * SIGMA) ** 2), (LAP, 1, 1)),
-        verdict=[Verdict.ACCEPTED] * LAP,
-        residual_before=unknown,
-        residual_after=unknown,
-        weight=unknown,
-    )
-    return Keyframes("laps", stamps, poses), ledger, Trajectory(stamps, poses)
+    information = np.tile(np.diag(1.0 / (claimed * SIGMA) ** 2), (LAP, 1, 1))
+    accepted = replace(ledger(query, match, z), information=information)
+    return Keyframes("laps", stamps, poses), accepted, Trajectory(stamps, poses)
 
 
 @pytest.mark.parametrize("claimed", [0.5, 1.0, 4.0])
@@ -61,16 +42,16 @@ def test_medians_are_the_errors_in_units_of_the_claim(claimed: float) -> None:
 
 
 def test_a_truth_that_is_off_between_the_laps_spoils_the_one_figure_and_not_the_other() -> None:
-    keyframes, ledger, truth = drive()
+    keyframes, closures, truth = drive()
     off = truth.world_from_body.copy()
     off[LAP:, 2, 3] += 1.0
-    found = score_residuals(keyframes, ledger, replace(truth, world_from_body=off))
+    found = score_residuals(keyframes, closures, replace(truth, world_from_body=off))
     assert found.to_truth is not None
     assert found.to_truth > 5
     assert found.to_neighbours == pytest.approx(0.94, rel=0.08)
 
 
 def test_nothing_accepted_is_no_figure() -> None:
-    keyframes, ledger, truth = drive()
-    found = score_residuals(keyframes, replace(ledger, verdict=[Verdict.TOO_FAR] * LAP), truth)
+    keyframes, closures, truth = drive()
+    found = score_residuals(keyframes, replace(closures, verdict=[Verdict.TOO_FAR] * LAP), truth)
     assert (found.closures, found.to_truth, found.pairs, found.to_neighbours) == (0, None, 0, None)
