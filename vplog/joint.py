@@ -105,7 +105,7 @@ def run_joint(
                 ],
                 header,
             )
-            _write_maps(out, drives, joined, topics, paths, header)
+            _write_maps(out, drives, joined, header)
         account = {
             **record.head(pipeline, paths[0], threads),
             "logs": [str(path.resolve()) for path in paths],
@@ -223,8 +223,6 @@ def _write_maps(
     out: Path,
     drives: Sequence[Alone],
     joined: graph_joint.Joined,
-    topics: logs.TopicChoice | None,
-    paths: Sequence[Path],
     header: tables.TableMetadata,
 ) -> None:
     """Of each drive in a map of several, its keyframes and trajectory in the map's frame; of each map its graph."""
@@ -235,9 +233,7 @@ def _write_maps(
         g2o.write_g2o(out / f"map{number}.g2o", refined.graph, refined.solution.world_from_body)
         for member in members:
             alone, poses = drives[member], joined.world_from_body[member]
-            odometry = logs.open(paths[member], topics).odometry()
-            if odometry is None:
-                raise LogError(f"{paths[member]} changed while it was read. Run again.")
+            _, odometry = tables.read_trajectory(alone.folder / "trajectory.parquet")
             trajectory = correct_trajectory(odometry, alone.done.keyframes, poses)
             tables.write_keyframes(alone.folder / "joint_keyframes.parquet", alone.done.keyframes, poses, header)
             tables.write_trajectory(alone.folder / "joint_trajectory.parquet", trajectory, odometry, header)
