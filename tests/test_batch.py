@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import duckdb
 import pytest
 
-from vplog import map_store
 from vplog.batch import run_batch
 from vplog.demo import SMALL, make_drive
 from vplog.errors import LibraryError, SettingsError
+from vplog.maps import store as map_store
 from vplog.pipeline import build_library, load_pipeline
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def test_what_is_missing_or_changed_is_done_again(
     told = run_batch(logs[:1], whole, changed)
     assert [(one["state"], one["error"]) for one in told["drives"]] == [("failed", "not now")]
     assert asked == ["drive"]
-    monkeypatch.setattr("vplog.map_keys.code_hash", lambda: "other code")
+    monkeypatch.setattr("vplog.maps.keys.code_hash", lambda: "other code")
     assert run_batch(logs, whole, pipeline)["failed"] == 2
     assert asked[1:] == ["drive", "drive-2"]
     assert {**files(whole), "map.json": 0, "failures.json": 0}.keys() == {

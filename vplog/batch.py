@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog import logs, map_keys, map_store, record
+from vplog import logs, record
 from vplog.batch_worker import Task, in_process
 from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
+from vplog.maps import keys
+from vplog.maps import store as map_store
 from vplog.pipeline import build_library, check_library
 from vplog.references import PAPER_SIZE
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from vplog.logs import TopicChoice
-    from vplog.map_store import Store
+    from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
 
     Progress = Callable[[str, int, int], None]
@@ -69,13 +71,13 @@ def run_batch(
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
         inputs, errors = _hashed(paths, topics, threads)
-        drives = map_keys.drive_names([_name(path) for path in paths], given, known, inputs)
+        drives = keys.drive_names([_name(path) for path in paths], given, known, inputs)
         done: dict[str, Drive] = {}
         tasks = []
         alike = _alike(pipeline, topics, digest)
         for drive, log, content in zip(drives, given, inputs, strict=True):
             about = {"drive": drive, "inputs": content, **alike}
-            about |= {"key": map_keys.key_of(about), "log": log}
+            about |= {"key": keys.key_of(about), "log": log}
             if drive in known and known[drive]["key"] == about["key"] and log not in errors:
                 done[drive] = Drive(drive, log, "unchanged")
             elif log in errors:
@@ -200,9 +202,9 @@ def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, A
     """
     return {
         "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file"}),
-        "settings": map_keys.key_of(pipeline.model_dump(mode="json")),
+        "settings": keys.key_of(pipeline.model_dump(mode="json")),
         "library": library,
-        "code": map_keys.code_hash(),
+        "code": keys.code_hash(),
         "versions": record.head(pipeline, Path(), 1)["versions"],
     }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import math
 import os
 import sys
 from contextlib import ExitStack, contextmanager
@@ -13,17 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import vplog
+from vplog.cli_maps import add_maps
+from vplog.cli_options import at_least, at_least_one, pipeline_of, place, positive, topic_options, topics_of
 from vplog.cli_print import (
     Progress,
-    print_answers,
-    print_batch,
     print_comparison,
     print_evaluation,
     print_explanation,
     print_info,
     print_joint,
     print_json,
-    print_map,
     print_optimised,
     print_run,
     print_study,
@@ -35,13 +33,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from vplog.evaluate.place_truth import TruthChoice
-    from vplog.logs import TopicChoice
-    from vplog.pipeline import Pipeline
 
     Verb = Callable[[argparse.Namespace], None]
 
-_MOST = 10**9
-"""Largest count an option may have: far above any drive, and whole in every number type."""
 _SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
 """The kinds of graph/solve.py, here too since that imports numpy."""
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
@@ -82,18 +76,6 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     sys.exit(0)
 
 
-def _place(text: str) -> Path:
-    """What an argument names: a path, or what is read and written by URL (vplog/remote.py)."""
-    if "://" not in text:
-        return Path(text)
-    from vplog.remote import located
-
-    try:
-        return located(text)
-    except VplogError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 @contextmanager
 def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
     """Run folders and libraries named by URL are copied for the verb; what it writes to one is sent when it is done."""
@@ -125,7 +107,7 @@ def info(arguments: argparse.Namespace) -> None:
     """What is in a log, what would be used, what is wrong, the command to run."""
     from vplog.info import preflight
 
-    found = preflight(arguments.log, _topics(arguments))
+    found = preflight(arguments.log, topics_of(arguments))
     if arguments.html is not None:
         from vplog.info_page import write_page
 
@@ -142,10 +124,10 @@ def library(arguments: argparse.Namespace) -> None:
     """Build a reference library of random frames."""
     from vplog.pipeline import build_library
 
-    pipeline = _pipeline(arguments)
+    pipeline = pipeline_of(arguments)
     with Progress(arguments) as progress:
         state = build_library(
-            arguments.logs, arguments.output, pipeline, _topics(arguments), arguments.threads, progress
+            arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress
         )
     record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
     if arguments.json:
@@ -161,7 +143,7 @@ def run(arguments: argparse.Namespace) -> None:
     """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
     if arguments.gps:
         arguments.set.append("gps.use=true")
-    pipeline, topics = _pipeline(arguments), _topics(arguments)
+    pipeline, topics = pipeline_of(arguments), topics_of(arguments)
     with Progress(arguments) as progress:
         if len(arguments.logs) > 1 and not arguments.one_drive:
             from vplog.joint import run_joint
@@ -187,7 +169,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
     """A run against ground truth."""
     from vplog.evaluation import evaluate as evaluate_run
 
-    found = evaluate_run(arguments.run, arguments.truth, _topics(arguments))
+    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments))
     if arguments.json:
         print_json(found)
     else:
@@ -205,14 +187,14 @@ def compare(arguments: argparse.Namespace) -> None:
             arguments.map,
             split_methods(arguments.methods),
             _truth(arguments),
-            _pipeline(arguments),
+            pipeline_of(arguments),
             library=arguments.library,
             library_size=arguments.library_size,
             library_seed=arguments.library_seed,
             min_gap=arguments.min_gap,
             sequence=arguments.sequence,
             out=arguments.output,
-            topics=_topics(arguments),
+            topics=topics_of(arguments),
             threads=arguments.threads,
             progress=progress,
         )
@@ -232,7 +214,7 @@ def study(arguments: argparse.Namespace) -> None:
         found = run_study(
             arguments.logs,
             _truth(arguments),
-            _pipeline(arguments),
+            pipeline_of(arguments),
             arguments.output,
             methods=METHODS if arguments.methods is None else split_methods(arguments.methods),
             sizes=arguments.sizes,
@@ -240,7 +222,7 @@ def study(arguments: argparse.Namespace) -> None:
             library_size=arguments.library_size,
             min_gap=arguments.min_gap,
             only=arguments.only,
-            topics=_topics(arguments),
+            topics=topics_of(arguments),
             threads=arguments.threads,
             progress=progress,
         )
@@ -282,7 +264,7 @@ def report(arguments: argparse.Namespace) -> None:
     from vplog.retell import report as write_report
 
     found = write_report(
-        arguments.run, arguments.output, arguments.truth, arguments.log, _topics(arguments), arguments.threads
+        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads
     )
     if arguments.json:
         print_json(found)
@@ -301,68 +283,11 @@ def export(arguments: argparse.Namespace) -> None:
         print("\n".join(found["written"]))
 
 
-def export_map(arguments: argparse.Namespace) -> None:
-    """The places of one run or many, in one Parquet file."""
-    from vplog.export import export_map as write_map
-
-    found = write_map(arguments.runs, arguments.output)
-    if arguments.json:
-        print_json(found)
-    else:
-        print(f"{found['map']}: {found['places']} places of {len(found['drives'])} drives")
-
-
-def batch(arguments: argparse.Namespace) -> None:
-    """Many recorded drives to one map that grows, each drive in a process of its own."""
-    from vplog.batch import run_batch
-    from vplog.errors import ResultError
-
-    with Progress(arguments) as progress:
-        found = run_batch(
-            arguments.logs, arguments.map, _pipeline(arguments), arguments.library, _topics(arguments),
-            arguments.jobs, arguments.threads, progress,
-        )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_batch(found)
-    if found["failed"]:
-        raise ResultError(
-            f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
-        )
-
-
-def info_map(arguments: argparse.Namespace) -> None:
-    """The drives, places and library of a map, and what failed."""
-    from vplog.map_info import describe_map
-
-    found = describe_map(arguments.map)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_map(found)
-
-
-def query_map(arguments: argparse.Namespace) -> None:
-    """The places of a map that are most like each view of a log."""
-    from vplog.map_query import query_map as find_places
-
-    with Progress(arguments) as progress:
-        found = find_places(
-            arguments.map, arguments.log, _topics(arguments), arguments.top, arguments.sequence, arguments.output,
-            arguments.threads, progress,
-        )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_answers(found)
-
-
 def config(arguments: argparse.Namespace) -> None:
     """Every setting of a pipeline, as YAML that a pipeline file may hold."""
     import yaml
 
-    tree = _pipeline(arguments).model_dump(mode="json")
+    tree = pipeline_of(arguments).model_dump(mode="json")
     if arguments.json:
         print_json(tree)
     else:
@@ -398,7 +323,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from vplog.pipeline import run as run_pipeline
     from vplog.retell import report as write_report
 
-    pipeline = _pipeline(arguments)
+    pipeline = pipeline_of(arguments)
     _folder(arguments.output)
     with Progress(arguments) as progress:
         progress("render", 0, 1)
@@ -415,31 +340,10 @@ def demo(arguments: argparse.Namespace) -> None:
     print_evaluation(found)
 
 
-def _pipeline(arguments: argparse.Namespace) -> Pipeline:
-    from vplog.pipeline import load_pipeline
-
-    return load_pipeline(arguments.pipeline, arguments.set)
-
-
 def _truth(arguments: argparse.Namespace) -> TruthChoice:
     from vplog.evaluate.place_truth import TruthChoice
 
     return TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
-
-
-def _topics(arguments: argparse.Namespace) -> TopicChoice:
-    from vplog.logs import TopicChoice
-
-    return TopicChoice(
-        image=arguments.image_topic,
-        depth=arguments.depth_topic,
-        right=arguments.right_topic,
-        camera_info=arguments.camera_info_topic,
-        odometry=arguments.odometry_topic,
-        gps=arguments.gps_topic,
-        odometry_file=arguments.odometry_file,
-        calibration_file=arguments.calibration_file,
-    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -448,11 +352,11 @@ def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print one JSON object")
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    topics = _topic_options()
+    topics = topic_options()
     threads = argparse.ArgumentParser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads.add_argument(
-        "--threads", type=_at_least_one, default=cores, metavar="N", help="workers (default: all cores)"
+        "--threads", type=at_least_one, default=cores, metavar="N", help="workers (default: all cores)"
     )
     settings = argparse.ArgumentParser(add_help=False)
     settings.add_argument("--pipeline", default="default", metavar="P", help="shipped name or .yaml file")
@@ -469,21 +373,20 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     def output(sub: argparse.ArgumentParser, text: str) -> None:
-        sub.add_argument("-o", "--output", type=_place, required=True, metavar="OUT", help=text)
+        sub.add_argument("-o", "--output", type=place, required=True, metavar="OUT", help=text)
 
     _add_info(add("info", info, topics))
     sub = add("library", library, topics, threads, settings)
-    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG")
+    sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
     output(sub, "folder of the library")
     sub = add("run", run, topics, threads, settings)
-    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG")
+    sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
     output(sub, "run folder")
-    sub.add_argument("--library", type=_place, metavar="LIB", help="reference library (default: made from the drive)")
+    sub.add_argument("--library", type=place, metavar="LIB", help="reference library (default: made from the drive)")
     sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
-    _add_batch(add("batch", batch, topics, threads, settings))
     sub = add("evaluate", evaluate, topics)
-    sub.add_argument("run", type=_place, metavar="RUN")
+    sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
     sub = add("compare", compare, topics, threads, settings, truth)
     _add_comparison(sub)
@@ -495,7 +398,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
     output(sub, "the graph at its solved poses, as g2o")
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="how false closures are met (default: gnc)")
-    _add_results(add, common, topics, threads)
+    _add_results(add, topics, threads)
+    add_maps(add, common, topics, threads, settings)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
     sub = add("schemas", schemas)
@@ -506,71 +410,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _topic_options() -> argparse.ArgumentParser:
-    topics = argparse.ArgumentParser(add_help=False)
-    for role in ("image", "depth", "right", "camera-info", "odometry", "gps"):
-        topics.add_argument(f"--{role}-topic", metavar="TOPIC", help=f"use this {role} topic")
-    topics.add_argument("--odometry-file", type=_resolved, metavar="FILE.tum", help="use these poses as the odometry")
-    topics.add_argument(
-        "--calibration", type=_resolved, metavar="FILE.yaml", dest="calibration_file",
-        help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml",
-    )  # fmt: skip
-    return topics
-
-
-def _resolved(text: str) -> Path:
-    """A file that run.json names, so that the run is understood from any folder."""
-    return Path(text).resolve()
-
-
 def _add_results(
-    add: Callable[..., argparse.ArgumentParser], common: argparse.ArgumentParser, topics: argparse.ArgumentParser,
-    threads: argparse.ArgumentParser,
-) -> None:  # fmt: skip
+    add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
+) -> None:
     sub = add("report", report, topics, threads)
-    sub.add_argument("run", type=_place, metavar="RUN")
+    sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
-    sub.add_argument("--log", type=_place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
+    sub.add_argument("--log", type=place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="page (default: RUN/report.html)")
     sub = add("export", export)
-    sub.add_argument("run", type=_place, metavar="RUN")
+    sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
-    maps = add("map", info_map).add_subparsers(required=True, metavar="VERB")
-    sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
-    sub.set_defaults(verb=info_map)
-    sub.add_argument("map", type=_local, metavar="MAP")
-    text = "where a log's views are in a map"
-    sub = maps.add_parser("query", help=text, description=query_map.__doc__, parents=[common, topics, threads])
-    sub.set_defaults(verb=query_map)
-    sub.add_argument("map", type=_local, metavar="MAP")
-    sub.add_argument("log", type=_place, metavar="LOG")
-    sub.add_argument("--top", type=_at_least_one, default=10, metavar="K", help="places for each view (default: 10)")
-    sub.add_argument(
-        "--sequence", type=_at_least_one, metavar="L", help="views in a window, odd; 1: none (default: as the map's)"
-    )
-    sub.add_argument("-o", "--output", type=Path, metavar="FILE.parquet", help="write the answers")
-    text = "the places of one run or many, in one file"
-    sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
-    sub.set_defaults(verb=export_map)
-    sub.add_argument("runs", type=_place, nargs="+", metavar="RUN")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.parquet", help="file to write")
-
-
-def _add_batch(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG", help="a drive each")
-    sub.add_argument("-o", "--map", type=_local, required=True, metavar="MAP", help="folder of the map")
-    sub.add_argument("--jobs", type=_at_least_one, default=1, metavar="N", help="drives at once (default: 1)")
-    sub.add_argument(
-        "--library", type=_place, metavar="LIB", help="reference library (default: the map's, or one of the logs)"
-    )
-
-
-def _local(text: str) -> Path:
-    """A folder that is written to bit by bit, which storage by URL is not."""
-    if "://" in text:
-        raise argparse.ArgumentTypeError("must be a local folder")
-    return Path(text)
 
 
 def _truth_options() -> argparse.ArgumentParser:
@@ -581,42 +432,40 @@ def _truth_options() -> argparse.ArgumentParser:
         metavar="FILE.csv|index|FILE.tum[,MAPFILE.tum]|poses|gps",
         help="pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS",
     )
-    sub.add_argument("--tolerance", type=_at_least(0), metavar="N", help="index: frames either side (default: 0)")
-    sub.add_argument("--distance-m", type=_positive, metavar="M", help="poses, gps: same place within (default: 6)")
-    sub.add_argument("--heading-deg", type=_positive, metavar="DEG", help="poses: and turned by less (default: 45)")
+    sub.add_argument("--tolerance", type=at_least(0), metavar="N", help="index: frames either side (default: 0)")
+    sub.add_argument("--distance-m", type=positive, metavar="M", help="poses, gps: same place within (default: 6)")
+    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: and turned by less (default: 45)")
     sub.add_argument(
-        "--min-gap", type=_at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
+        "--min-gap", type=at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
     )
-    sub.add_argument("--library-size", type=_at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
+    sub.add_argument("--library-size", type=at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
     return sub
 
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("log", type=_place, metavar="LOG")
+    sub.add_argument("log", type=place, metavar="LOG")
     sub.add_argument("--html", type=Path, metavar="FILE.html", help="also write a page with pictures of the drive")
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("query", type=_place, metavar="QUERY", help="drive whose frames are looked for")
-    sub.add_argument("map", type=_place, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
+    sub.add_argument("query", type=place, metavar="QUERY", help="drive whose frames are looked for")
+    sub.add_argument("map", type=place, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
     sub.add_argument(
         "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
     )
-    sub.add_argument("--sequence", type=_at_least_one, metavar="L", help="also match sequences of L frames")
-    sub.add_argument(
-        "--library", type=_place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)"
-    )
-    sub.add_argument("--library-seed", type=_at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
+    sub.add_argument("--sequence", type=at_least_one, metavar="L", help="also match sequences of L frames")
+    sub.add_argument("--library", type=place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
+    sub.add_argument("--library-seed", type=at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
     sub.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for compare.json, scores and curves")
 
 
 def _add_study(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=_place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
+    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
     sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
     sub.add_argument(
         "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="of libraries (default: 10,20,50,100)"
     )
-    sub.add_argument("--seeds", type=_at_least_one, default=3, metavar="N", help="libraries a figure (default: 3)")
+    sub.add_argument("--seeds", type=at_least_one, default=3, metavar="N", help="libraries a figure (default: 3)")
     sub.add_argument(
         "--only", type=lambda text: text.split(","), metavar="E,E",
         help="pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)",
@@ -624,7 +473,7 @@ def _add_study(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_explain(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("run", type=_place, metavar="RUN")
+    sub.add_argument("run", type=place, metavar="RUN")
     which = sub.add_mutually_exclusive_group(required=True)
     which.add_argument(
         "--closure", type=_closure, metavar="K|QUERY:MATCH",
@@ -634,7 +483,7 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "-o", "--output", type=Path, metavar="PICTURE.png", help="picture, .png or .svg (default: RUN/closure-K.png)"
     )
-    sub.add_argument("--log", type=_place, metavar="LOG", help="the run's log, where it has moved since")
+    sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
     sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
 
 
@@ -646,27 +495,4 @@ def _closure(text: str) -> tuple[int, ...]:
 
 
 def _counts(text: str) -> tuple[int, ...]:
-    return tuple(_at_least_one(part) for part in text.split(","))
-
-
-def _at_least(least: int) -> Callable[[str], int]:
-    def whole_number(text: str) -> int:
-        value = int(text)
-        if value < least:
-            raise argparse.ArgumentTypeError(f"must be {least} or more")
-        if value > _MOST:
-            raise argparse.ArgumentTypeError(f"must be {_MOST} or less")
-        return value
-
-    return whole_number
-
-
-def _at_least_one(text: str) -> int:
-    return _at_least(1)(text)
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError("must be more than 0")
-    return value
+    return tuple(at_least_one(part) for part in text.split(","))

@@ -7,22 +7,23 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vplog import map_keys, map_store
 from vplog.errors import ResultError
+from vplog.maps import keys
+from vplog.maps import store as map_store
 from vplog.places.stored import read_library_record
 from vplog.results import run_record
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.map_store import Store
+    from vplog.maps.store import Store
 
 
 def describe_map(root: Path) -> dict[str, Any]:
     """Drives, places, bytes, library and failures of a map, without reading a descriptor. Raises ResultError."""
     store = map_store.Store(root)
     head, drives, problems = store.head(), [], []
-    now, other = (map_keys.key_of(head.settings), map_keys.code_hash()), []
+    now, other = (keys.key_of(head.settings), keys.code_hash()), []
     for drive, about in store.drives().items():
         if about["library"] != head.library:
             problems.append(other_library(store, drive, about["library"], head.library))

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from vplog import map_store
-from vplog.map_keys import drive_names
-from vplog.map_query import search
+from vplog.maps import store as map_store
+from vplog.maps.keys import drive_names
+from vplog.maps.query import search
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.demo.record import Drive
-    from vplog.map_store import Store
+    from vplog.maps.store import Store
     from vplog.stages import PlaceState
 
     Verb = Callable[..., Said]

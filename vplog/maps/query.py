@@ -10,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vplog import logs, map_store
+from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.keyframes import select_keyframes
-from vplog.map_info import other_library, row_count
+from vplog.maps import store as map_store
+from vplog.maps.info import other_library, row_count
 from vplog.pipeline import Pipeline
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.results import tables
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Float32s, Int32s, Ints
-    from vplog.map_store import Store
+    from vplog.maps.store import Store
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]

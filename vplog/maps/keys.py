@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import vplog
-from vplog.map_store import sha256_of
+from vplog.maps.store import sha256_of
 from vplog.results import run_record
 
 

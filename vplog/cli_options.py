@@ -1,0 +1,99 @@
+"""What arguments mean: the types of the command line, and the options that several verbs share."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vplog.errors import VplogError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.logs import TopicChoice
+    from vplog.pipeline import Pipeline
+
+_MOST = 10**9
+"""Largest count an option may have: far above any drive, and whole in every number type."""
+
+
+def place(text: str) -> Path:
+    """What an argument names: a path, or what is read and written by URL (vplog/remote.py)."""
+    if "://" not in text:
+        return Path(text)
+    from vplog.remote import located
+
+    try:
+        return located(text)
+    except VplogError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def local(text: str) -> Path:
+    """A folder that is written to bit by bit, which storage by URL is not."""
+    if "://" in text:
+        raise argparse.ArgumentTypeError("must be a local folder")
+    return Path(text)
+
+
+def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
+    from vplog.pipeline import load_pipeline
+
+    return load_pipeline(arguments.pipeline, arguments.set)
+
+
+def topics_of(arguments: argparse.Namespace) -> TopicChoice:
+    from vplog.logs import TopicChoice
+
+    return TopicChoice(
+        image=arguments.image_topic,
+        depth=arguments.depth_topic,
+        right=arguments.right_topic,
+        camera_info=arguments.camera_info_topic,
+        odometry=arguments.odometry_topic,
+        gps=arguments.gps_topic,
+        odometry_file=arguments.odometry_file,
+        calibration_file=arguments.calibration_file,
+    )
+
+
+def topic_options() -> argparse.ArgumentParser:
+    topics = argparse.ArgumentParser(add_help=False)
+    for role in ("image", "depth", "right", "camera-info", "odometry", "gps"):
+        topics.add_argument(f"--{role}-topic", metavar="TOPIC", help=f"use this {role} topic")
+    topics.add_argument("--odometry-file", type=resolved, metavar="FILE.tum", help="use these poses as the odometry")
+    topics.add_argument(
+        "--calibration", type=resolved, metavar="FILE.yaml", dest="calibration_file",
+        help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml",
+    )  # fmt: skip
+    return topics
+
+
+def resolved(text: str) -> Path:
+    """A file that run.json names, so that the run is understood from any folder."""
+    return Path(text).resolve()
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    def whole_number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"must be {least} or more")
+        if value > _MOST:
+            raise argparse.ArgumentTypeError(f"must be {_MOST} or less")
+        return value
+
+    return whole_number
+
+
+def at_least_one(text: str) -> int:
+    return at_least(1)(text)
+
+
+def positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError("must be more than 0")
+    return value
