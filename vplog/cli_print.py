@@ -1,5 +1,4 @@
 """How results look on a terminal: text, tables, progress, and JSON for programs."""
-# ruff: noqa: T201
 
 from __future__ import annotations
 
