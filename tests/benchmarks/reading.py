@@ -48,8 +48,8 @@ def reading(rounds: int, speed_bar: float, growth_bar: float, sizes_gb: tuple[fl
     folder = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[3] / "shared" / "data")) / "drives"
     for name, topic in REAL:
         if (folder / name).exists():
-            yield speed(folder / name, topic, 1, rounds, speed_bar)
-            yield speed(folder / name, topic, os.cpu_count() or 1, rounds, None)
+            for threads in dict.fromkeys((1, os.cpu_count() or 1)):
+                yield speed(folder / name, topic, threads, rounds, speed_bar)
     with tempfile.TemporaryDirectory() as scratch:
         room = os.statvfs(scratch)
         if room.f_bavail * room.f_frsize / 1e9 >= sizes_gb[1] + _SPARE_GB:

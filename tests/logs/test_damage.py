@@ -54,6 +54,19 @@ def test_what_is_no_log(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / "other.db3") as db:
         db.execute("CREATE TABLE other (x)")
     assert "not a ROS 2 bag" in refusal(tmp_path / "other.db3")
+
+
+def test_a_list_of_topics_with_holes_is_read(tmp_path: Path) -> None:
+    """Damage may leave nothing where a name was."""
+    path = write_ros2(tmp_path / "drive", ros_messages(DRIVE, 2), "sqlite3") / "drive.db3"
+    with sqlite3.connect(path) as db:
+        db.execute("CREATE TABLE other AS SELECT * FROM topics")
+        db.execute("DROP TABLE topics")
+        db.execute("ALTER TABLE other RENAME TO topics")
+        db.execute("INSERT INTO topics (id) SELECT id FROM topics")
+        db.execute("INSERT INTO topics (name) SELECT name FROM topics")
+    db.close()
+    np.testing.assert_array_equal(logs.open(path).stamps(), DRIVE.stamp_ns)
     (tmp_path / "packed.mcap").write_bytes(zstandard.compress(b"anything"))
     assert "holds something else than a log" in refusal(tmp_path / "packed.mcap")
 

@@ -44,6 +44,7 @@ def track(*messages: PoseMessage) -> tuple[Odometry | None, str]:
 
 def pose(stamp_ns: int, covariance: Any = None, **fields: Any) -> PoseMessage:
     values = {"position": np.ones(3), "quaternion": QUARTER} | fields
+    covariance = None if covariance is None else np.ravel(covariance)
     return PoseMessage(stamp_ns, "odom", "base_link", covariance=covariance, **values)
 
 

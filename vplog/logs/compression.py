@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import bz2
 import io
+from typing import TYPE_CHECKING
 
 import lz4.frame
 import zstandard
+
+if TYPE_CHECKING:
+    from vplog.logs.containers import Octets
 
 MAX_RATIO = 200
 """Output bytes a chunk may claim per input byte, above the free allowance; images and numbers pack 1 to 20 fold."""
@@ -17,6 +21,11 @@ KINDS = ("", "none", "lz4", "zstd", "bz2")
 
 class BadChunkError(Exception):
     """A chunk's bytes do not unpack as its header says; the message holds the reason."""
+
+    def __init__(self, reason: str, data: bytes = b"") -> None:
+        """`data` is what it unpacked to all the same."""
+        super().__init__(reason)
+        self.data = data
 
 
 def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
@@ -42,6 +51,11 @@ def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
 
 
 def _zstd(data: bytes, size: int) -> bytes:
+    try:
+        if zstandard.frame_content_size(data) == size:  # one frame, as most writers make it
+            return zstandard.ZstdDecompressor().decompress(data)
+    except zstandard.ZstdError:
+        pass  # what there is of a cut one comes out below
     parts, left = [], size
     with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
         while left and (part := stream.read(min(left, 2**20))):
@@ -61,7 +75,7 @@ def _bz2(data: bytes, size: int) -> bytes:
 _DECODERS = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}
 
 
-def unpack_zstd_message(data: bytes) -> bytes:
+def unpack_zstd_message(data: Octets) -> bytes:
     """One zstd frame with its own length, bounded like a chunk. Raises BadChunkError."""
     try:
         size = zstandard.frame_content_size(data)
@@ -69,4 +83,4 @@ def unpack_zstd_message(data: bytes) -> bytes:
         raise BadChunkError(str(error)) from None
     if size < 0:
         raise BadChunkError("a message's zstd frame does not say its length")
-    return unpack("zstd", data, size)
+    return unpack("zstd", bytes(data), size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from vplog.logs.losses import Account
@@ -10,6 +11,8 @@ from vplog.logs.losses import Account
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
+Octets = bytes | memoryview
+"""Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
 Place = tuple[int, ...]
 """Where a message lies in its container; only the container that gave it out can read it."""
 
@@ -29,8 +32,56 @@ class Message(NamedTuple):
 
     channel: Channel
     log_ns: int
-    data: bytes
+    data: Octets
     place: Place
+
+
+class Block(NamedTuple):
+    """Messages that lie in the same bytes, in file order: a chunk's, or one alone. All lists are as long."""
+
+    data: Octets
+    channels: list[Channel]
+    log_ns: list[int]
+    starts: list[int]
+    stops: list[int]
+    places: list[Place]
+
+    def messages(self) -> Iterator[Message]:
+        return map(self.message, range(len(self.channels)))
+
+    def message(self, row: int) -> Message:
+        start, stop = self.starts[row], self.stops[row]
+        data = self.data if stop - start < _COPIED else memoryview(self.data)
+        return Message(self.channels[row], self.log_ns[row], data[start:stop], self.places[row])
+
+
+_COPIED = 4096
+"""Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
+_TOGETHER = 256
+"""Small messages of one block, at most; they take about as long to go through as one call does to set up."""
+
+
+def in_blocks(messages: Iterable[Message]) -> Iterator[Block]:
+    """Blocks of messages that lie in no chunk: small ones together, up to the next large one, which is one alone."""
+    waiting: list[Message] = []
+    for message in messages:
+        large = len(message.data) >= _COPIED
+        if waiting and (large or len(waiting) == _TOGETHER):
+            yield _joined(waiting)
+            waiting.clear()
+        if large:
+            yield _joined([message])
+        else:
+            waiting.append(message)
+    if waiting:
+        yield _joined(waiting)
+
+
+def _joined(messages: list[Message]) -> Block:
+    data = messages[0].data if len(messages) == 1 else b"".join(message.data for message in messages)
+    stops = list(accumulate(len(message.data) for message in messages))
+    channels, log_ns, _, places = (list(column) for column in zip(*messages, strict=True))
+    return Block(data, channels, log_ns, [0, *stops[:-1]], stops, places)
 
 
 @dataclass(frozen=True)
@@ -71,6 +122,11 @@ class Container(Protocol):
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         """The messages of these channels in file order, one in memory at a time."""
+        ...
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        """The same by the bytes they lie in, one block in memory at a time. Large messages of `brief` channels, in the
+        encodings of ROS, may be cut off behind the stamp in their header: they reach beyond the block's bytes."""
         ...
 
     def read(self, place: Place) -> bytes:

@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.containers import Notes, plural
-from vplog.logs.losses import Runs
-from vplog.logs.messages import (
-    BadMessageError,
-    CalibrationMessage,
-    FixMessage,
-    ImageMessage,
-    PoseMessage,
-    TransformMessage,
-    decode,
-    stamp_of,
-)
+from vplog.logs.containers import plural
+from vplog.logs.gather import Gathered, Images
 from vplog.logs.moving import MovingFrames
-from vplog.logs.odometry_message import read_odometry
-from vplog.logs.stamps import NONE, Stamps, nearest, share_clock
+from vplog.logs.stamps import nearest, share_clock
 from vplog.logs.tracks import FixTrack, PoseTrack
 from vplog.logs.transforms import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry
-    from vplog.logs.containers import Channel, Container, Message, Place
+    from vplog.logs.containers import Container, Notes, Place
+    from vplog.logs.messages import CalibrationMessage
     from vplog.logs.select import Selection
 
 
@@ -65,136 +55,26 @@ class Content:
 
 _TOGETHER_NS = 5_000_000
 """ns that the images of a pair may be apart: 5 cm at 10 m/s, a tenth of a usual baseline."""
-_SMALL = 512
-"""Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
-
-
-class _EmptyImageError(BadMessageError):
-    """An image message without an image: cameras that lose a frame may log one."""
-
-
-def _is_empty(message: Message) -> bool:
-    """Raises BadMessageError."""
-    record = decode(message.channel, message.data) if message.data else None
-    return record is None or (isinstance(record, ImageMessage) and not record.data)
-
-
-@dataclass
-class _Images:
-    """Stamps and places of one image topic."""
-
-    channel: Channel | None
-    stamps: Stamps = field(default_factory=Stamps)
-    places: list[Place] = field(default_factory=list)
-    stream: list[Place] = field(default_factory=list)
-    """Of all messages, the empty and damaged ones too."""
-    rows: list[int] = field(default_factory=list)
-    """Which of `stream` the places are."""
-
-    def add(self, message: Message) -> None:
-        """Raises BadMessageError."""
-        self.stream.append(message.place)
-        if len(message.data) < _SMALL and _is_empty(message):
-            raise _EmptyImageError
-        self.stamps.add(stamp_of(message.channel, message.data), message.log_ns)
-        self.places.append(message.place)
-        self.rows.append(len(self.stream) - 1)
-
-    def finish(self, notes: Notes) -> tuple[Ints, list[Place], Ints]:
-        """Stamps and places of the images in order of time, and which of `stream` they are."""
-        if self.channel is None:
-            return NONE, [], NONE
-        stamp_ns, rows = self.stamps.order(self.channel.topic, notes)
-        return stamp_ns, [self.places[row] for row in rows.tolist()], np.array(self.rows, np.int64)[rows]
-
-
-@dataclass
-class _Pass:
-    """What has been collected so far."""
-
-    images: _Images
-    depths: _Images
-    rights: _Images
-    right_info: Channel | None
-    poses: PoseTrack | None
-    fixes: FixTrack | None
-    calibration: CalibrationMessage | None = None
-    """The first one speaks for the drive."""
-    right_calibration: CalibrationMessage | None = None
-    transforms: list[TransformMessage] = field(default_factory=list)
-    lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
-    """By reason and topic."""
-    info: Channel | None = None
-    tf: tuple[Channel, ...] = ()
-    moving: MovingFrames = field(default_factory=lambda: MovingFrames(keep=False))
-
-    def take(self, message: Message) -> None:
-        """Add a message, or count it among the lost ones."""
-        topic = message.channel.topic
-        try:
-            self.add(message)
-        except BadMessageError as error:
-            reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
-            self.lost.setdefault((reason, topic), Runs()).lost(message.log_ns)
-            return
-        for reason in ("empty_image", "undecodable") if self.lost else ():
-            if (reason, topic) in self.lost:
-                self.lost[reason, topic].sound()
-
-    def stamps(self) -> list[Stamps]:
-        """Of every topic that is followed over time."""
-        images = [one.stamps for one in (self.images, self.depths, self.rights) if one.channel]
-        return images + [one.stamps for one in (self.poses, self.fixes) if one]
-
-    def skew_ms(self) -> dict[str, float]:
-        """Log time less header stamp of each topic whose stamps follow a clock, the median."""
-        timed = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
-        timed += [(one.topic, one.stamps) for one in (self.poses, self.fixes) if one]
-        return {topic: clock.skew_ns / 1e6 for topic, stamps in timed if (clock := stamps.clock())}
-
-    def add(self, message: Message) -> None:
-        """Raises BadMessageError."""
-        for images in (self.images, self.depths, self.rights):
-            if message.channel == images.channel:
-                images.add(message)
-                return
-        if (message.channel == self.right_info and self.right_calibration) or (
-            message.channel == self.info and self.calibration
-        ):
-            return
-        if self.poses and (odometry := read_odometry(message.channel, message.data)) is not None:
-            self.poses.add(odometry, message.log_ns)
-            return
-        match decode(message.channel, message.data):
-            case CalibrationMessage() as calibration if message.channel == self.right_info:
-                self.right_calibration = self.right_calibration or calibration
-            case CalibrationMessage() as calibration:
-                self.calibration = self.calibration or calibration
-            case PoseMessage() as pose if self.poses:
-                self.poses.add(pose, message.log_ns)
-            case FixMessage() as fix if self.fixes:
-                self.fixes.add(fix, message.log_ns)
-            case list() as transforms if message.channel in self.tf:
-                self.moving.add(transforms, message.log_ns)
-            case list() as transforms:
-                self.transforms.extend(transforms)
 
 
 def read_content(container: Container, chosen: Selection, notes: Notes) -> Content:
     """Read the chosen topics once; what had to be repaired or left out is noted."""
-    read = _Pass(
-        _Images(chosen.image),
-        _Images(chosen.depth),
-        _Images(chosen.right),
+    read = Gathered(
+        Images(chosen.image),
+        Images(chosen.depth),
+        Images(chosen.right),
         chosen.right_info,
         PoseTrack(chosen.odometry.topic) if chosen.odometry and chosen.odometry not in chosen.tf else None,
         FixTrack(chosen.gps.topic) if chosen.gps else None,
+        odometry=chosen.odometry,
         info=chosen.camera_info,
         tf=chosen.tf,
         moving=MovingFrames(keep=chosen.odometry in chosen.tf),
     )
-    for message in container.messages(chosen.channels):
-        read.take(message)
+    stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
+    for block in container.blocks(chosen.channels, stamped):
+        read.take_block(block)
+    read.finish_poses()
     for (reason, topic), runs in read.lost.items():
         notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
     share_clock(read.stamps())

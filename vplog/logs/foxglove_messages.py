@@ -20,6 +20,7 @@ from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
 
 from vplog.logs.flat_messages import fill_flat
 from vplog.logs.messages import (
@@ -38,7 +39,13 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message as Proto
 
     from vplog.data import Floats
+    from vplog.logs.containers import Octets
     from vplog.logs.messages import Record
+
+_LENGTH = 2
+"""Wire type of protobuf's fields that are bytes behind their length (protobuf.dev/programming-guides/encoding)."""
+_FIXED = {1: 8, 5: 4}
+"""Bytes of the wire types that have always as many."""
 
 
 def decode_foxglove(kind: str, encoding: str, data: bytes) -> Record:
@@ -52,6 +59,57 @@ def decode_foxglove(kind: str, encoding: str, data: bytes) -> Record:
     else:
         message.ParseFromString(data)
     return read(message)
+
+
+def head_reader(kind: str) -> Callable[[Octets], tuple[Any, int, int] | None]:
+    """What reads a protobuf image without its pixels: the message, its `data` empty, and where those start and stop.
+
+    It gives None for bytes that are no such message, or hold `data` more than once.
+    """
+    make, _ = _READERS[kind]
+    tag_of_data = make.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH
+
+    def read(data: Octets) -> tuple[Any, int, int] | None:
+        at, stop = 0, len(data)
+        while at < len(data) and (tag := data[at]) != tag_of_data:
+            at = _skipped(data, at + 1, tag)
+        start, head = at, bytes(data[:at])
+        if at < len(data):
+            length, start = _varint(data, at + 1)
+            stop = start + length
+            head += bytes(data[stop:])
+        message: Any = make()
+        try:
+            message.ParseFromString(head)
+        except DecodeError:
+            return None
+        return None if start > stop or stop > len(data) or message.data else (message, start, stop)
+
+    return read
+
+
+def _skipped(data: Octets, at: int, tag: int) -> int:
+    """Where the value of a field ends that begins at `at`. Raises IndexError where that cannot be told."""
+    if tag >= 0x80:  # a field number above 15, which none of these types has
+        raise IndexError
+    if tag & 7 == _LENGTH:
+        length, at = _varint(data, at)
+        return at + length
+    if tag & 7 == 0:
+        return _varint(data, at)[1]
+    return at + _FIXED[tag & 7]
+
+
+def _varint(data: Octets, at: int) -> tuple[int, int]:
+    """A number in groups of 7 bits, the lowest first, and where it ends. Raises IndexError where it does not."""
+    value = shift = 0
+    for position in range(at, at + 10):  # 64 bits
+        byte = data[position]
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position + 1
+        shift += 7
+    raise IndexError
 
 
 def _fill(message: Proto, tree: Any) -> None:
@@ -110,14 +168,16 @@ def _calibration(m: Any) -> Record:
 
 
 def _pose(m: Any) -> Record:
-    return PoseMessage(_stamp(m), m.frame_id, "", _xyz(m.pose.position), _xyzw(m.pose.orientation), None)
+    pose = m.pose
+    p, q = pose.position, pose.orientation
+    return PoseMessage(_stamp(m), m.frame_id, "", (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), None)
 
 
 def _odometry(m: Any) -> Record:
-    covariance = _matrix(m.pose_covariance, (6, 6))
-    return PoseMessage(
-        _stamp(m), m.frame_id, m.body_frame_id, _xyz(m.pose.position), _xyzw(m.pose.orientation), covariance
-    )
+    covariance = _matrix(m.pose_covariance, (6, 6)).ravel().tolist()
+    p, q = m.pose.position, m.pose.orientation
+    position, quaternion = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+    return PoseMessage(_stamp(m), m.frame_id, m.body_frame_id, position, quaternion, covariance)
 
 
 def _fix(m: Any) -> Record:

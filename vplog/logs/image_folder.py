@@ -117,6 +117,11 @@ class ImageFolder:
         return list(self._notes.lines)
 
     @property
+    def account(self) -> Account:
+        """Of what could not be used so far."""
+        return self._notes.account
+
+    @property
     def losses(self) -> list[Loss]:
         return self._notes.account.losses
 

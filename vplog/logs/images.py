@@ -126,7 +126,8 @@ def _metres(pixels: Any, encoding: str) -> Float32s:
     if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
         raise BadMessageError(f"{encoding[:40]!r} with {pixels.ndim} dimensions of {pixels.dtype} is not a depth image")
     if pixels.dtype == np.uint16:
-        return np.where(np.isin(pixels, _INVALID_MM), np.float32(np.nan), pixels * np.float32(0.001)).astype(np.float32)
+        unknown = np.logical_or.reduce([pixels == value for value in _INVALID_MM])  # np.isin takes ten times as long
+        return np.where(unknown, np.float32(np.nan), pixels * np.float32(0.001)).astype(np.float32)
     return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.float32(np.nan)).astype(np.float32)
 
 

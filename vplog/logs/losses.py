@@ -100,6 +100,12 @@ class Account:
         for topic, count in ({"": None} if counts is None else counts).items():
             self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)
 
+    def undecodable(self, stamp_ns: Collection[int]) -> list[tuple[str, int]]:
+        """Topic and stamp of the images of frames with these stamps that were found not to decode."""
+        wanted = set(stamp_ns)
+        found = [places.copy() for (reason, _), places in self._found.copy().items() if reason == "undecodable_image"]
+        return sorted(key for places in found for key in places if key[1] in wanted)
+
     def know(self, file: str, recorded: Mapping[str, int], start_ns: int) -> None:
         """How many messages of each topic were recorded in a file, as it says itself, and when the first."""
         self._recorded[file] = dict(recorded)

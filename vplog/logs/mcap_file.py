@@ -15,22 +15,22 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from vplog.logs.chunks import ChunkCache
+from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered, plural
+from vplog.logs.containers import Channel, Contents, Notes, by_topic, ordered, plural
 from vplog.logs.mcap_layout import MAGIC, RECORD, read_layout
+from vplog.logs.mcap_walk import Walk
+from vplog.remote import RemotePath
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.containers import Place
+    from vplog.logs.containers import Block, Message, Place
     from vplog.logs.mcap_layout import Chunk
 
 __all__ = ["MAGIC", "McapFile"]
 
-_MESSAGE = struct.Struct("<HIQQ")
-"""Channel id, sequence, log time, publish time: the head of a message record."""
 _IDL = ("ros2idl", "omgidl")
 """Schema languages whose writers may name types as C++ and DDS do."""
 
@@ -48,7 +48,12 @@ class McapFile:
         """Opcodes and ids of schemas and channels from damaged chunks, until a sound one says the same."""
         self._length = path.stat().st_size
         self._layout = read_layout(self._file, self._length, self._define, self._name)
-        self._data = ChunkCache(self._unpack)
+        self._local = not isinstance(path, RemotePath)
+        self._at = reader_at(self._file, self._local)
+        self._sound = bytearray(len(self._layout.chunks))
+        """1 for chunks whose checksum was found right."""
+        sizes = [chunk.stop - chunk.start if self._is_plain(chunk) else chunk.size for chunk in self._layout.chunks]
+        self._data = Chunks(self._unpack, self._lose, sizes.__getitem__, self._is_kept, self._local)
 
     def contents(self) -> Contents:
         """Counted by the indexes behind the chunks; a chunk without is unpacked."""
@@ -59,10 +64,11 @@ class McapFile:
                 found = chunk.counts
                 times += (chunk.first_ns, chunk.last_ns)
             else:
-                found = {}
-                for channel_id, log_ns, _, _ in self._messages(number):
-                    found[channel_id] = found.get(channel_id, 0) + 1
-                    times = [*times[-2:], log_ns] if not times else [min(*times, log_ns), max(*times, log_ns)]
+                data = self._data(number)
+                walk = Walk(number, len(data), self._channels, self._define, None)
+                times += walk.whole(data).log_ns
+                found = walk.seen
+                self._account_for_chunk(chunk, walk)
             for channel_id, count in found.items():
                 if channel_id in self._channels:
                     channel = self._channels[channel_id]
@@ -74,19 +80,31 @@ class McapFile:
         return Contents(counts, start_ns, end_ns)
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        for block in self.blocks(channels):
+            yield from block.messages()
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         wanted = set(channels)
-        for number, chunk in enumerate(self._layout.chunks):
-            if not self._may_hold(chunk, wanted):
+        chunks = self._layout.chunks
+        numbers = (number for number, chunk in enumerate(chunks) if self._may_hold(chunk, wanted))
+        for number, data in self._data.in_turn(numbers, self._stays if brief else None):
+            chunk = chunks[number]
+            if not self._may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
-            data = self._data(number)
-            for channel_id, log_ns, start, stop in self._messages(number):
-                channel = self._channels.get(channel_id)
-                if channel in wanted and channel is not None:
-                    yield Message(channel, log_ns, data[start:stop], (number, start, stop))
+            end = chunk.stop - chunk.start if data is None else len(data)
+            walk = Walk(number, end, self._channels, self._define, wanted, brief)
+            if data is None:
+                yield walk.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
+            else:
+                yield walk.whole(data)
+            self._account_for_chunk(chunk, walk)
 
     def read(self, place: Place) -> bytes:
-        chunk, start, stop = place
-        return self._data(chunk)[start:stop]
+        number, start, stop = place
+        chunk = self._layout.chunks[number]
+        if self._local and self._is_plain(chunk):  # as when it was gone through
+            return self._at(chunk.start + start, stop - start)
+        return self._data(number)[start:stop]
 
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
         """What the walk could not find, and how much of what was recorded that is."""
@@ -157,35 +175,16 @@ class McapFile:
             self._doubtful.discard((opcode, number))
         return news
 
-    def _messages(self, number: int) -> Iterator[tuple[int, int, int, int]]:
-        """Channel id, log time, start and stop of every message in a chunk; at its end, what it was short of."""
-        chunk, data = self._layout.chunks[number], self._data(number)
-        seen: dict[int, int] = {}
-        unknown, position, last_ns = 0, 0, chunk.first_ns
-        while position + RECORD.size <= len(data):
-            opcode, length = RECORD.unpack_from(data, position)
-            start, stop = position + RECORD.size, position + RECORD.size + length
-            if stop > len(data):
-                break
-            if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
-                channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
-                seen[channel_id] = seen.get(channel_id, 0) + 1
-                last_ns = log_ns
-                unknown += channel_id not in self._channels
-                yield channel_id, log_ns, start + _MESSAGE.size, stop
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, data[start:stop])
-            position = stop
-        key, account = (self._name, chunk.start), self._notes.account
-        if unknown:
-            account.add("unknown_channel", {"": unknown}, key, [(chunk.first_ns, chunk.last_ns)])
-        if (
-            data
-            and not chunk.cut
-            and (position < len(data) or any(seen.get(i, 0) < n for i, n in chunk.counts.items()))
-        ):
-            short = self._topics({i: n - seen.get(i, 0) for i, n in chunk.counts.items()})
+    def _account_for_chunk(self, chunk: Chunk, walk: Walk) -> None:
+        """What a chunk is short of that was walked."""
+        key, account, seen = (self._name, chunk.start), self._notes.account, walk.seen
+        if walk.unknown:
+            account.add("unknown_channel", {"": walk.unknown}, key, [(chunk.first_ns, chunk.last_ns)])
+        fewer = any(seen[i] < n for i, n in chunk.counts.items())
+        if walk.end and not chunk.cut and (walk.position < walk.end or fewer):
+            short = self._topics({i: n - seen[i] for i, n in chunk.counts.items()})
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
+            last_ns = chunk.first_ns if walk.last_ns is None else walk.last_ns
             span = (min(last_ns, chunk.last_ns), chunk.last_ns)
             account.add("damaged_chunk", short if chunk.counts else None, key, [span], detail)
 
@@ -194,24 +193,42 @@ class McapFile:
         return not chunk.counts or any(self._channels.get(i) in wanted or i not in self._channels for i in chunk.counts)
 
     def _unpack(self, number: int) -> bytes:
-        """The records of one chunk; empty, and accounted for, where it is damaged."""
+        """The records of one chunk. Raises BadChunkError where it is damaged."""
         chunk = self._layout.chunks[number]
-        self._file.seek(chunk.start)
-        data = self._file.read(chunk.stop - chunk.start)
+        data = self._at(chunk.start, chunk.stop - chunk.start)
         if chunk.compression is None:
             return data
-        try:
-            data = unpack(chunk.compression, data, chunk.size, partial=chunk.cut)
-            if chunk.crc and not chunk.cut and zlib.crc32(data) != chunk.crc:
-                self._define_all(data)
-                raise BadChunkError("its checksum does not match")
-        except BadChunkError as error:
-            detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
-            span = (chunk.first_ns, max(chunk.first_ns, chunk.last_ns))
-            counts = self._topics(chunk.counts) if chunk.counts else None
-            self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), [span], detail)
-            return b""
+        data = unpack(chunk.compression, data, chunk.size, partial=chunk.cut)
+        if chunk.crc and not chunk.cut and not self._sound[number]:
+            if zlib.crc32(data) != chunk.crc:
+                raise BadChunkError("its checksum does not match", data)
+            self._sound[number] = 1
         return data
+
+    def _lose(self, number: int, error: BadChunkError) -> None:
+        """Account for a damaged chunk."""
+        self._define_all(error.data)
+        chunk = self._layout.chunks[number]
+        detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
+        span = (chunk.first_ns, max(chunk.first_ns, chunk.last_ns))
+        counts = self._topics(chunk.counts) if chunk.counts else None
+        self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), [span], detail)
+
+    def _is_kept(self, number: int) -> bool:
+        """Parts of what is not packed can be read again by themselves, unless each costs a request."""
+        return not self._local or not self._is_plain(self._layout.chunks[number])
+
+    def _stays(self, number: int) -> bool:
+        """Whether a chunk's messages can be found where they lie, without reading all of it."""
+        chunk = self._layout.chunks[number]
+        if not self._local or not self._is_plain(chunk) or chunk.cut:
+            return False
+        sound = not chunk.crc or bool(self._sound[number])
+        return chunk.compression is None or (sound and chunk.stop - chunk.start == chunk.size)
+
+    @staticmethod
+    def _is_plain(chunk: Chunk) -> bool:
+        return chunk.compression in (None, "", "none")
 
     def _define_all(self, data: bytes) -> None:
         """Schemas and channels of a chunk whose checksum is wrong: other chunks need them, and a wrong one fails to

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vplog.data import Floats
-    from vplog.logs.containers import Channel
+    from vplog.logs.containers import Channel, Octets
 
 
 class BadMessageError(Exception):
@@ -47,18 +50,19 @@ class CalibrationMessage:
     """(3, 3) rectified_from_camera of a stereo pair; the identity or all zero without one."""
 
 
-@dataclass(frozen=True, eq=False)
-class PoseMessage:
+class PoseMessage(NamedTuple):
+    """A tuple of plain numbers: drives have more of these than of anything else."""
+
     stamp_ns: int
     frame: str
     child: str
     """The frame that moves; empty where the type has none."""
-    position: Floats
-    """(3,) m."""
-    quaternion: Floats
-    """(4,) x y z w, as logged."""
-    covariance: Floats | None
-    """(6, 6) as logged: translation first, axes of `frame`; None where the type has none."""
+    position: Sequence[float]
+    """x y z in m."""
+    quaternion: Sequence[float]
+    """x y z w, as logged."""
+    covariance: Sequence[float] | None
+    """The 36 numbers of a (6, 6) as logged: translation first, axes of `frame`; None where the type has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +117,15 @@ _KINDS = {
 _ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxglove", "flatbuffer": "foxglove"}
 
 
+_STAMPS = {
+    ("cdr", True): struct.Struct("<4xiI"),
+    ("cdr", False): struct.Struct(">4xiI"),
+    ("ros1", True): struct.Struct("<4xII"),
+}
+"""Stamps in the headers of ROS, by encoding and whether it is little endian: CDR has 4 bytes of encapsulation before
+them, ROS 1 a sequence number."""
+
+
 def kind_of(channel: Channel) -> str:
     """`image`, `camera_info`, `odometry`, `gps`, `tf`, or `` for what vplog has no use for or cannot decode."""
     family = _ENCODINGS.get(channel.encoding)
@@ -127,8 +140,17 @@ def short_type(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def decode(channel: Channel, data: bytes) -> Record:
+def decode(channel: Channel, data: Octets) -> Record:
     """The record that a message holds. Raises BadMessageError."""
+    from vplog.logs.fix_message import read_fix
+    from vplog.logs.image_message import read_image
+
+    record = read_image(channel, data) or read_fix(channel, data)
+    return decode_generally(channel, bytes(data)) if record is None else record
+
+
+def decode_generally(channel: Channel, data: bytes) -> Record:
+    """The same by the decoders that know whole types. Raises BadMessageError."""
     try:
         if _ENCODINGS[channel.encoding] == "ros":
             from vplog.logs.ros_messages import decode_ros
@@ -144,17 +166,18 @@ def decode(channel: Channel, data: bytes) -> Record:
         raise BadMessageError(reason[:200]) from None
 
 
-def stamp_of(channel: Channel, data: bytes) -> int:
+def stamp_of(channel: Channel, data: Octets) -> int:
     """The header stamp in ns without decoding the rest where the encoding allows. Raises BadMessageError."""
     if channel.encoding in ("cdr", "ros1"):
-        # CDR: 4 bytes of encapsulation, then the stamp; ROS 1: a sequence number of 4 bytes, then the stamp.
-        little = channel.encoding == "ros1" or data[1:2] == b"\x01"
-        order = "little" if little else "big"
         if len(data) < 12:
             raise BadMessageError(f"{len(data)} bytes are too few for a header")
-        seconds = int.from_bytes(data[4:8], order, signed=channel.encoding == "cdr")
-        return nanoseconds(seconds, int.from_bytes(data[8:12], order))
-    record = decode(channel, data)
+        little = channel.encoding == "ros1" or data[1] == 1
+        return nanoseconds(*_STAMPS[channel.encoding, little].unpack_from(data))
+    from vplog.logs.image_message import stamp_of_image
+
+    if (stamp_ns := stamp_of_image(channel, data)) is not None:
+        return stamp_ns
+    record = decode_generally(channel, bytes(data))
     return 0 if isinstance(record, list) else record.stamp_ns
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from vplog.logs.messages import BadMessageError, ImageMessage, decode
 from vplog.logs.video import VideoStream
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor, Future
+
     from vplog.data import Float32s
     from vplog.logs.containers import Channel, Container, Notes, Place
     from vplog.logs.content import Content
@@ -23,12 +25,44 @@ _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
 
 
+class Early(NamedTuple):
+    """An image that is decoded while the log is read."""
+
+    place: Place
+    frame_and_size: Future[tuple[str, tuple[int, int]]]
+    """As `Pictures.first` gives them; BadMessageError where it does not decode."""
+
+
+def decode_early(container: Container, channel: Channel, pool: Executor) -> Early | None:
+    """The first image of a topic, of which the size of all is to be told: idle cores may as well find it."""
+    message = next(container.messages([channel]), None)
+    if message is None:
+        return None
+    return Early(message.place, pool.submit(_frame_and_size, channel, bytes(message.data)))
+
+
+def _frame_and_size(channel: Channel, data: bytes) -> tuple[str, tuple[int, int]]:
+    message = decode(channel, data)
+    if not isinstance(message, ImageMessage):
+        raise BadMessageError("it is not an image message")
+    height, width = grey(message).shape
+    return message.frame, (width, height)
+
+
 class Pictures:
     """Reads images where `content` says they lie."""
 
-    def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
+    def __init__(
+        self,
+        container: Container,
+        image: Channel | None,
+        codec: str,
+        content: Content,
+        notes: Notes,
+        early: Early | None = None,
+    ) -> None:
         """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
-        self._container, self._image = container, image
+        self._container, self._image, self._early = container, image, early
         self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """What was read, without the images before a video's first key frame."""
@@ -56,10 +90,13 @@ class Pictures:
         video, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:
+                if self._early is not None and place == self._early.place:
+                    return self._early.frame_and_size.result()
+                if video is None:
+                    return _frame_and_size(channel, self._container.read(place))
                 message = decode(channel, self._container.read(place))
                 if isinstance(message, ImageMessage):
-                    rows = self.content.stream_rows
-                    height, width = (grey(message) if video is None else video.frame(int(rows[i]))).shape
+                    height, width = video.frame(int(self.content.stream_rows[i])).shape
                     return message.frame, (width, height)
             except BadMessageError as error:
                 reason = str(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from vplog.logs.candidates import read_candidates
 from vplog.logs.content import read_content
 from vplog.logs.frames import RecordedFrame, size_of
 from vplog.logs.losses import Account
-from vplog.logs.pictures import Pictures
+from vplog.logs.pictures import Pictures, decode_early
 from vplog.logs.select import TopicChoice, select
 from vplog.logs.stamps import rows_of
 from vplog.logs.stereo import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
@@ -52,6 +53,11 @@ class RecordedLog:
     @property
     def warnings(self) -> list[str]:
         return list(self._notes.lines)
+
+    @property
+    def account(self) -> Account:
+        """Of what could not be used so far."""
+        return self._notes.account
 
     @property
     def losses(self) -> list[Loss]:
@@ -154,9 +160,12 @@ class RecordedLog:
 
     @cached_property
     def _pictures(self) -> Pictures:
-        content = read_content(self._container, self._selection, self._notes)
         image = self._selection.image
-        return Pictures(self._container, image, self._codec(image), content, self._notes)
+        codec = self._codec(image)
+        with ThreadPoolExecutor(1, "vplog-first-image") as pool:
+            early = None if image is None or codec else decode_early(self._container, image, pool)
+            content = read_content(self._container, self._selection, self._notes)
+        return Pictures(self._container, image, codec, content, self._notes, early)
 
     @property
     def _content(self) -> Content:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vplog.logs.chunks import ChunkCache
+from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered, plural
+from vplog.logs.containers import Block, Channel, Contents, Notes, by_topic, ordered, plural
 from vplog.logs.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
+from vplog.remote import RemotePath
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.containers import Place
+    from vplog.logs.containers import Message, Place
     from vplog.logs.ros1_layout import Chunk
 
 __all__ = ["MAGIC", "Ros1Bag"]
@@ -29,7 +30,10 @@ class Ros1Bag:
         self._length = path.stat().st_size
         self._channels: dict[int, Channel] = {}
         self._layout = read_layout(self._file, self._length, self._connect, self._name)
-        self._data = ChunkCache(self._unpack)
+        local = not isinstance(path, RemotePath)
+        self._at = reader_at(self._file, local)
+        sizes = [chunk.size for chunk in self._layout.chunks]
+        self._data = Chunks(self._unpack, self._lose, sizes.__getitem__, lambda _: True, local)
 
     def contents(self) -> Contents:
         """Counted by the indexes; a chunk without is unpacked."""
@@ -41,7 +45,7 @@ class Ros1Bag:
                 start_ns, end_ns = min(start_ns, chunk.first_ns), max(end_ns, chunk.last_ns)
             else:
                 found = {}
-                for connection, log_ns, _, _ in self._messages(count):
+                for connection, log_ns, _, _ in self._messages(count, self._data(count)):
                     found[connection] = found.get(connection, 0) + 1
                     start_ns, end_ns = min(start_ns, log_ns), max(end_ns, log_ns)
                     chunk.first_ns, chunk.last_ns = min(chunk.first_ns or log_ns, log_ns), max(chunk.last_ns, log_ns)
@@ -55,15 +59,26 @@ class Ros1Bag:
         return Contents(counts, start_ns, end_ns)
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        for block in self.blocks(channels):
+            yield from block.messages()
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         wanted = set(channels)
-        for count, chunk in enumerate(self._layout.chunks):
-            if not self._may_hold(chunk, wanted):
+        chunks = self._layout.chunks
+        numbers = (count for count, chunk in enumerate(chunks) if self._may_hold(chunk, wanted))
+        for count, data in self._data.in_turn(numbers):
+            if data is None or not self._may_hold(chunks[count], wanted):  # by a connection that came meanwhile
                 continue
-            data = self._data(count)
-            for connection, log_ns, start, stop in self._messages(count):
+            block = Block(data, [], [], [], [], [])
+            for connection, log_ns, start, stop in self._messages(count, data):
                 channel = self._channels.get(connection)
                 if channel in wanted and channel is not None:
-                    yield Message(channel, log_ns, data[start:stop], (count, start, stop))
+                    block.channels.append(channel)
+                    block.log_ns.append(log_ns)
+                    block.starts.append(start)
+                    block.stops.append(stop)
+                    block.places.append((count, start, stop))
+            yield block
 
     def read(self, place: Place) -> bytes:
         chunk, start, stop = place
@@ -108,9 +123,9 @@ class Ros1Bag:
         kind = (fields(data) or {}).get(b"type", b"").decode("utf-8", "replace")
         self._channels[number(header, b"conn")] = Channel(topic, kind, "ros1")
 
-    def _messages(self, count: int) -> Iterator[tuple[int, int, int, int]]:
+    def _messages(self, count: int, data: bytes) -> Iterator[tuple[int, int, int, int]]:
         """Connection, log time, start and stop of every message in a chunk; at its end, what it was short of."""
-        chunk, data = self._layout.chunks[count], self._data(count)
+        chunk = self._layout.chunks[count]
         seen: dict[int, int] = {}
         unknown, position, last_ns = 0, 0, chunk.first_ns
         while position < len(data):
@@ -144,15 +159,14 @@ class Ros1Bag:
         return not chunk.counts or any(self._channels.get(i) in wanted or i not in self._channels for i in chunk.counts)
 
     def _unpack(self, count: int) -> bytes:
-        """The records of one chunk; empty, and accounted for, where it is damaged."""
+        """The records of one chunk. Raises BadChunkError where it is damaged."""
         chunk = self._layout.chunks[count]
-        self._file.seek(chunk.start)
-        data = self._file.read(chunk.stop - chunk.start)
-        try:
-            return unpack(chunk.compression, data, chunk.size, chunk.cut)
-        except BadChunkError as error:
-            detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
-            span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
-            counts = self._topics(chunk.counts) if chunk.counts else None
-            self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), span, detail)
-            return b""
+        return unpack(chunk.compression, self._at(chunk.start, chunk.stop - chunk.start), chunk.size, chunk.cut)
+
+    def _lose(self, count: int, error: BadChunkError) -> None:
+        """Account for a damaged chunk."""
+        chunk = self._layout.chunks[count]
+        detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
+        span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
+        counts = self._topics(chunk.counts) if chunk.counts else None
+        self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), span, detail)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from vplog.logs.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.containers import Contents, Message, Notes, by_topic, ordered
+from vplog.logs.containers import Contents, Message, Notes, by_topic, in_blocks, ordered
 from vplog.logs.losses import Runs
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.logs.containers import Channel, Container, Place
+    from vplog.logs.containers import Block, Channel, Container, Place
 
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
@@ -71,6 +71,11 @@ class Chain:
             for message in part.messages(channels):
                 yield message._replace(place=(number, *message.place))
 
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        for number, part in enumerate(self._parts):
+            for block in part.blocks(channels, brief):
+                yield block._replace(places=[(number, *place) for place in block.places])
+
     def read(self, place: Place) -> bytes:
         return self._parts[place[0]].read(place[1:])
 
@@ -96,6 +101,9 @@ class Counted:
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         return self._found.messages(channels)
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return self._found.blocks(channels, brief)
 
     def read(self, place: Place) -> bytes:
         return self._found.read(place)
@@ -124,6 +132,9 @@ class ZstdMessages:
             else:
                 if topic in lost:
                     lost[topic].sound()
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return in_blocks(self.messages(channels))
 
     def read(self, place: Place) -> bytes:
         try:

@@ -127,9 +127,9 @@ def _pose_with_covariance(message: Any) -> Record:
 
 
 def _pose(message: Any, pose: Any, child: str, covariance: Any) -> PoseMessage:
-    sigma = None if covariance is None else np.reshape(covariance, (6, 6)).astype(np.float64)
-    position, quaternion = _xyz(pose.position), _xyzw(pose.orientation)
-    return PoseMessage(_stamp(message), message.header.frame_id, child, position, quaternion, sigma)
+    sigma = None if covariance is None else np.reshape(covariance, 36).astype(np.float64).tolist()
+    p, q = pose.position, pose.orientation
+    return PoseMessage(_stamp(message), message.header.frame_id, child, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), sigma)
 
 
 def _fix(message: Any) -> Record:
@@ -152,7 +152,8 @@ def _transforms(message: Any) -> Record:
 
 
 def _one_transform(message: Any) -> Record:
-    position, quaternion = _xyz(message.transform.translation), _xyzw(message.transform.rotation)
+    p, q = message.transform.translation, message.transform.rotation
+    position, quaternion = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
     return PoseMessage(_stamp(message), message.header.frame_id, message.child_frame_id, position, quaternion, None)
 
 

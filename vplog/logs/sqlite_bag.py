@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, ordered
+from vplog.logs.containers import Channel, Contents, Message, Notes, by_topic, in_blocks, ordered
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
-    from vplog.logs.containers import Place
+    from vplog.logs.containers import Block, Place
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
@@ -77,6 +77,9 @@ class SqliteBag:
         for row, topic, time_ns, data in self._salvaged("rowid, topic_id, timestamp, data", ids):
             if isinstance(data, bytes):
                 yield Message(self._topics[topic], _integer(time_ns), data, (row,))
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return in_blocks(self.messages(channels))
 
     def read(self, place: Place) -> bytes:
         try:
@@ -167,7 +170,9 @@ class SqliteBag:
                 f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages."
             )
         rows = self._rows("SELECT id, name, type, serialization_format FROM topics")
-        return {number: Channel(str(name), str(kind), str(encoding)) for number, name, kind, encoding in sorted(rows)}
+        # damage may have put anything, or nothing, in any column
+        rows = sorted(row for row in rows if [type(value) for value in row] == [int, str, str, str])
+        return {number: Channel(name, kind, encoding) for number, name, kind, encoding in rows}
 
     def _rows(self, query: str, values: list[int] | None = None) -> Iterator[tuple]:
         """Rows as far as the file is sound; a note where it is not."""

@@ -47,10 +47,16 @@ class Stamps:
 
     common: Clock | None = None
     """The clock that all topics of the log are to be on, where that is known."""
+    _found: tuple[int, Repaired | None] | None = None
+    """The one clock of so many messages."""
 
     def add(self, header_ns: int, log_ns: int) -> None:
         self.header_ns.append(header_ns)
         self.log_ns.append(min(log_ns, _LAST_NS))
+
+    def extend(self, header_ns: list[int], log_ns: list[int]) -> None:
+        self.header_ns.extend(header_ns)
+        self.log_ns.extend([min(time_ns, _LAST_NS) for time_ns in log_ns])
 
     def clock(self) -> Clock | None:
         """The clock of the header stamps; None where they follow none."""
@@ -66,9 +72,12 @@ class Stamps:
         return {} if found is None else found.counts
 
     def _on_one_clock(self) -> Repaired | None:
-        header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
-        log_ns, header_ns = log_ns[header_ns != 0], header_ns[header_ns != 0]
-        return on_one_clock(header_ns, log_ns) if len(header_ns) else None
+        """Found once: three parts of a log's account ask for it."""
+        if self._found is None or self._found[0] != len(self.log_ns):
+            header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
+            log_ns, header_ns = log_ns[header_ns != 0], header_ns[header_ns != 0]
+            self._found = len(self.log_ns), on_one_clock(header_ns, log_ns) if len(header_ns) else None
+        return self._found[1]
 
     def order(self, topic: str, notes: Notes) -> tuple[Ints, Ints]:
         """Strictly increasing stamps in ns and the row each came from. What was repaired is noted.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from array import array
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,12 +13,13 @@ from vplog import geometry
 from vplog.data import Gps, Odometry
 from vplog.logs.containers import plural
 from vplog.logs.stamps import Stamps
-from vplog.logs.transforms import clean, is_usable
+from vplog.logs.transforms import are_usable, clean, is_usable
 
 if TYPE_CHECKING:
     from vplog.data import Floats
     from vplog.logs.containers import Notes
     from vplog.logs.messages import FixMessage, PoseMessage
+    from vplog.logs.odometry_message import Poses
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
@@ -49,13 +52,29 @@ class PoseTrack:
     def add(self, message: PoseMessage, log_ns: int) -> None:
         self.child = self.child or clean(message.child)
         self.parent = self.parent or clean(message.frame)
-        if not is_usable(position := message.position.tolist(), quaternion := message.quaternion.tolist()):
+        stamp_ns, _, _, position, quaternion, covariance = message
+        if not is_usable(*position, *quaternion):
             self._dropped += 1
             return
-        self.stamps.add(message.stamp_ns, log_ns)
-        self._poses.extend((*position, *quaternion))
-        self._bare = self._bare and message.covariance is None
-        self._covariances.extend(_UNKNOWN if message.covariance is None else message.covariance.ravel().tolist())
+        self.stamps.add(stamp_ns, log_ns)
+        self._poses.extend(position)
+        self._poses.extend(quaternion)
+        self._bare = self._bare and covariance is None
+        self._covariances.extend(_UNKNOWN if covariance is None else covariance)
+
+    def add_all(self, poses: Poses, log_ns: list[int]) -> None:
+        """The same of several messages that name the same frames."""
+        self.child = self.child or clean(poses.child)
+        self.parent = self.parent or clean(poses.frame)
+        usable = are_usable(poses.poses)
+        self._dropped += int((~usable).sum())
+        self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable.tolist())))
+        self._poses.frombytes(poses.poses[usable].tobytes())
+        if poses.covariances is None:
+            self._covariances.extend(_UNKNOWN * int(usable.sum()))
+        else:
+            self._covariances.frombytes(poses.covariances[usable].tobytes())
+            self._bare = self._bare and not usable.any()
 
     def finish(self, notes: Notes) -> Odometry | None:
         """The odometry, or None where no pose is usable."""
@@ -114,7 +133,7 @@ class FixTrack:
 
     def add(self, message: FixMessage, log_ns: int) -> None:
         here = (message.latitude_deg, message.longitude_deg)
-        if not (message.valid and np.isfinite(here).all() and abs(here[0]) <= 90 and abs(here[1]) <= 360):
+        if not (message.valid and all(map(math.isfinite, here)) and abs(here[0]) <= 90 and abs(here[1]) <= 360):
             self._dropped += 1
             return
         self.frame = self.frame or message.frame

@@ -68,13 +68,20 @@ def clean(frame: str) -> str:
 
 def usable_pose(position: Floats, quaternion: Floats) -> Floats | None:
     """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond FARTHEST_M) or no rotation is set."""
-    if not is_usable(position.tolist(), quaternion.tolist()):
+    if not is_usable(*position.tolist(), *quaternion.tolist()):
         return None
     return geometry.pose(geometry.rotation(quaternion), position)
 
 
-def is_usable(position: list[float], quaternion: list[float]) -> bool:
-    """Whether `usable_pose` of these x y z and x y z w is one; plain numbers, since odometry asks for each message."""
-    placed = all(abs(value) < FARTHEST_M for value in position)  # False for NaN
-    turned = all(map(math.isfinite, quaternion)) and SMALLEST < max(map(abs, quaternion)) < 1 / SMALLEST
-    return placed and turned
+def are_usable(poses: Floats) -> np.ndarray:
+    """(K,) bool: `is_usable` of each row of (K, 7)."""
+    sizes = np.abs(poses)
+    placed, largest = (sizes[:, :3] < FARTHEST_M).all(1), sizes[:, 3:].max(1)  # NaN where one is
+    return placed & (largest > SMALLEST) & (largest < 1 / SMALLEST)
+
+
+def is_usable(x: float, y: float, z: float, qx: float, qy: float, qz: float, qw: float) -> bool:
+    """Whether `usable_pose` of these is one; plain numbers, since odometry asks for each message."""
+    placed = abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M  # False for NaN
+    finite = math.isfinite(qx + qy + qz + qw)  # a sum beyond the largest float is of numbers that are too large anyway
+    return placed and finite and SMALLEST < max(abs(qx), abs(qy), abs(qz), abs(qw)) < 1 / SMALLEST

@@ -1,0 +1,210 @@
+"""What the pass over a log collects: motion, fixes and calibration as they come, images by stamp and place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.logs.containers import Message
+from vplog.logs.losses import Runs
+from vplog.logs.messages import (
+    BadMessageError,
+    CalibrationMessage,
+    FixMessage,
+    ImageMessage,
+    PoseMessage,
+    TransformMessage,
+    decode,
+    stamp_of,
+)
+from vplog.logs.moving import MovingFrames
+from vplog.logs.odometry_message import read_poses
+from vplog.logs.stamps import NONE, Stamps
+
+if TYPE_CHECKING:
+    from vplog.data import Ints
+    from vplog.logs.containers import Block, Channel, Notes, Place
+    from vplog.logs.tracks import FixTrack, PoseTrack
+
+_SMALL = 512
+"""Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
+_TOGETHER = 1024
+"""Messages of odometry that are read at once: 0.7 MB, with which the calls to set up take no time."""
+
+
+class _EmptyImageError(BadMessageError):
+    """An image message without an image: cameras that lose a frame may log one."""
+
+
+def _is_empty(message: Message) -> bool:
+    """Raises BadMessageError."""
+    record = decode(message.channel, message.data) if message.data else None
+    return record is None or (isinstance(record, ImageMessage) and not record.data)
+
+
+@dataclass
+class Images:
+    """Stamps and places of one image topic."""
+
+    channel: Channel | None
+    stamps: Stamps = field(default_factory=Stamps)
+    places: list[Place] = field(default_factory=list)
+    stream: list[Place] = field(default_factory=list)
+    """Of all messages, the empty and damaged ones too."""
+    rows: list[int] = field(default_factory=list)
+    """Which of `stream` the places are."""
+
+    def add(self, message: Message) -> None:
+        """Raises BadMessageError."""
+        self.stream.append(message.place)
+        if len(message.data) < _SMALL and _is_empty(message):
+            raise _EmptyImageError
+        self.stamps.add(stamp_of(message.channel, message.data), message.log_ns)
+        self.places.append(message.place)
+        self.rows.append(len(self.stream) - 1)
+
+    def add_block(self, block: Block, rows: list[int]) -> bool:
+        """Add these messages of a block, where each is one with an image and a stamp; else none."""
+        view, stamps = memoryview(block.data), []
+        try:
+            for row in rows:
+                start, stop = block.starts[row], block.stops[row]
+                if stop - start < _SMALL:
+                    return False
+                stamps.append(stamp_of(block.channels[row], view[start:stop]))
+        except BadMessageError:
+            return False
+        self.stamps.extend(stamps, [block.log_ns[row] for row in rows])
+        places = [block.places[row] for row in rows]
+        self.rows.extend(range(len(self.stream), len(self.stream) + len(rows)))
+        self.places.extend(places)
+        self.stream.extend(places)
+        return True
+
+    def finish(self, notes: Notes) -> tuple[Ints, list[Place], Ints]:
+        """Stamps and places of the images in order of time, and which of `stream` they are."""
+        if self.channel is None:
+            return NONE, [], NONE
+        stamp_ns, rows = self.stamps.order(self.channel.topic, notes)
+        return stamp_ns, [self.places[row] for row in rows.tolist()], np.array(self.rows, np.int64)[rows]
+
+
+@dataclass
+class Gathered:
+    """What has been collected so far."""
+
+    images: Images
+    depths: Images
+    rights: Images
+    right_info: Channel | None
+    poses: PoseTrack | None
+    fixes: FixTrack | None
+    calibration: CalibrationMessage | None = None
+    """The first one speaks for the drive."""
+    right_calibration: CalibrationMessage | None = None
+    transforms: list[TransformMessage] = field(default_factory=list)
+    lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
+    """By reason and topic."""
+    odometry: Channel | None = None
+    waiting: list[bytes] = field(default_factory=list)
+    """Messages of odometry that are still to be added, and their log times."""
+    waiting_ns: list[int] = field(default_factory=list)
+    info: Channel | None = None
+    tf: tuple[Channel, ...] = ()
+    moving: MovingFrames = field(default_factory=lambda: MovingFrames(keep=False))
+
+    @cached_property
+    def by_channel(self) -> dict[Channel, Images]:
+        """The image topics in use."""
+        return {one.channel: one for one in (self.rights, self.depths, self.images) if one.channel}
+
+    def take_block(self, block: Block) -> None:
+        """Add the messages of a block; those that drives are full of, all of a topic at once."""
+        rows: dict[Channel, list[int]] = {}
+        for row, channel in enumerate(block.channels):
+            rows.setdefault(channel, []).append(row)
+        others: list[int] = []
+        for channel, mine in rows.items():
+            if (images := self.by_channel.get(channel)) and images.add_block(block, mine):
+                self._sound(channel.topic)
+            elif channel == self.odometry and self.poses:
+                self.waiting += [bytes(block.data[block.starts[row] : block.stops[row]]) for row in mine]
+                self.waiting_ns += [block.log_ns[row] for row in mine]
+            elif not self._is_settled(channel):
+                others += mine
+        for row in sorted(others):
+            self.take(block.message(row))
+        if len(self.waiting) >= _TOGETHER:
+            self.finish_poses()
+
+    def finish_poses(self) -> None:
+        """Add the messages of odometry that wait: at once where each is a pose, else one by one."""
+        channel, data, log_ns = self.odometry, self.waiting, self.waiting_ns
+        self.waiting, self.waiting_ns = [], []
+        if channel is None or self.poses is None or not data:
+            return
+        found = read_poses(channel, data)
+        if found is not None:
+            self.poses.add_all(found, log_ns)
+            self._sound(channel.topic)
+        else:
+            for one, time_ns in zip(data, log_ns, strict=True):
+                self.take(Message(channel, time_ns, one, ()))
+
+    def take(self, message: Message) -> None:
+        """Add a message, or count it among the lost ones."""
+        topic = message.channel.topic
+        try:
+            self.add(message)
+        except BadMessageError as error:
+            reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
+            self.lost.setdefault((reason, topic), Runs()).lost(message.log_ns)
+            return
+        self._sound(topic)
+
+    def _sound(self, topic: str) -> None:
+        for reason in ("empty_image", "undecodable") if self.lost else ():
+            if (reason, topic) in self.lost:
+                self.lost[reason, topic].sound()
+
+    def _is_settled(self, channel: Channel) -> bool:
+        """Calibrations that the first one has spoken for."""
+        return bool(
+            (channel == self.info and self.calibration) or (channel == self.right_info and self.right_calibration)
+        )
+
+    def stamps(self) -> list[Stamps]:
+        """Of every topic that is followed over time."""
+        images = [one.stamps for one in (self.images, self.depths, self.rights) if one.channel]
+        return images + [one.stamps for one in (self.poses, self.fixes) if one]
+
+    def skew_ms(self) -> dict[str, float]:
+        """Log time less header stamp of each topic whose stamps follow a clock, the median."""
+        timed = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
+        timed += [(one.topic, one.stamps) for one in (self.poses, self.fixes) if one]
+        return {topic: clock.skew_ns / 1e6 for topic, stamps in timed if (clock := stamps.clock())}
+
+    def add(self, message: Message) -> None:
+        """Raises BadMessageError."""
+        channel = message.channel
+        if images := self.by_channel.get(channel):
+            images.add(message)
+            return
+        if self._is_settled(channel):
+            return
+        match decode(channel, message.data):
+            case CalibrationMessage() as calibration if channel == self.right_info:
+                self.right_calibration = self.right_calibration or calibration
+            case CalibrationMessage() as calibration:
+                self.calibration = self.calibration or calibration
+            case PoseMessage() as pose if self.poses:
+                self.poses.add(pose, message.log_ns)
+            case FixMessage() as fix if self.fixes:
+                self.fixes.add(fix, message.log_ns)
+            case list() as transforms if channel in self.tf:
+                self.moving.add(transforms, message.log_ns)
+            case list() as transforms:
+                self.transforms.extend(transforms)

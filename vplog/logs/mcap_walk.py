@@ -1,0 +1,131 @@
+"""The messages of one chunk of an MCAP file (mcap.dev/spec), found by walking it record by record."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from mcap.opcode import Opcode
+
+from vplog.logs.containers import Block
+from vplog.logs.mcap_layout import RECORD
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from vplog.logs.containers import Channel, Place
+
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
+_IS_MESSAGE, _DEFINES = int(Opcode.MESSAGE), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
+_WINDOW = 4096
+"""Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
+_BRIEF = 16
+"""Bytes of a message that are there where it is only wanted briefly: up to the stamp in a header of ROS."""
+
+
+class Walk:
+    """What has been found so far in chunk `number`, from its first byte to `position`."""
+
+    def __init__(
+        self,
+        number: int,
+        end: int,
+        channels: dict[int, Channel],
+        define: Callable[[int, bytes], None],
+        wanted: Collection[Channel] | None,
+        brief: Collection[Channel] = (),
+    ) -> None:
+        """`end` is its length. Messages on `wanted` channels are kept (None: on all); those on `brief` ones need not be
+        whole. `define` takes a schema or channel record and may add to `channels`."""
+        self.position = 0
+        self.unknown = 0
+        """Messages of channels that nothing defined so far."""
+        self.last_ns: int | None = None
+        """Log time of the last message, on whatever channel."""
+        self._number, self.end, self._channels, self._define = number, end, channels, define
+        self._wanted, self._brief = wanted, brief
+        self._used = self._wanted_ids()
+        self._ids: list[int] = []
+        self._found: list[Channel] = []
+        self._log_ns: list[int] = []
+        self._starts: list[int] = []
+        self._stops: list[int] = []
+        self._places: list[Place] = []
+
+    @property
+    def seen(self) -> Counter[int]:
+        """Messages by channel id."""
+        return Counter(self._ids)
+
+    def whole(self, data: bytes) -> Block:
+        """The messages of the chunk, of which `data` are all bytes."""
+        self._go(data, 0)
+        return Block(data, self._found, self._log_ns, self._starts, self._stops, self._places)
+
+    def in_place(self, read: Callable[[int, int], bytes]) -> Block:
+        """The same of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
+        parts: list[bytes] = []
+        size = 0
+        while (left := self.end - self.position) >= RECORD.size:
+            before = self.position
+            data = read(before, min(_WINDOW, left))
+            self._go(data, size)
+            if self.position == before:
+                length = RECORD.size + RECORD.unpack_from(data)[1] if len(data) >= RECORD.size else left + 1
+                if not len(data) < length <= left:
+                    break
+                data = read(before, length)
+                self._go(data, size)
+                if self.position == before:
+                    break
+            parts.append(data)
+            size += len(data)
+        return Block(b"".join(parts), self._found, self._log_ns, self._starts, self._stops, self._places)
+
+    def _go(self, data: bytes, shift: int) -> None:
+        """On through `data`, which lie at `position` in the chunk and at `shift` in the block, up to the first record
+        that more is needed of."""
+        base, at, size, left = self.position, 0, len(data), self.end - self.position
+        used = self._used
+        while at + _MESSAGE.size <= size:
+            opcode, length, channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, at)
+            start, stop = at + _MESSAGE.size, at + RECORD.size + length
+            if stop > size and (
+                opcode != _IS_MESSAGE or stop > left or self._is_needed(used.get(channel_id), size - start, length)
+            ):
+                break
+            if opcode == _IS_MESSAGE and start <= stop:
+                self._ids.append(channel_id)
+                self.last_ns = log_ns
+                if channel_id in used:
+                    self._found.append(used[channel_id])
+                    self._log_ns.append(log_ns)
+                    self._starts.append(shift + start)
+                    self._stops.append(shift + stop)
+                    self._places.append((self._number, base + start, base + stop))
+                elif channel_id not in self._channels:
+                    self.unknown += 1
+            elif opcode in _DEFINES:
+                self._define(opcode, data[at + RECORD.size : stop])
+                used = self._used = self._wanted_ids()
+            at = stop
+        while at + RECORD.size <= size:  # too short for a message
+            opcode, length = RECORD.unpack_from(data, at)
+            stop = at + RECORD.size + length
+            if stop > size:
+                break
+            if opcode in _DEFINES:
+                self._define(opcode, data[at + RECORD.size : stop])
+                used = self._used = self._wanted_ids()
+            at = stop
+        self.position = base + at
+
+    def _wanted_ids(self) -> dict[int, Channel]:
+        wanted = self._wanted
+        return {i: channel for i, channel in self._channels.items() if wanted is None or channel in wanted}
+
+    def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
+        """Whether more of a message is needed than the bytes that are there."""
+        return channel is not None and (channel not in self._brief or there < _BRIEF or length < _WINDOW)
