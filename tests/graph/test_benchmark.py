@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tests.benchmarks import graphs as benchmark
+from tests.benchmarks.large_graphs import drives
+from vplog.graph.build import parts
 from vplog.graph.consistency import is_loop
 from vplog.results.g2o import write_g2o
 
@@ -51,3 +54,20 @@ def test_every_figure_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert figures[0].passed
     assert figures[0].facts["gnc"]["false_kept"] == [0]
     assert figures[-1].facts["error"] <= figures[-1].facts["error_of_bare"] * (1 + 1e-4)
+
+
+def test_drives_are_joined_by_closures_alone() -> None:
+    graph, again = drives(900, each=300), drives(900, each=300)
+    np.testing.assert_array_equal(graph.a_from_b, again.a_from_b)
+    odometry = ~is_loop(graph)
+    assert odometry.sum() == 897
+    assert (graph.a[odometry] // 300 == graph.b[odometry] // 300).all()
+    assert (graph.a // 300 != graph.b // 300).any()
+    assert not parts(900, graph.a, graph.b).any()
+
+
+def test_a_call_is_ended_at_its_limit() -> None:
+    spent, told = benchmark.apart(sorted, ([3, 1, 2],), 60.0)
+    assert told == [1, 2, 3]
+    assert spent < 60.0
+    assert benchmark.apart(time.sleep, (60.0,), 0.1) == (0.1, None)

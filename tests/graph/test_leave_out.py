@@ -58,7 +58,7 @@ def test_the_cost_is_what_chi_square_falls_by(graph: PoseGraph) -> None:
     factors = Factors.of(graph)
     poses, whole = solved(graph, weight)
     pull = tension(factors, weight, poses, loops)
-    tree = factorised(factors, factors.weighted(weight), poses)
+    tree = factorised(factors, weight, poses)
     for row in range(0, len(loops), max(len(loops) // 6, 1)):
         without = np.where(np.arange(len(graph.a)) == loops[row], 0.0, 1.0)
         other, left = solved(graph, without)
@@ -106,5 +106,5 @@ def test_a_false_place_is_suspected() -> None:
     worst = places[int(np.argmax(suspicion))]
     assert set(loops[worst]) >= set(range(len(bent.a) - 9, len(bent.a) - 1))
     _, left = solved(bent, np.where(np.isin(np.arange(len(bent.a)), loops[worst]), 0.0, 1.0))
-    tree = factorised(factors, factors.weighted(weight), poses)
+    tree = factorised(factors, weight, poses)
     assert cost_together(factors, weight, poses, tree, loops[worst]) > 0.5 * (whole - left) > 50

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import gtsam
@@ -12,12 +13,19 @@ from vplog import geometry
 from vplog.data import EdgeKind
 from vplog.errors import GraphError
 from vplog.graph.build import informed, parts
+from vplog.graph.elimination import Elimination
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from vplog.data import Floats, Ints, PoseGraph
 
-_GAUGE_SIGMA = 1e-6
+    Bools = NDArray[np.bool_]
+
+GAUGE_SIGMA = 1e-6
 """rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""
+_ALIKE = 0.99
+"""Share of a shape's edges that are still there for it to serve: a new one costs as much as a few steps."""
 _PLANAR = [1, 2, 0]
 """GTSAM has x, y, yaw; the planar rows here are yaw, x, y."""
 
@@ -38,29 +46,45 @@ class Factors:
     graph: PoseGraph
     information: Floats
     """(E, d, d) in GTSAM's order of axes; d = 6, or 3 in the plane."""
-    whole: list[Any]
-    """BetweenFactorPose3 or Pose2 of each edge with its full information."""
     piece: Ints
     """(N,) number of the piece of odometry that each pose is on, in order of their first poses."""
+    eliminations: list[tuple[Bools, Elimination]] = field(default_factory=list, repr=False)
+    """Those made last, with the edges (E,) that each is of."""
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Factors:
-        """One factor per edge. Edges of equal information share a noise model, as in most files all do."""
         information = informed(graph)
         if graph.dimension == 2:
             information = information[:, _PLANAR][:, :, _PLANAR]
+        odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+        return cls(graph, information, parts(len(graph.world_from_body), graph.a[odometry], graph.b[odometry]))
+
+    @cached_property
+    def whole(self) -> list[Any]:
+        """BetweenFactorPose3 or Pose2 of each edge with its full information.
+
+        Edges of equal information share a noise model, as in most files all do.
+        """
+        graph = self.graph
         shared: dict[bytes, Any] = {}
         noise = []
-        for matrix in np.ascontiguousarray(information):
+        for matrix in np.ascontiguousarray(self.information):
             name = matrix.tobytes()
             if name not in shared:
                 shared[name] = gtsam.noiseModel.Gaussian.Information(matrix)
             noise.append(shared[name])
         between = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
         ends = zip(graph.a.tolist(), graph.b.tolist(), as_gtsam(graph.a_from_b, graph.dimension), noise, strict=True)
-        factors = [between(a, b, measured, model) for a, b, measured, model in ends]
-        odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
-        return cls(graph, information, factors, parts(len(graph.world_from_body), graph.a[odometry], graph.b[odometry]))
+        return [between(a, b, measured, model) for a, b, measured, model in ends]
+
+    def elimination(self, on: Bools) -> Elimination:
+        """A shape that holds all of these edges (E,): one made before where it has few others, else a new one."""
+        for edges, shape in self.eliminations:
+            if not (on & ~edges).any() and on.sum() >= _ALIKE * edges.sum():
+                return shape
+        shape = Elimination.of(len(self.graph.world_from_body), self.graph.a[on], self.graph.b[on])
+        self.eliminations[:] = [*self.eliminations[-1:], (on, shape)]
+        return shape
 
     def weighted(self, weight: Floats) -> gtsam.NonlinearFactorGraph:
         """The edges of positive weight (E,), their information times the weight, and the gauge at pose 0.
@@ -108,7 +132,7 @@ class Factors:
         world = self.graph.world_from_body
         held = [0, *loose]
         planar = self.graph.dimension == 2
-        noise = gtsam.noiseModel.Isotropic.Sigma(3 if planar else 6, _GAUGE_SIGMA)
+        noise = gtsam.noiseModel.Isotropic.Sigma(3 if planar else 6, GAUGE_SIGMA)
         prior = gtsam.PriorFactorPose2 if planar else gtsam.PriorFactorPose3
         places = as_gtsam(geometry.between(world[:1], world[held]), self.graph.dimension)
         for node, pose in zip(held, places, strict=True):

@@ -27,7 +27,8 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
-from vplog.graph.factors import Factors, least_squares
+from vplog.graph.descent import descend
+from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_kept
 from vplog.graph.pcm import PcmSettings
@@ -94,10 +95,18 @@ class GncSettings(Settings):
 
     def _join(self, graph: PoseGraph, loops: Ints) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest set that agrees."""
-        part = OdometryChain.of(graph).part
-        across = loops[part[graph.a[loops]] != part[graph.b[loops]]]
-        kept, _ = PcmSettings(pair_probability=self.inlier_probability).consistent(graph, across)
-        return ~np.isin(loops, np.setdiff1d(across, kept))
+        chain = OdometryChain.of(graph)
+        part = chain.part
+        one, two = part[graph.a[loops]], part[graph.b[loops]]
+        across = one != two
+        consistency = PcmSettings(pair_probability=self.inlier_probability)
+        good = ~across
+        # closures between other pieces say nothing about each other, so each two pieces are judged by themselves
+        pairs = np.minimum(one, two) * (int(part.max()) + 1) + np.maximum(one, two)
+        for pair in np.unique(pairs[across]).tolist():
+            kept, _ = consistency.consistent(graph, loops[across & (pairs == pair)], chain)
+            good[np.searchsorted(loops, kept)] = True
+        return good
 
     def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats, int]:
         """Algorithm 1 of the paper over the closures of weight 1: weights 0 or 1, poses, and stages taken."""
@@ -105,7 +114,7 @@ class GncSettings(Settings):
         judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
         if len(judged) == 0:
             return weight, poses, 0
-        poses = least_squares(factors, factors.weighted(weight), poses, self.max_iterations, 1e-3).world_from_body
+        poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         stage = 0
@@ -113,9 +122,7 @@ class GncSettings(Settings):
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
-            poses = least_squares(
-                factors, factors.weighted(weight), poses, self.steps, self.stage_tolerance
-            ).world_from_body
+            poses = descend(factors, weight, poses, self.steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
             mu *= self.growth
         return np.where(weight > 0.5, 1.0, 0.0), poses, stage

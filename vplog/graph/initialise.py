@@ -9,7 +9,10 @@ import gtsam
 import numpy as np
 
 from vplog import geometry
+from vplog.errors import GraphError
+from vplog.graph.cholesky import Blocks, Cholesky
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
+from vplog.graph.descent import is_large
 from vplog.graph.factors import anchored, as_array
 
 if TYPE_CHECKING:
@@ -23,6 +26,8 @@ _ROUGH_STEPS = 50
 """The same for headings where there are more loops than that: what is left is within the reach of least squares."""
 _LOST_RAD = np.pi / 3.0
 """Noise of the heading, rad, beyond which the chain's whole circles may be wrong: half a circle is three sigmas."""
+_HELD = 1e6
+"""How much more firmly than by any edge the first pose is held."""
 _LINEAR_TOLERANCE = 1e-4
 """They end at this share of the first residual: what follows corrects far more."""
 
@@ -36,8 +41,11 @@ def relaxed(factors: Factors, weight: Floats, chain: Floats) -> Floats | None:
     if len(factors.loose(weight)):
         return None
     try:
-        poses = _planar(factors, weight, chain) if factors.graph.dimension == 2 else _chordal(factors, weight)
-    except RuntimeError:  # of GTSAM's elimination
+        if factors.graph.dimension == 2:
+            poses = _planar(factors, weight, chain)
+        else:
+            poses = _chordal_large(factors, weight) if is_large(chain) else _chordal(factors, weight)
+    except (RuntimeError, GraphError):  # of GTSAM's elimination, and of our own
         return None
     return anchored(poses, factors.graph.world_from_body[0]) if np.isfinite(poses).all() else None
 
@@ -45,6 +53,48 @@ def relaxed(factors: Factors, weight: Floats, chain: Floats) -> Floats | None:
 def _chordal(factors: Factors, weight: Floats) -> Floats:
     """Chordal relaxation of the rotations, and one linear step: Carlone et al., ICRA 2015, III-B."""
     return as_array(gtsam.InitializePose3.initialize(factors.weighted(weight)), 3)
+
+
+def _chordal_large(factors: Factors, weight: Floats) -> Floats:
+    """The same relaxation of the rotations by our own elimination, and positions as a linear problem of their own."""
+    graph = factors.graph
+    n, held = len(graph.world_from_body), np.eye(3)
+    firmness = weight * np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3.0
+    # each row r of a rotation by itself: r_b = r_a a_from_b
+    diagonal = _ends(graph, firmness)[:, None, None] * np.eye(3)
+    diagonal[0] += firmness.max() * _HELD * held
+    right = np.zeros((n, 3, 3))
+    right[0] = firmness.max() * _HELD * held
+    between = -firmness[:, None, None] * graph.a_from_b[:, :3, :3]
+    shape = factors.elimination(weight > 0)
+    columns = Cholesky.of(shape, Blocks(diagonal, graph.a, graph.b, between)).solve(right)
+    left, _, turned = np.linalg.svd(np.swapaxes(columns, 1, 2))
+    left[:, :, 2] *= np.linalg.det(left @ turned)[:, None]  # the nearest rotations
+    rotation = left @ turned
+    firmness = weight * np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3.0
+    shift = (rotation[graph.a] @ graph.a_from_b[:, :3, 3:])[:, :, 0]
+    return geometry.pose(rotation, _apart(factors, weight, firmness, shift))
+
+
+def _apart(factors: Factors, weight: Floats, firmness: Floats, difference: Floats) -> Floats:
+    """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first is 0."""
+    graph = factors.graph
+    n = len(graph.world_from_body)
+    diagonal = _ends(graph, firmness)
+    diagonal[0] += firmness.max() * _HELD
+    tension = firmness[:, None] * difference
+    right = np.empty((n, tension.shape[1]))
+    for column, one in enumerate(np.ascontiguousarray(tension.T)):
+        right[:, column] = np.bincount(graph.b, one, n) - np.bincount(graph.a, one, n)
+    right[0] = 0.0
+    matrix = Blocks(diagonal[:, None, None], graph.a, graph.b, -firmness[:, None, None])
+    return Cholesky.of(factors.elimination(weight > 0), matrix).solve(right[:, None, :])[:, 0]
+
+
+def _ends(graph: PoseGraph, firmness: Floats) -> Floats:
+    """(N,) sum of the firmness of the edges at each pose."""
+    n = len(graph.world_from_body)
+    return np.asarray(np.bincount(graph.a, firmness, n) + np.bincount(graph.b, firmness, n), np.float64)
 
 
 def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
@@ -63,11 +113,18 @@ def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
     many = (np.abs(graph.a - graph.b) != 1).sum() > _LINEAR_STEPS
     steps = _ROUGH_STEPS if many else _LINEAR_STEPS
-    yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None], steps)[:, 0]
+    large = is_large(chain)
+    if large:
+        yaw = yaw[0] + _apart(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]
+    else:
+        yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None], steps)[:, 0]
     zero = np.zeros(len(yaw))
     poses = geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
     shift = (poses[graph.a, :2, :2] @ graph.a_from_b[:, :2, 3:])[:, :, 0]
     firmness = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
+    if large:
+        poses[:, :2, 3] = _apart(factors, weight, weight * firmness, shift)
+        return poses
     if many:  # factorising is faster
         poses[:, :2, 3] = _placed(graph, weight * firmness, shift)
         return poses

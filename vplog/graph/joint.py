@@ -33,6 +33,15 @@ class JoinSettings(Settings):
     least_closures: int = Field(default=3, ge=1)
     """Closures between two drives that the solve must keep. Nothing but another one can speak against a closure that
     alone joins two drives; a second may be of the same mistake, seldom a third at another keyframe."""
+    most_drives: int = Field(default=32, ge=1)
+    """Drives that one is verified against: those whose places are most like its own. With `propose.per_query`, which
+    bounds the candidates of a keyframe in all drives together, what a drive costs does not grow with their number."""
+    around: int = Field(default=10, ge=0)
+    """Keyframes either side of one whose best candidate in another drive is of the same place by geometry, of which
+    all candidates there are verified: half the window of `sequence.length`. Elsewhere the best alone is."""
+    keep_features: bool = True
+    """Whether a map keeps the features of its keyframes that verification looks at, 0.1 MB each, so that a new drive
+    needs neither the logs of those before it nor to extract from them again."""
 
 
 @dataclass(frozen=True, eq=False)

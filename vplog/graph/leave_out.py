@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import gtsam
 
     from vplog.data import Floats, Int32s, Ints, PoseGraph
+    from vplog.graph.cholesky import Cholesky
     from vplog.graph.factors import Factors
 
 _ALONE = 1e-9
@@ -69,7 +70,9 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     )
 
 
-def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: gtsam.GaussianBayesTree, loops: Ints) -> float:
+def cost_together(
+    factors: Factors, weight: Floats, poses: Floats, tree: gtsam.GaussianBayesTree | Cholesky, loops: Ints
+) -> float:
     """By how much chi-square falls without all of a few closures, to first order; `tree` as of marginals.factorised."""
     size = len(AXES[factors.graph.dimension])
     error, turned = _errors(factors.graph, poses, loops)

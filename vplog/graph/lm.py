@@ -10,7 +10,8 @@ from pydantic import Field
 from vplog.data import Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.factors import Factors, least_squares
+from vplog.graph.descent import LARGE_POSES, descend, is_large
+from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.settings import Settings
 
@@ -41,8 +42,9 @@ def solve_kept(
 ) -> Solution:
     """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
     graph = factors.graph
-    fit = least_squares(factors, factors.weighted(weight), start, max_iterations, tolerance)
+    fit = descend(factors, weight, start, max_iterations, tolerance)
     end = "converged" if fit.converged else "stopped at the limit"
+    by = f" by sparse elimination, as for all of {LARGE_POSES} poses or more," if is_large(start) else ""
     return Solution(
         world_from_body=fit.world_from_body,
         weight=weight,
@@ -50,7 +52,7 @@ def solve_kept(
         error_after=half_chi2(graph, weight, fit.world_from_body),
         iterations=fit.iterations,
         converged=fit.converged,
-        reason=f"{found}Least squares {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
+        reason=f"{found}Least squares{by} {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
     )
 
 

@@ -65,18 +65,21 @@ class PcmSettings(Settings):
         start = initial_poses(factors, weight)
         return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, found)
 
-    def consistent(self, graph: PoseGraph, loops: Ints) -> tuple[Ints, bool]:
-        """The largest set among the edges `loops` found, in order, and whether there is none larger."""
-        chosen = loops
+    def consistent(self, graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> tuple[Ints, bool]:
+        """The largest set among the edges `loops` found, in order, and whether there is none larger.
+
+        `chain` is the graph's where it is at hand.
+        """
+        chain, chosen = chain or OdometryChain.of(graph), loops
         if len(loops) > self.most_closures:
-            apart = OdometryChain.of(graph).distance(loops, graph)
+            apart = chain.distance(loops, graph)
             chosen = np.sort(loops[np.argsort(apart, kind="stable")[: self.most_closures]])
         bound = chi2_quantile(self.pair_probability, degrees_of_freedom(graph))
-        members, exact = largest_clique(consistency(graph, chosen, bound), self.clique_steps)
+        members, exact = largest_clique(consistency(graph, chosen, bound, chain), self.clique_steps)
         return chosen[members], exact and len(chosen) == len(loops)
 
 
-def consistency(graph: PoseGraph, loops: Ints, bound: float) -> Bools:
+def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChain | None = None) -> Bools:
     """(K, K) whether each two of the closures agree: the way round both, by odometry, comes back to where it began.
 
     A closure a, b claims that the world is displaced by D = X_a z X_b^-1 between two visits, X the odometry; two agree
@@ -85,14 +88,14 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float) -> Bools:
     each other, which counts as agreement.
     """
     axes = AXES[graph.dimension]
-    chain = OdometryChain.of(graph)
+    chain = chain or OdometryChain.of(graph)
     # written from the earlier to the later pose, so that two that are written either way round compare
     a, b = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
     back = (graph.a[loops] > graph.b[loops])[:, None, None]
     measured = np.where(back, geometry.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
-    poses = geometry.between(chain.poses[:1], chain.poses)
-    displaced = poses[a] @ measured @ geometry.inverse(poses[b])
-    at_end = geometry.adjoint(poses[graph.b[loops]])[:, axes][:, :, axes]
+    at_a, at_b = (geometry.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
+    displaced = at_a @ measured @ geometry.inverse(at_b)
+    at_end = geometry.adjoint(np.where(back, at_a, at_b))[:, axes][:, :, axes]
     noise = at_end @ np.linalg.inv(informed(graph)[loops]) @ np.swapaxes(at_end, 1, 2)
     # what happens before the displacement, seen after it: the walk to a, and the noise of a closure written backwards
     after = geometry.adjoint(geometry.inverse(displaced))[:, axes][:, :, axes]

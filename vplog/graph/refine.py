@@ -15,6 +15,7 @@ from pydantic import Field
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, is_loop, residual_sigma
+from vplog.graph.descent import descend
 from vplog.graph.factors import Factors, least_squares
 from vplog.graph.marginals import edge_covariances
 from vplog.graph.satellites import Fixes, believe, chi2_of_fixes, with_fixes, world_from_enu
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 _STEP = 1e-4
 """Of the scale, for differences: far above rounding, far below what any drive tells."""
+_STEPS = 20
+"""Of least squares at most: each starts from the last round's best poses."""
 _LONGEST = 0.05
 """Largest change of the scale in one round."""
 
@@ -97,8 +100,8 @@ def refine(
     for _ in range(settings.max_rounds):
         present = rescaled(graph, of_odometry, ~loops, noise, scale)
         factors = Factors.of(present)
-        weighted = _weighted(factors, weight, poses, fixes, believed)
-        poses = least_squares(factors, weighted, poses, 20, 1e-6).world_from_body
+        weighted = None if fixes is None else with_fixes(factors, weight, poses, fixes, believed)
+        poses = _settled(factors, weight, weighted, poses, 1e-6)
         before = noise, scale
         if settings.noise:
             noise *= _misjudged(factors, weight, weighted, poses, ~loops, settings.least_redundancy)
@@ -124,10 +127,11 @@ def rescaled(graph: PoseGraph, of_odometry: Bools, odometry: Bools, noise: float
     return replace(graph, a_from_b=a_from_b, information=information)
 
 
-def _weighted(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes | None, believed: Floats) -> Any:
-    if fixes is None:
-        return factors.weighted(weight)
-    return with_fixes(factors, weight, poses, fixes, believed)
+def _settled(factors: Factors, weight: Floats, weighted: Any, start: Floats, tolerance: float) -> Floats:
+    """The best poses (N, 4, 4) from `start` for the weighted edges, or for the graph `weighted` where that is given."""
+    if weighted is None:
+        return descend(factors, weight, start, _STEPS, tolerance).world_from_body
+    return least_squares(factors, weighted, start, _STEPS, tolerance).world_from_body
 
 
 def _misjudged(
@@ -174,8 +178,8 @@ def _scale_step(
 
     def slope(at: float, start: Floats) -> float:
         factors = Factors.of(rescaled(graph, of_odometry, odometry, noise, at))
-        weighted = _weighted(factors, weight, start, fixes, believed)
-        best = least_squares(factors, weighted, start, 20, 1e-8).world_from_body
+        weighted = None if fixes is None else with_fixes(factors, weight, start, fixes, believed)
+        best = _settled(factors, weight, weighted, start, 1e-8)
         errors = [
             float((weight * residual_sigma(rescaled(graph, of_odometry, odometry, noise, at + side), best) ** 2).sum())
             for side in (-_STEP, _STEP)

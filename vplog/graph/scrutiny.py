@@ -10,12 +10,13 @@ import numpy as np
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, residual_sigma
-from vplog.graph.factors import Factors, least_squares
+from vplog.graph.descent import descend
 from vplog.graph.leave_out import cost_together, distance, group_costs, groups, tension
 from vplog.graph.marginals import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
+    from vplog.graph.factors import Factors
     from vplog.graph.leave_out import Tension
 
 _WORST_SHARE = 0.5
@@ -102,7 +103,7 @@ class Scrutiny:
         suspects = [members for members in suspects[:_MOST_SUSPECTS] if members.tobytes() not in cleared]
         if not suspects:
             return None
-        tree = factorised(factors, factors.weighted(state.weight), state.poses)
+        tree = factorised(factors, state.weight, state.poses)
         for members in suspects:
             cost = min(cost_together(factors, state.weight, state.poses, tree, members), state.chi2)
             if cost > self.limit_of_group(state, np.array([cost]), len(members))[0]:
@@ -167,8 +168,7 @@ class Scrutiny:
 
     def settle(self, weight: Floats, poses: Floats) -> State:
         """Least squares with these weights (E,) from these poses."""
-        weighted = self.factors.weighted(weight)
-        poses = least_squares(self.factors, weighted, poses, self.max_iterations, _SETTLED).world_from_body
+        poses = descend(self.factors, weight, poses, self.max_iterations, _SETTLED).world_from_body
         return State(weight, poses, float((weight * residual_sigma(self.factors.graph, poses) ** 2).sum()))
 
 

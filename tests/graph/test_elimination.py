@@ -1,0 +1,165 @@
+"""Our own elimination of large graphs does what dense matrices, and GTSAM on smaller graphs, do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.graphs import city, spoiled
+from tests.benchmarks.large_graphs import drives
+from vplog import geometry
+from vplog.errors import GraphError
+from vplog.graph import descent
+from vplog.graph.cholesky import Blocks, Cholesky
+from vplog.graph.consistency import is_loop, residual_sigma
+from vplog.graph.elimination import Elimination
+from vplog.graph.factors import Factors, as_values
+from vplog.graph.gnc import GncSettings
+from vplog.graph.inverse import inverse_blocks, joint_inverse
+from vplog.graph.leave_out import cost_together, tension
+from vplog.graph.lm import LmSettings
+from vplog.graph.marginals import edge_covariances, factorised
+from vplog.graph.normal import normal_equations
+
+from .drive import ring
+
+if TYPE_CHECKING:
+    from vplog.data import PoseGraph
+
+GRAPHS = {"planar": city(400, seed=1), "spatial": ring(80, loops=10).graph, "drives": drives(600, each=300, seed=2)}
+EXACT = {2: 1e-4, 3: 1e-7}
+"""GTSAM loses digits of a planar edge's derivative where its residual turns by less than a milliradian."""
+each_graph = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS)
+
+
+def random_matrix(nodes: int, chords: int, size: int, seed: int) -> tuple[Blocks, np.ndarray]:
+    """A positive definite matrix of a chain with chords, some of them twice, in blocks and dense (n d, n d)."""
+    random = np.random.default_rng(seed)
+    a = np.concatenate([np.arange(nodes - 1), random.integers(0, nodes, chords)])
+    b = np.concatenate([np.arange(1, nodes), random.integers(0, nodes, chords)])
+    ends = np.stack([a, b])[:, a != b].astype(np.int32)
+    a, b = np.repeat(ends, random.integers(1, 3, ends.shape[1]), axis=1)
+    by_a, by_b = random.normal(size=(2, len(a), size, size))
+    diagonal = np.tile(0.1 * np.eye(size), (nodes, 1, 1))
+    np.add.at(diagonal, a, np.swapaxes(by_a, 1, 2) @ by_a)
+    np.add.at(diagonal, b, np.swapaxes(by_b, 1, 2) @ by_b)
+    other = np.swapaxes(by_a, 1, 2) @ by_b
+    return Blocks(diagonal, a, b, other), dense(Blocks(diagonal, a, b, other))
+
+
+def dense(matrix: Blocks) -> np.ndarray:
+    nodes, size, _ = matrix.diagonal.shape
+    whole = np.zeros((nodes, nodes, size, size))
+    whole[range(nodes), range(nodes)] = matrix.diagonal
+    np.add.at(whole, (matrix.a, matrix.b), matrix.other)
+    np.add.at(whole, (matrix.b, matrix.a), np.swapaxes(matrix.other, 1, 2))
+    return whole.transpose(0, 2, 1, 3).reshape(nodes * size, -1)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "chords", "size"), [(1, 0, 3), (2, 0, 6), (40, 5, 1), (40, 30, 3), (300, 200, 3), (120, 150, 6)]
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords: int, size: int, seed: int) -> None:
+    matrix, whole = random_matrix(nodes, chords, size, seed)
+    random = np.random.default_rng(seed)
+    shape = Elimination.of(nodes, matrix.a, matrix.b)
+    assert sorted(shape.place.tolist()) == list(range(nodes))
+    factor = Cholesky.of(shape, matrix)
+    right = random.normal(size=(nodes, size, 2))
+    np.testing.assert_allclose(whole @ factor.solve(right).reshape(-1, 2), right.reshape(-1, 2), atol=1e-9)
+    inverse = np.linalg.inv(whole).reshape(nodes, size, nodes, size).transpose(0, 2, 1, 3)
+    largest = 1e-10 * np.abs(inverse).max()
+    some = random.permutation(len(matrix.a))[: len(matrix.a) // 2]
+    a, b = matrix.a[some], matrix.b[some]
+    for found, expected in zip(
+        inverse_blocks(factor, a, b), (inverse[a, a], inverse[a, b], inverse[b, b]), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=largest)
+    few = random.permutation(nodes)[:5]
+    expected = inverse[few][:, few].transpose(0, 2, 1, 3).reshape(len(few) * size, -1)
+    np.testing.assert_allclose(joint_inverse(factor, few), expected, rtol=0, atol=largest)
+    assert Cholesky.of(shape, matrix).values.tobytes() == factor.values.tobytes()
+
+
+@pytest.mark.parametrize("wrong", [-1.0, 0.0, np.nan])
+def test_a_matrix_that_is_not_positive_definite_is_refused(wrong: float) -> None:
+    matrix, _ = random_matrix(30, 5, 3, 0)
+    diagonal = matrix.diagonal.copy()
+    diagonal[17] *= wrong
+    with pytest.raises(GraphError, match="too open"):
+        Cholesky.of(Elimination.of(30, matrix.a, matrix.b), replace(matrix, diagonal=diagonal))
+
+
+@each_graph
+def test_normal_equations_are_those_of_gtsam(graph: PoseGraph) -> None:
+    random = np.random.default_rng(0)
+    size, axes = (3, [2, 3, 4]) if graph.dimension == 2 else (6, list(range(6)))
+    twist = np.zeros((len(graph.world_from_body), 6))
+    twist[:, axes] = 0.2 * random.normal(size=(len(twist), size))
+    poses = geometry.between(graph.world_from_body[:1], graph.world_from_body @ geometry.exp(twist))
+    weight = random.uniform(0.1, 1.0, len(graph.a))
+    weight[3] = 0.0
+    matrix, slope, error = normal_equations(graph, weight, poses)
+    assert error == pytest.approx(0.5 * (weight * residual_sigma(graph, poses) ** 2).sum(), rel=1e-12)
+    # weights of 0 leave no factor, and the gauge is on the first pose alone
+    factors = Factors.of(graph)
+    linear = factors.weighted(np.maximum(weight, 1e-30)).linearize(as_values(poses, graph.dimension))
+    expected, right = linear.hessian()
+    order = [2, 0, 1] if graph.dimension == 2 else axes
+    expected = expected.reshape(-1, size, len(poses), size)[:, order][:, :, :, order].reshape(len(poses) * size, -1)
+    whole, right = dense(matrix), right.reshape(-1, size)[:, order]
+    np.testing.assert_allclose(
+        whole[size:, size:], expected[size:, size:], rtol=0, atol=EXACT[graph.dimension] * np.abs(whole).max()
+    )
+    np.testing.assert_allclose(slope[1:], -right[1:], rtol=0, atol=EXACT[graph.dimension] * np.abs(slope).max())
+
+
+@each_graph
+def test_large_graphs_are_solved_as_small_ones(graph: PoseGraph, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = LmSettings(tolerance=1e-9)(graph)
+    assert "elimination" not in small.reason
+    weight, loops = np.ones(len(graph.a)), np.flatnonzero(is_loop(graph))
+    covariance = edge_covariances(Factors.of(graph), weight, small.world_from_body, loops)
+    factors, pair = Factors.of(graph), loops[:3]
+    tree = factorised(factors, weight, small.world_from_body)
+    cost = cost_together(factors, weight, small.world_from_body, tree, pair)
+    pull = tension(factors, weight, small.world_from_body, loops)
+
+    monkeypatch.setattr(descent, "LARGE_POSES", 10)
+    large = LmSettings(tolerance=1e-9)(graph)
+    assert "elimination" in large.reason
+    assert large.error_after == pytest.approx(small.error_after, rel=1e-6)
+    np.testing.assert_allclose(large.world_from_body, small.world_from_body, atol=1e-3)
+    assert LmSettings(tolerance=1e-9)(graph).world_from_body.tobytes() == large.world_from_body.tobytes()
+    found = edge_covariances(Factors.of(graph), weight, small.world_from_body, loops)
+    np.testing.assert_allclose(found, covariance, rtol=1e-5, atol=EXACT[graph.dimension] * np.abs(covariance).max())
+    tree = factorised(factors, weight, small.world_from_body)
+    assert cost_together(factors, weight, small.world_from_body, tree, pair) == pytest.approx(cost, rel=1e-5)
+    np.testing.assert_allclose(
+        tension(factors, weight, small.world_from_body, loops).cost, pull.cost, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_large_graphs_lose_the_same_closures(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, false = spoiled(GRAPHS["planar"], 0.3, 0)
+    small = GncSettings()(graph)
+    monkeypatch.setattr(descent, "LARGE_POSES", 10)
+    large = GncSettings()(graph)
+    np.testing.assert_array_equal(large.weight, small.weight)
+    assert large.error_after == pytest.approx(small.error_after, rel=1e-5)
+    assert not large.weight[false].any()
+
+
+def test_drives_that_only_closures_join_are_solved_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(descent, "LARGE_POSES", 10)
+    graph = GRAPHS["drives"]
+    solution = GncSettings()(graph)
+    assert solution.weight[is_loop(graph)].mean() > 0.9
+    apart = np.setdiff1d(np.arange(len(graph.a)), np.flatnonzero(is_loop(graph) & (graph.a < 300) & (graph.b >= 300)))
+    weight = np.where(np.isin(np.arange(len(graph.a)), apart), 1.0, 0.0)
+    alone = descent.descend(Factors.of(graph), weight, graph.world_from_body, 20, 1e-6)
+    np.testing.assert_allclose(alone.world_from_body[300], graph.world_from_body[300], atol=1e-6)

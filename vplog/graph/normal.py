@@ -1,0 +1,272 @@
+"""The normal equations of a pose graph at some poses, edge by edge in compiled loops."""
+
+from __future__ import annotations
+
+from math import atan2, cos, sin, sqrt
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+from vplog.graph.build import informed
+from vplog.graph.cholesky import Blocks
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Int32s, PoseGraph
+
+
+def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[Blocks, Floats, float]:
+    """Half the second and the first derivatives (n, d) of the weighted chi-square, and half of it, at `poses`.
+
+    By a small motion of each pose in its own frame, rotation first, d = 6, or 3 in the plane. The residual of an edge
+    is e = log(b_from_a_measured a_from_b), as GTSAM's BetweenFactor has it; it moves with b as the inverse of the right
+    Jacobian of the exponential at e says, J, and with a as -J Ad(b_from_a) (Barfoot 2017, eq. 7.77, 7.83).
+    """
+    size = 3 if graph.dimension == 2 else 6
+    n, edges = len(poses), len(graph.a)
+    diagonal, slope = np.zeros((n, size, size)), np.zeros((n, size))
+    other = np.empty((edges, size, size))
+    terms = _planar if graph.dimension == 2 else _spatial
+    information = np.ascontiguousarray(informed(graph), np.float64)
+    error = terms(
+        graph.a, graph.b, np.ascontiguousarray(graph.a_from_b), information, weight, np.ascontiguousarray(poses),
+        diagonal, other, slope,
+    )  # fmt: skip
+    return Blocks(diagonal, graph.a, graph.b, other), slope, error
+
+
+def half_chi2_of(graph: PoseGraph, weight: Floats, poses: Floats) -> float:
+    """Half the weighted chi-square, at `poses`."""
+    terms = _planar if graph.dimension == 2 else _spatial
+    none = np.empty((0, 0, 0))
+    information = np.ascontiguousarray(informed(graph), np.float64)
+    return terms(
+        graph.a, graph.b, np.ascontiguousarray(graph.a_from_b), information, weight, np.ascontiguousarray(poses),
+        none, none, np.empty((0, 0)),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _planar(
+    a: Int32s,
+    b: Int32s,
+    measured: Floats,
+    information: Floats,
+    weight: Floats,
+    poses: Floats,
+    diagonal: Floats,
+    other: Floats,
+    slope: Floats,
+) -> float:
+    """Add what each edge says; nothing but half the chi-square where `diagonal` is empty."""
+    total = 0.0
+    error, move, bend, turned, say = np.empty(3), np.zeros((3, 3)), np.eye(3), np.empty((3, 3)), np.empty((3, 3))
+    for edge in range(len(a)):
+        if weight[edge] == 0.0:
+            if len(diagonal):
+                other[edge] = 0.0
+            continue
+        one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
+        # b seen from a, and that seen from where b was measured
+        dx, dy = two[0, 3] - one[0, 3], two[1, 3] - one[1, 3]
+        x, y = one[0, 0] * dx + one[1, 0] * dy, one[0, 1] * dx + one[1, 1] * dy
+        c = one[0, 0] * two[0, 0] + one[1, 0] * two[1, 0]
+        s = one[0, 0] * two[1, 0] - one[1, 0] * two[0, 0]
+        ex, ey = x - seen[0, 3], y - seen[1, 3]
+        ex, ey = seen[0, 0] * ex + seen[1, 0] * ey, seen[0, 1] * ex + seen[1, 1] * ey
+        turn = atan2(seen[0, 0] * s - seen[1, 0] * c, seen[0, 0] * c + seen[1, 0] * s)
+        half = turn / 2.0
+        straight = 1.0 - half**2 / 3.0 - half**4 / 45.0 - 2.0 * half**6 / 945.0  # h cot h where h is small
+        curve = 1.0 / 12.0 + turn * turn / 720.0
+        if abs(half) >= 1e-2:
+            straight = half * cos(half) / sin(half)
+            curve = (1.0 - straight) / (turn * turn)
+        error[0], error[1], error[2] = turn, straight * ex + half * ey, straight * ey - half * ex
+        # Ad(b_from_a), negative; b_from_a turns by -turn of b and shifts by (-c x - s y, s x - c y)
+        move[0, 0] = -1.0
+        move[1, 0], move[2, 0] = -(s * x - c * y), -(c * x + s * y)
+        move[1, 1], move[1, 2], move[2, 1], move[2, 2] = -c, -s, s, -c
+        # I + ad / 2 + curve ad^2 with ad = (0 0 0, y 0 -turn, -x turn 0) of the residual
+        bend[1, 0] = error[2] / 2.0 + curve * turn * error[1]
+        bend[2, 0] = -error[1] / 2.0 + curve * turn * error[2]
+        bend[1, 1] = bend[2, 2] = 1.0 - curve * turn * turn
+        bend[1, 2], bend[2, 1] = -half, half
+        _product(bend, move, turned)
+        total += _add(
+            edge, a[edge], b[edge], error, turned, bend, information, weight[edge], diagonal, other, slope, say
+        )
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _spatial(
+    a: Int32s,
+    b: Int32s,
+    measured: Floats,
+    information: Floats,
+    weight: Floats,
+    poses: Floats,
+    diagonal: Floats,
+    other: Floats,
+    slope: Floats,
+) -> float:
+    """Add what each edge says; nothing but half the chi-square where `diagonal` is empty."""
+    total = 0.0
+    error, move, bend, moved, say = (
+        np.empty(6), np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    )  # fmt: skip
+    ad, square, fourth = np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    turned, rest, x, shift = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for edge in range(len(a)):
+        if weight[edge] == 0.0:
+            if len(diagonal):
+                other[edge] = 0.0
+            continue
+        one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
+        for i in range(3):  # b seen from a
+            x[i] = 0.0
+            for k in range(3):
+                x[i] += one[k, i] * (two[k, 3] - one[k, 3])
+            for j in range(3):
+                turned[i, j] = one[0, i] * two[0, j] + one[1, i] * two[1, j] + one[2, i] * two[2, j]
+        for i in range(3):  # that seen from where b was measured
+            shift[i] = 0.0
+            for k in range(3):
+                shift[i] += seen[k, i] * (x[k] - seen[k, 3])
+            for j in range(3):
+                rest[i, j] = seen[0, i] * turned[0, j] + seen[1, i] * turned[1, j] + seen[2, i] * turned[2, j]
+        _logarithm(rest, shift, error)
+        # Ad(b_from_a), negative: R^T and -R^T [x] with a_from_b = (R, x)
+        for i in range(3):
+            r0, r1, r2 = turned[0, i], turned[1, i], turned[2, i]
+            move[i, 0], move[i, 1], move[i, 2] = -r0, -r1, -r2
+            move[3 + i, 3], move[3 + i, 4], move[3 + i, 5] = -r0, -r1, -r2
+            move[3 + i, 0], move[3 + i, 1], move[3 + i, 2] = (
+                r1 * x[2] - r2 * x[1],
+                r2 * x[0] - r0 * x[2],
+                (r0 * x[1] - r1 * x[0]),
+            )
+        _bend(error, bend, ad, square, fourth)
+        _product(bend, move, moved)
+        total += _add(
+            edge, a[edge], b[edge], error, moved, bend, information, weight[edge], diagonal, other, slope, say
+        )
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _logarithm(rotation: Floats, shift: Floats, error: Floats) -> None:
+    """The twist of a motion, as geometry.log: through the quaternion, stable up to half a turn."""
+    m = rotation
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    if trace >= 0.0:
+        w = 1.0 + trace
+        x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    elif m[0, 0] >= m[1, 1] and m[0, 0] >= m[2, 2]:
+        x = 1.0 + m[0, 0] - m[1, 1] - m[2, 2]
+        w, y, z = m[2, 1] - m[1, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]
+    elif m[1, 1] >= m[2, 2]:
+        y = 1.0 - m[0, 0] + m[1, 1] - m[2, 2]
+        w, x, z = m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 2] + m[2, 1]
+    else:
+        z = 1.0 - m[0, 0] - m[1, 1] + m[2, 2]
+        w, x, y = m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    norm = sqrt(x * x + y * y + z * z)
+    scale = 2.0 / w if norm < 1e-9 * w else 2.0 * atan2(norm, w) / norm
+    x, y, z = scale * x, scale * y, scale * z
+    # the inverse of the left Jacobian: v = t - omega x t / 2 + k omega x (omega x t)
+    square = x * x + y * y + z * z
+    half = sqrt(square) / 2.0
+    k = 1.0 / 12.0 + square / 720.0
+    if half > 1e-2:
+        k = (1.0 - half * cos(half) / sin(half)) / square
+    cx, cy, cz = y * shift[2] - z * shift[1], z * shift[0] - x * shift[2], x * shift[1] - y * shift[0]
+    error[0], error[1], error[2] = x, y, z
+    error[3] = shift[0] - cx / 2.0 + k * (y * cz - z * cy)
+    error[4] = shift[1] - cy / 2.0 + k * (z * cx - x * cz)
+    error[5] = shift[2] - cz / 2.0 + k * (x * cy - y * cx)
+
+
+@numba.njit(cache=True, nogil=True)
+def _product(a: Floats, b: Floats, result: Floats) -> None:
+    size = len(a)
+    for i in range(size):
+        for j in range(size):
+            result[i, j] = 0.0
+            for k in range(size):
+                result[i, j] += a[i, k] * b[k, j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _bend(error: Floats, bend: Floats, ad: Floats, square: Floats, fourth: Floats) -> None:
+    """The inverse of the right Jacobian of the exponential at a twist (6,), in `bend`; the others are room for it.
+
+    x / (1 - exp(-x)) of x = ad(e), which is 1 + x / 2 + p x^2 + q x^4 exactly as (x^2 + angle^2)^2 x = 0.
+    """
+    angle2 = error[0] ** 2 + error[1] ** 2 + error[2] ** 2
+    if angle2 < 1e-2:
+        p, q = 1.0 / 12.0 - angle2**2 / 30240.0, -1.0 / 720.0 - angle2 / 15120.0
+    else:
+        half = sqrt(angle2) / 2.0
+        even = half * cos(half) / sin(half) - 1.0  # x / 2 coth(x / 2) - 1, a function of x^2, at -angle^2
+        its_slope = (half / sin(half) ** 2 - cos(half) / sin(half)) / (8.0 * half)
+        p = -its_slope - 2.0 * even / angle2
+        q = -(even + its_slope * angle2) / angle2**2
+    for at in range(3):
+        after, last = (at + 1) % 3, (at + 2) % 3
+        ad[at, after] = ad[3 + at, 3 + after] = -error[last]
+        ad[at, last] = ad[3 + at, 3 + last] = error[after]
+        ad[3 + at, after], ad[3 + at, last] = -error[3 + last], error[3 + after]
+    _product(ad, ad, square)
+    _product(square, square, fourth)
+    for i in range(6):
+        for j in range(6):
+            bend[i, j] = ad[i, j] / 2.0 + p * square[i, j] + q * fourth[i, j]
+        bend[i, i] += 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(
+    edge: int,
+    a: int,
+    b: int,
+    error: Floats,
+    by_a: Floats,
+    by_b: Floats,
+    information: Floats,
+    weight: float,
+    diagonal: Floats,
+    other: Floats,
+    slope: Floats,
+    say: Floats,
+) -> float:
+    """Half the chi-square of one edge, which moves with its ends as `by_a` and `by_b` (d, d) say; its share of the
+    normal equations is added."""
+    size = len(error)
+    believed = information[edge]
+    half = 0.0
+    for i in range(size):
+        for j in range(size):
+            half += 0.5 * weight * error[i] * believed[i, j] * error[j]
+    if len(diagonal) == 0:
+        return half
+    for end in range(2):
+        node, by = (a, by_a) if end == 0 else (b, by_b)
+        for i in range(size):  # J^T of the edge times its information
+            for j in range(size):
+                say[i, j] = 0.0
+                for k in range(size):
+                    say[i, j] += by[k, i] * believed[k, j]
+                say[i, j] *= weight
+        for i in range(size):
+            for j in range(size):
+                slope[node, i] += say[i, j] * error[j]
+                for k in range(size):
+                    diagonal[node, i, j] += say[i, k] * by[k, j]
+                if end == 0:
+                    other[edge, i, j] = 0.0
+                    for k in range(size):
+                        other[edge, i, j] += say[i, k] * by_b[k, j]
+    return half
