@@ -9,7 +9,6 @@ import pytest
 from vplog import geometry
 from vplog.data import Camera, Closures, Features, Keyframes, Verdict
 from vplog.errors import LogError
-from vplog.loops import verify_metric
 from vplog.loops.landmarks import LandmarkSettings
 from vplog.loops.verify import VerifySettings, verify
 from vplog.loops.verify_metric import MetricSettings
@@ -287,17 +286,3 @@ def test_an_unknown_lens_stops_before_the_work() -> None:
     lens, frames, _, _ = drive(False)
     with pytest.raises(LogError, match="distortion model"):
         verify(proposals([(LAP, 0)]), frames, replace(lens, distortion_model="fov"), lambda _: 1 / 0, EXACT)  # type: ignore[arg-type]
-
-
-def test_derivatives_of_the_pose_agree_with_differences() -> None:
-    rng = np.random.default_rng(8)
-    at = geometry.exp(rng.normal(0, 0.1, 6))
-    points = np.column_stack([rng.uniform(-0.5, 0.5, (4, 2)), rng.uniform(0.05, 0.5, 4)])
-    here, by_pose, by_point = verify_metric._predict(at, points)
-    step = 1e-6
-    for axis in range(6):
-        moved, _, _ = verify_metric._predict(at @ geometry.exp(step * np.eye(6)[axis]), points)
-        np.testing.assert_allclose(by_pose[..., axis], (moved - here) / step, atol=1e-5)
-    for axis in range(3):
-        moved, _, _ = verify_metric._predict(at, points + step * np.eye(3)[axis])
-        np.testing.assert_allclose(by_point[..., axis], (moved - here) / step, atol=1e-5)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
+from vplog import geometry
 from vplog.data import Verdict
 from vplog.loops import two_way, undistort, verify_direction, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
@@ -21,7 +22,7 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vplog.data import Camera, Features, Keyframes
+    from vplog.data import Camera, Features, Floats, Keyframes
 
     FeaturesOf = Callable[[int], Features]
 
@@ -124,7 +125,8 @@ def check_back(
         if row.pairs is None:
             raise ValueError("a row without a pose was to be checked the other way round")
         mine, found = row.pairs
-        back = _check_metric(earlier, earlier.features(match), found, mine, known, later.stereo, lenient)
+        there = None if row.pose.match_from_query is None else geometry.inverse(row.pose.match_from_query)
+        back = _check_metric(earlier, earlier.features(match), found, mine, known, later.stereo, lenient, there)
         if back.landmarks < later.settings.metric.min_inliers:
             result.append(row)
         else:
@@ -145,9 +147,10 @@ def _check_metric(
     known: Landmarks,
     stereo: bool,
     metric: MetricSettings,
+    start: Floats | None = None,
 ) -> Row:
     """Features `mine` (K,) of one frame of `drive` against the landmarks of `found` (K,) in the other frame, whose
-    depths, if it has any, are of a stereo pair or not."""
+    depths, if it has any, are of a stereo pair or not; `start` is a pose to try first."""
     settings, camera = drive.settings, drive.camera
     rays = undistort.rays(camera, own.points[mine])
     usable = known.known[found] & np.isfinite(rays).all(axis=1)
@@ -167,6 +170,7 @@ def _check_metric(
         camera,
         settings.landmarks,
         metric,
+        start,
     )
     if pose.verdict is not Verdict.ACCEPTED:
         return Row(matches, count, pose)

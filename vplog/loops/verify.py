@@ -18,7 +18,6 @@ from vplog.loops.landmarks import for_stereo
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from concurrent.futures import Executor
 
     from vplog.data import Camera, Features, Floats, Int32s, Ints, Keyframes
     from vplog.loops.propose import Proposals
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     FeaturesOf = Callable[[int], Features]
     Progress = Callable[[int, int], None]
 
-__all__ = ["Drive", "VerifySettings", "drive_of", "verify", "verify_between"]
+__all__ = ["Drive", "VerifySettings", "calibration_share", "drive_of", "verify", "verify_between"]
 _LOG = logging.getLogger(__name__)
 _SUSPICIOUS_SHARE = 0.05
 """Disagreement of camera and odometry that is worth a word: five times a careful calibration's error."""
@@ -69,15 +68,27 @@ def drive_of(
 
 
 def verify_between(
-    proposals: Proposals, later: Drive, earlier: Drive, threads: int = 1, progress: Progress | None = None
+    proposals: Proposals,
+    later: Drive,
+    earlier: Drive,
+    threads: int = 1,
+    progress: Progress | None = None,
+    share: float | None = None,
 ) -> Closures:
     """The ledger of proposals whose queries are rows of `later` and whose matches are rows of `earlier`, in order.
 
     Both may be the same drive. `progress(done, total)` counts candidates and is called from the caller's thread. The
     result does not depend on `threads`. Candidates are worked through by map frame, whose landmarks are made once, and
     only when some query shares enough features with it; those believed are then looked at the other way round.
+    `share` is the larger `calibration_share` of the two drives, where it is known already.
     """
     total = len(proposals.query)
+    bent = 0.0
+    if share is not None:
+        bent = share
+    elif total and later.camera.matrix is not None and earlier.camera.matrix is not None:
+        drives = [later] if later is earlier else [later, earlier]
+        bent = max(calibration_share(drive, threads) for drive in drives)
 
     def check(match: int, queries: list[int]) -> list[Row]:
         cv2.setNumThreads(1)  # one candidate, one thread; the pool is the only parallelism
@@ -85,14 +96,10 @@ def verify_between(
 
     def back(query: int, matches: list[int], believed: list[Row]) -> list[Row]:
         cv2.setNumThreads(1)
-        return check_back(later, earlier, query, matches, believed, share)
+        return check_back(later, earlier, query, matches, believed, bent)
 
     rows: dict[int, Row] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        share = 0.0
-        if total and later.camera.matrix is not None and earlier.camera.matrix is not None:
-            drives = [later] if later is earlier else [later, earlier]
-            share = max(_calibration_share(drive, pool) for drive in drives)
         groups = _by(proposals.match, proposals.query, np.arange(total))
         matches = [int(proposals.match[group[0]]) for group in groups]
         queries = [proposals.query[group].tolist() for group in groups]
@@ -108,7 +115,7 @@ def verify_between(
             one_way = [[rows[at] for at in group.tolist()] for group in groups]
             for group, found in zip(groups, pool.map(back, queries, matches, one_way), strict=True):
                 rows.update(zip(group.tolist(), found, strict=True))
-    return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, share)
+    return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, bent)
 
 
 def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
@@ -117,8 +124,8 @@ def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
     return np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(rows) else []
 
 
-def _calibration_share(drive: Drive, pool: Executor) -> float:
-    """By what share the camera's rotations over turning pairs disagree with the odometry's."""
+def calibration_share(drive: Drive, threads: int = 1) -> float:
+    """By what share the rotations of a calibrated camera disagree with the odometry's, over turning pairs."""
 
     def check(match: int, queries: list[int]) -> list[Row]:
         cv2.setNumThreads(1)
@@ -126,8 +133,9 @@ def _calibration_share(drive: Drive, pool: Executor) -> float:
 
     keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
     pairs = turning_pairs(keyframes, settings)
-    turns = pool.map(check, pairs[:, 0].tolist(), [[later] for later in pairs[:, 1].tolist()])
-    poses = [row.pose for (row,) in turns]
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        turns = pool.map(check, pairs[:, 0].tolist(), [[later] for later in pairs[:, 1].tolist()])
+        poses = [row.pose for (row,) in turns]
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
     driven = geometry.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
