@@ -26,6 +26,8 @@ class KeyframeSettings(Settings):
 
     distance_m: float | None = Field(default=None, ge=0)
     """Spacing in m; None takes 1 m, or a thousandth of the path where that is shorter (at least 5 cm)."""
+    sparseness: float = Field(default=1.0, gt=0, le=1000)
+    """Times the spacing that is taken where `distance_m` is None: 2 makes half as many keyframes."""
     rotation_deg: float = Field(default=10.0, ge=0)
     """Turning by this much makes a keyframe too: a tenth to a seventh of a usual field of view."""
     max_odometry_gap_s: float | None = Field(default=None, ge=0, le=1e9)
@@ -54,7 +56,7 @@ def select_keyframes(
             "Compare the clocks with `vplog info`, or choose another topic with --odometry-topic."
         )
     poses = geometry.interpolate_at(odometry.stamp_ns, odometry.odom_from_body, stamp_ns)
-    spacing = settings.distance_m if settings.distance_m is not None else _spacing(poses)
+    spacing = settings.distance_m if settings.distance_m is not None else settings.sparseness * _spacing(poses)
     rows = _far_enough(poses, spacing, np.deg2rad(settings.rotation_deg))
     return Keyframes(drive, stamp_ns[rows], poses[rows]), warnings
 

@@ -28,9 +28,9 @@ def blob(width: int, height: int, x: float, y: float, sigma: float) -> np.ndarra
 
 
 @pytest.mark.parametrize(("x", "y"), [(100.0, 60.0), (101.0, 57.0), (40.5, 80.25), (30.2, 31.7)])
-@pytest.mark.parametrize("sigma", [2.0, 4.0])
-def test_a_blob_is_found_at_its_middle(x: float, y: float, sigma: float) -> None:
-    points = SiftSettings()(blob(160, 120, x, y, sigma)).points
+@pytest.mark.parametrize(("sigma", "doubled"), [(2.0, True), (4.0, True), (4.0, False)])
+def test_a_blob_is_found_at_its_middle(x: float, y: float, sigma: float, doubled: bool) -> None:
+    points = SiftSettings(doubled=doubled)(blob(160, 120, x, y, sigma)).points
     np.testing.assert_allclose(points[0], [x, y], atol=0.1)
 
 

@@ -185,6 +185,18 @@ def test_the_figure_of_a_run(state: PaperBobbState) -> None:
     assert half == _measure(state, known + elsewhere, threads=1)
 
 
+def test_more_frames_are_looked_at_where_few_leave_it_open(
+    state: PaperBobbState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cov, "_FIRST", 8)
+    known, elsewhere = [0, 1, 2, 3, 4, 5, 6, 7], [60, 61, 62, 63, 64, 65, 66, 67]
+    good = _measure(state, [*known, 8, 9, 10, 11])
+    assert (good.explained, good.frames) == (1.0, 8)
+    mixed = _measure(state, [row for pair in zip(known, elsewhere, strict=True) for row in pair][1:])
+    assert mixed.frames == 15
+    assert mixed.explained == pytest.approx(7 / 15)
+
+
 def test_an_image_does_not_explain_itself() -> None:
     alone = [Reference(r.image, r.features, "one", r.stamp_ns) for r in map(reference, (0, 20, 40, 60))]
     state = SMALL.learn(alone, 1)
