@@ -53,9 +53,10 @@ def columns(folder: Path, table: str) -> dict[str, np.ndarray]:
     return {name: read[name].to_numpy() for name in read.schema.names}
 
 
-def test_a_run_folder_holds_every_file_and_no_scratch(finished: Path) -> None:
+def test_a_run_folder_holds_every_file_and_no_scratch_but_its_cache(finished: Path) -> None:
     assert all(len(data) for data in contents(finished).values())
-    assert not [path.name for path in finished.rglob(".*")]
+    assert [path.name for path in finished.rglob(".*")] == [".cache"]
+    assert {path.suffix for path in (finished / ".cache").iterdir()} == {".stage", ".json"}
 
 
 def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Drive) -> None:
@@ -67,9 +68,10 @@ def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Drive
     assert {"python", "numpy", "gtsam", "pyarrow"} <= record["versions"].keys()
     assert "unknown" not in record["versions"].values()
     stages = record["stages"]
-    names = "read extract learn cover describe propose verify solve write report"
+    names = "read extract choose learn cover describe propose verify solve write report"
     assert list(stages) == names.split()
     for stage in stages.values():
+        assert stage["result"] == "computed"
         assert stage["seconds"] >= 0
         assert stage["peak_memory_mb"] > 10
     counts = record["counts"]
@@ -89,12 +91,12 @@ def test_the_same_bytes_from_any_number_of_threads_and_over_an_old_run(
 ) -> None:
     run(drive.log, tmp_path, load_pipeline("default"), threads=1)
     one = contents(tmp_path)
-    (tmp_path / ".features").write_bytes(b"left by a run that was killed")
-    run(drive.log, tmp_path, load_pipeline("default"), threads=4)
+    (tmp_path / ".cache" / ".extract-000000.stage.1.part").write_bytes(b"left by a run that was killed")
+    run(drive.log, tmp_path, load_pipeline("default"), threads=4, use_cache=False)
     for name, data in contents(finished).items():
         assert one[name] == data, f"{name} differs between one thread and two"
         assert (tmp_path / name).read_bytes() == data, f"{name} differs between four threads and two"
-    assert not (tmp_path / ".features").exists()
+    assert not (tmp_path / ".cache").exists()
 
 
 def test_closures_take_out_the_drift(finished: Path, drive: Drive) -> None:

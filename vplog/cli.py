@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from vplog.evaluate.place_truth import TruthChoice
+    from vplog.logs import TopicChoice
+    from vplog.pipeline import Pipeline
 
     Verb = Callable[[argparse.Namespace], None]
 
@@ -141,21 +143,21 @@ def library(arguments: argparse.Namespace) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
-    if arguments.gps:
-        arguments.set.append("gps.use=true")
-    pipeline, topics = pipeline_of(arguments), topics_of(arguments)
+    paths, pipeline, library, topics = _asked(arguments)
+    # a cache that is sent over the net costs more than it saves
+    use_cache = arguments.cache and "://" not in str(arguments.shown)
     with Progress(arguments) as progress:
-        if len(arguments.logs) > 1 and not arguments.one_drive:
+        if len(paths) > 1 and not arguments.one_drive:
             from vplog.joint import run_joint
 
             found = run_joint(
-                arguments.logs, arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
+                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache
             )
         else:
             from vplog.pipeline import run as run_pipeline
 
             found = run_pipeline(
-                arguments.logs, arguments.output, pipeline, arguments.library, topics, arguments.threads, progress
+                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache=use_cache
             ).record
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
@@ -163,6 +165,27 @@ def run(arguments: argparse.Namespace) -> None:
         print_joint(arguments.shown, found)
     else:
         print_run(arguments.shown, found)
+
+
+def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
+    """Logs, settings, library and topics: those of the command, or with --resume of the run that is gone on with."""
+    if not arguments.resume:
+        if not arguments.logs:
+            arguments.refuse("the following arguments are required: LOG")
+        if arguments.gps:
+            arguments.set.append("gps.use=true")
+        return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
+    from vplog.resume import asked_for
+
+    asking, asked_by = vars(arguments), ("pipeline", "set", "library", "gps")
+    names = [name for name in asking if name in asked_by or name.endswith(("_topic", "_file"))]
+    given = [name for name in names if asking[name] not in (None, [], False, "default")]
+    if given or not arguments.cache:
+        option = given[0].removesuffix("_file").replace("_", "-") if given else "no-cache"
+        arguments.refuse(f"argument --resume: a run is gone on with as it began; leave out --{option}")
+    asked = asked_for(arguments.output, arguments.logs)
+    arguments.one_drive = True
+    return asked.logs, asked.pipeline, asked.library, asked.topics
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -380,11 +403,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
     output(sub, "folder of the library")
     sub = add("run", run, topics, threads, settings)
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
+    _add_run(sub)
     output(sub, "run folder")
-    sub.add_argument("--library", type=place, metavar="LIB", help="reference library (default: made from the drive)")
-    sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
-    sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
@@ -445,6 +465,18 @@ def _truth_options() -> argparse.ArgumentParser:
 def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=place, metavar="LOG")
     sub.add_argument("--html", type=Path, metavar="FILE.html", help="also write a page with pictures of the drive")
+
+
+def _add_run(sub: argparse.ArgumentParser) -> None:
+    sub.set_defaults(refuse=sub.error)
+    sub.add_argument("logs", type=place, nargs="*", metavar="LOG")
+    sub.add_argument("--library", type=place, metavar="LIB", help="reference library (default: made from the drive)")
+    sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
+    sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
+    sub.add_argument("--resume", action="store_true", help="go on with the run in OUT that was killed; needs no LOG")
+    sub.add_argument(
+        "--no-cache", dest="cache", action="store_false", help="keep nothing in OUT for a run with other settings"
+    )
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import platform
 import shutil
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import vplog
 from vplog import logs
 from vplog.data import Verdict
 from vplog.errors import LogError, ResultError, SettingsError
-from vplog.remote import RemotePath, located
+from vplog.inputs import files_of
+from vplog.inputs import hash_inputs as hash_inputs  # noqa: PLC0414 - others know it by this name
+from vplog.remote import located
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -27,9 +28,10 @@ if TYPE_CHECKING:
     from vplog.stages import Log
 
 
-def files_of(drive: Path | Sequence[Path]) -> list[Path]:
-    """The files of a drive: of one log, or of a recording in several."""
-    return list(drive) if isinstance(drive, list | tuple) else [cast("Path", drive)]
+OWN_LIBRARY = "the drive's own keyframes"
+"""Where the library of a run is from to which none was given."""
+CACHE = ".cache"
+"""Where a run folder keeps what its stages came to, unless another place is named."""
 
 
 def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice | None) -> Log:
@@ -43,17 +45,33 @@ def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice
     return logs.open_drive(known, topics)
 
 
-def begin_folder(out: Path, pipeline: Settings, path: Path | Sequence[Path], threads: int) -> None:
-    """Make the run folder, with a run.json that says the run is not finished until it is."""
-    if out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
+def begin_folder(
+    out: Path,
+    pipeline: Settings,
+    path: Path | Sequence[Path],
+    threads: int,
+    library: Path | None = None,
+    topics: logs.TopicChoice | None = None,
+) -> None:
+    """Make the run folder, with a run.json that says the run is not finished until it is, and how it was asked for."""
+    others = [file for file in out.iterdir() if file.name != CACHE] if out.is_dir() else []
+    if others and not (out / "run.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
-    run_record.write_run_json(out / "run.json", {**head(pipeline, path, threads), "finished": False})
+    asked = {"topics": (topics or logs.TopicChoice()).model_dump(mode="json"), "library": {"from": library_of(library)}}
+    run_record.write_run_json(out / "run.json", {**head(pipeline, path, threads), "finished": False, **asked})
+    for file in out.glob(".*.part"):  # what a killed run was writing
+        file.unlink(missing_ok=True)
     if (out / "library" / "library.json").is_file():  # an earlier run's, which would not be this one's
         shutil.rmtree(out / "library")
+
+
+def library_of(library: Path | None) -> str:
+    """What run.json says of where a library is from."""
+    return OWN_LIBRARY if library is None else str(library.resolve())
 
 
 def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[str, Any]:
@@ -74,24 +92,6 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "unknown"
-
-
-def hash_inputs(drive: Path | Sequence[Path]) -> dict[str, str]:
-    """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole."""
-    result: dict[str, str] = {}
-    named = [
-        (str(file.relative_to(path)) if path.is_dir() else file.name, file)
-        for path in files_of(drive)
-        for file in (sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path])
-    ]
-    for own, file in named:
-        name = str(file) if own in result else own
-        if isinstance(file, RemotePath):
-            result[name] = file.version()
-            continue
-        with file.open("rb") as stream:
-            result[name] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return result
 
 
 def counts(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
@@ -17,6 +17,40 @@ if TYPE_CHECKING:
 _ROW_BYTES = 4 * 4 + 128
 """x, y, size, depth as float32, then the descriptor."""
 _THUMBNAIL_BYTES = THUMBNAIL_SIDE**2
+
+
+class FeaturesOf(Protocol):
+    """Features of images by their rows, from any thread."""
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, row: int, /) -> Features: ...
+
+
+def size_of(count: int, thumbnail: bool) -> int:
+    """Bytes of an image's features."""
+    return count * _ROW_BYTES + thumbnail * _THUMBNAIL_BYTES
+
+
+def features_to(features: Features) -> bytes:
+    """The features of an image, without its size."""
+    floats = np.column_stack([features.points, features.sizes, features.depth_m]).astype("<f4")
+    small = b"" if features.thumbnail is None else features.thumbnail.tobytes()
+    return floats.tobytes() + features.descriptors.tobytes() + small
+
+
+def features_from(data: bytes, count: int, width: int, height: int, thumbnail: bool) -> Features:
+    """`count` features of an image of this size, from the `size_of(count, thumbnail)` bytes of `features_to`."""
+    floats = np.frombuffer(data, "<f4", count * 4).reshape(count, 4)
+    small = np.frombuffer(data, np.uint8, _THUMBNAIL_BYTES, count * _ROW_BYTES) if thumbnail else None
+    return Features(
+        points=np.ascontiguousarray(floats[:, :2]),
+        sizes=floats[:, 2],
+        descriptors=np.frombuffer(data, np.uint8, count * 128, count * 16).reshape(count, 128),
+        depth_m=floats[:, 3],
+        width=width,
+        height=height,
+        thumbnail=None if small is None else small.reshape(THUMBNAIL_SIDE, THUMBNAIL_SIDE),
+    )
 
 
 class FeatureStore:
@@ -44,14 +78,10 @@ class FeatureStore:
 
     def append(self, features: Features) -> None:
         """Store the next keyframe's features. Raises ResultError where the disk is full."""
-        floats = np.column_stack([features.points, features.sizes, features.depth_m]).astype("<f4")
         try:
             with self._lock:
                 offset = self._file.seek(0, 2)
-                self._file.write(floats.tobytes())
-                self._file.write(features.descriptors.tobytes())
-                if features.thumbnail is not None:
-                    self._file.write(features.thumbnail.tobytes())
+                self._file.write(features_to(features))
                 self._file.flush()
         except OSError as error:
             raise ResultError(
@@ -60,21 +90,15 @@ class FeatureStore:
             ) from None
         self._entries.append((offset, len(features), features.width, features.height, features.thumbnail is not None))
 
+    def extend(self, images: FeaturesOf) -> None:
+        """Store the features of several keyframes. Raises ResultError as `append` does."""
+        for row in range(len(images)):
+            self.append(images[row])
+
     def __getitem__(self, row: int) -> Features:
         """The features of keyframe `row`."""
         offset, count, width, height, small = self._entries[row]
         with self._lock:
             self._file.seek(offset)
-            data = self._file.read(count * _ROW_BYTES + small * _THUMBNAIL_BYTES)
-        floats = np.frombuffer(data, "<f4", count * 4).reshape(count, 4)
-        return Features(
-            points=np.ascontiguousarray(floats[:, :2]),
-            sizes=floats[:, 2],
-            descriptors=np.frombuffer(data, np.uint8, count * 128, count * 16).reshape(count, 128),
-            depth_m=floats[:, 3],
-            width=width,
-            height=height,
-            thumbnail=np.frombuffer(data, np.uint8, offset=count * _ROW_BYTES).reshape(THUMBNAIL_SIDE, -1)
-            if small
-            else None,
-        )
+            data = self._file.read(size_of(count, small))
+        return features_from(data, count, width, height, small)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.errors import ResultError
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable
 
     from vplog.data import Bytes
 
@@ -50,49 +48,26 @@ def jpeg(image: Bytes, quality: int) -> bytes:
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
+def preview(image: Bytes, settings: PictureSettings) -> bytes:
+    """A keyframe's picture as a JPEG; empty where pictures are switched off."""
+    return jpeg(shrink(image, settings.megapixels), settings.quality) if settings.megapixels else b""
+
+
 class Previews:
-    """A scratch file of small JPEGs, one keyframe after the other. Removed on exit."""
+    """The pictures of a drive's keyframes, each read when it is asked for, so that memory does not grow."""
 
-    def __init__(self, path: Path, settings: PictureSettings) -> None:
-        self._path, self._settings = path, settings
-        self._ends = [0]
-        try:
-            self._file = path.open("w+b")
-        except OSError as error:
-            raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):  # a full disk fails again here; append has said so, and the file goes
-            self._file.close()
-        self._path.unlink(missing_ok=True)
+    def __init__(self, count: int, read: Callable[[int], bytes]) -> None:
+        """`read` gives the JPEG of a row."""
+        self._count, self._read = count, read
 
     def __len__(self) -> int:
-        return len(self._ends) - 1
-
-    def append(self, image: Bytes) -> None:
-        """Keep the next keyframe's picture; nothing where pictures are switched off. Raises ResultError."""
-        if not self._settings.megapixels:
-            return
-        data = jpeg(shrink(image, self._settings.megapixels), self._settings.quality)
-        try:
-            self._file.seek(self._ends[-1])
-            self._file.write(data)
-            self._file.flush()
-        except OSError as error:
-            raise ResultError(
-                f"Cannot store pictures in {self._path}: {error.strerror}. --set pictures.megapixels=0 does without."
-            ) from None
-        self._ends.append(self._ends[-1] + len(data))
+        return self._count
 
     def __getitem__(self, row: int) -> bytes:
         """The JPEG of keyframe `row`."""
-        if not 0 <= row < len(self):
+        if not 0 <= row < self._count:
             raise IndexError(row)
-        self._file.seek(self._ends[row])
-        return self._file.read(self._ends[row + 1] - self._ends[row])
+        return self._read(row)
 
     def image(self, row: int) -> Bytes:
         """(h, w) uint8 grey."""

@@ -1,0 +1,88 @@
+"""Folders that travel arrive as they were, are unpacked once, and leave nothing behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from vplog import scratch as scratch_of
+from vplog.errors import ResultError
+from vplog.scratch import files_in, own_folder, packed, pieces, scratch, unpacked, write_pieces
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The temporary folder of a machine."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return tmp_path
+
+
+def make_folder(place: Path) -> Path:
+    (place / "below").mkdir(parents=True)
+    (place / "a.bin").write_bytes(bytes(range(256)) * 3)
+    (place / "below" / "empty").touch()
+    (place / ".features").write_bytes(b"nobody's")
+    return place
+
+
+def test_a_folder_comes_back_from_its_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scratch_of, "_PIECE_BYTES", 100)
+    source, target = make_folder(tmp_path / "source"), tmp_path / "target"
+    assert files_in(source) == ["a.bin", "below/empty"]
+    for name in files_in(source):
+        parts = list(pieces(source / name))
+        assert all(part.size <= 100 for part in parts)
+        write_pieces(target, name, iter(parts))
+        assert (target / name).read_bytes() == (source / name).read_bytes()
+    for name in ("../out", "/out", "below/../../out"):
+        with pytest.raises(ResultError, match="not inside"):
+            write_pieces(target, name, iter([np.zeros(1, np.uint8)]))
+
+
+def test_it_is_unpacked_once_and_again_where_something_is_missing(tmp_path: Path, machine: Path) -> None:
+    files = packed(make_folder(tmp_path / "source"))
+    place = unpacked(files, "library-1")
+    assert place.is_relative_to(machine)
+    assert {name: data.tobytes() for name, data in packed(place).items()} == {
+        name: data.tobytes() for name, data in files.items()
+    }
+    before = (place / "a.bin").stat().st_ino
+    assert unpacked(files, "library-1") == place
+    assert (place / "a.bin").stat().st_ino == before
+    (place / "below" / "empty").unlink()
+    assert files_in(unpacked(files, "library-1")) == ["a.bin", "below/empty"]
+    assert list(own_folder().iterdir()) == [place]
+
+
+def test_what_a_killed_process_leaves_goes_when_the_next_one_comes(machine: Path) -> None:
+    code = f"""
+import os, tempfile
+tempfile.tempdir = {str(machine)!r}
+from vplog.scratch import scratch
+with scratch("run") as folder:
+    (folder / "large").touch()
+    os.kill(os.getpid(), 9)
+"""
+    subprocess.run([sys.executable, "-c", code], check=False)
+    [left] = own_folder().iterdir()
+    assert (left / "large").exists()
+    with scratch("run") as first, scratch("run") as second:
+        assert sorted(own_folder().iterdir()) == sorted([first, second]), "of those that run none is taken"
+    assert not list(own_folder().iterdir())
+
+
+def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, machine: Path) -> None:
+    (tmp_path / "theirs").mkdir()
+    own = own_folder()
+    assert own.parent == machine
+    own.rmdir()
+    own.symlink_to(tmp_path / "theirs")
+    with pytest.raises(ResultError, match="TMPDIR"):
+        own_folder()

@@ -1,0 +1,109 @@
+"""What code a result depends on: a hash over the files its modules import, and the versions of the packages they use.
+
+Found from the imports themselves, so that no list can forget one.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import platform
+import sys
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import vplog
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_PACKAGE = Path(vplog.__file__).parent
+_PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
+"""Packages whose name on PyPI is not the one they are imported by; others are looked for, which takes half a second."""
+
+
+@cache
+def code_of(*modules: str) -> dict[str, str]:
+    """sha256 over the vplog files that these modules import, transitively and themselves included, as `code`; and the
+    version of Python, the kind of machine, and the version of every other package that those files import.
+
+    What is imported for type checkers alone does not count, as it does not run. A package that is entered on the way
+    to one of its modules counts by its own file, not by all that it imports besides.
+    """
+    files, packages = imported(modules)
+    digest = hashlib.sha256()
+    for name in sorted(files):
+        digest.update(f"{name} {hashlib.sha256(files[name].read_bytes()).hexdigest()}\n".encode())
+    versions = {name: _version(name) for name in sorted(packages)}
+    return {"code": digest.hexdigest(), "python": platform.python_version(), "machine": platform.machine(), **versions}
+
+
+def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
+    """Files by name of the vplog modules that these import, and the names of the packages of others."""
+    files: dict[str, Path] = {}
+    packages: set[str] = set()
+    waiting = list(modules)
+    followed: set[str] = set()
+    while waiting:
+        module = waiting.pop()
+        if module in followed:
+            continue
+        followed.add(module)
+        path = _file(module)
+        if path is None:
+            raise ValueError(f"{module} is no module of vplog")
+        parts = module.split(".")
+        for depth in range(1, len(parts)):
+            parent = ".".join(parts[:depth])
+            if (entered := _file(parent)) is not None:
+                files[parent] = entered
+        files[module] = path
+        for name in _imports(path):
+            top = name.split(".", maxsplit=1)[0]
+            if top == "vplog":
+                waiting.append(name if _file(name) is not None else name.rpartition(".")[0])
+            elif top not in sys.stdlib_module_names:
+                packages.add(top)
+    return files, packages
+
+
+def _file(module: str) -> Path | None:
+    """The file of a module or package of vplog; None where there is none of that name."""
+    at = _PACKAGE.joinpath(*module.split(".")[1:])
+    return next((file for file in (at / "__init__.py", at.with_suffix(".py")) if file.is_file()), None)
+
+
+def _imports(path: Path) -> list[str]:
+    """Full names of all that a file imports when it runs, wherever in it."""
+    found = []
+    for node in _running(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return found
+
+
+def _running(node: ast.AST) -> Iterator[ast.AST]:
+    """Every statement below this one but those behind `if TYPE_CHECKING`."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
+            continue
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            for other in child.orelse:
+                yield other
+                yield from _running(other)
+            continue
+        yield child
+        yield from _running(child)
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(_PUBLISHED_AS.get(package, package))
+    except metadata.PackageNotFoundError:
+        named = sorted(metadata.packages_distributions().get(package, ()))
+    # an extra that is not installed matters too: another machine may decode what this one cannot
+    return metadata.version(named[0]) if named else "none"

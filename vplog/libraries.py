@@ -1,0 +1,166 @@
+"""Reference libraries: of a drive's own keyframes, of frames of several logs, and how far one explains a drive."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vplog import logs
+from vplog.data import Reference
+from vplog.errors import LibraryError
+from vplog.extract import extract_frames
+from vplog.places.coverage import (
+    STRONGEST,
+    Coverage,
+    choose_by_coverage,
+    coverage_warning,
+    frames_needed,
+    measure_coverage,
+)
+from vplog.places.library import WordSettings
+from vplog.places.library import build_library as index_words
+from vplog.places.stored import read_library_record, references_hash
+from vplog.references import PAPER_SIZE, choose, evenly
+from vplog.stage_codecs import json_codec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from vplog.data import Bytes, Ints, Keyframes
+    from vplog.features.sift import SiftSettings
+    from vplog.features.store import FeaturesOf
+    from vplog.places import PlaceSettings
+    from vplog.references import LibrarySettings
+    from vplog.stage_codecs import Codec
+    from vplog.stages import Log, PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+class Describing(Protocol):
+    """The settings that a library is made with, as the pipeline has them."""
+
+    @property
+    def features(self) -> SiftSettings: ...
+    @property
+    def library(self) -> LibrarySettings: ...
+    @property
+    def places(self) -> PlaceSettings: ...
+
+
+def check_library(folder: Path | None, pipeline: Describing) -> None:
+    """Before any work: is what was given a library, and made as this run describes places? Raises LibraryError."""
+    if folder is None:
+        return
+    made = pipeline.places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
+    for name, value in pipeline.places:
+        if getattr(made, name) != value:
+            raise LibraryError(
+                f"{folder} was made with places.{name}={getattr(made, name)}, and this run asks for {value}. "
+                f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
+            )
+
+
+def own_images(
+    log: Log, selected: Keyframes, keyframes: Keyframes, features: FeaturesOf, settings: LibrarySettings, threads: int
+) -> list[tuple[int, Bytes]]:
+    """Rows and images of the keyframes that become the drive's own references; these images are read once more.
+
+    `keyframes` are those of the `selected` that decode.
+    """
+    if settings.choose == "coverage":
+        rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, threads)
+    else:
+        chosen_ns = selected.stamp_ns[choose(selected.stamp_ns, settings)]
+        rows = np.flatnonzero(np.isin(keyframes.stamp_ns, chosen_ns))
+    frames = log.frames(keyframes.stamp_ns[rows])
+    return [(row, encoded.decode().image) for row, encoded in zip(rows.tolist(), frames, strict=True)]
+
+
+def cover(
+    drive: str,
+    keyframes: Keyframes,
+    references: list[Reference],
+    given: bool,
+    features: FeaturesOf,
+    threads: int,
+) -> tuple[Coverage, list[str]]:
+    """How far the references explain the drive, and what to do where that is little."""
+    library = index_words(references, WordSettings(), threads, own=False)
+    coverage = measure_coverage(len(features), features.__getitem__, keyframes.stamp_ns, drive, library, threads)
+    doubt = coverage_warning(coverage, len(features), given, len(library))
+    return coverage, [doubt] if doubt else []
+
+
+def coverage_codec() -> Codec[tuple[Coverage, list[str]]]:
+    """Of what `cover` gives."""
+
+    def made(tree: Any) -> tuple[Coverage, list[str]]:
+        coverage, doubt = tree
+        return Coverage(float(coverage["explained"]), float(coverage["median"]), int(coverage["frames"])), list(doubt)
+
+    return json_codec(made, lambda found: [asdict(found[0]), found[1]])
+
+
+def about_references(references: Sequence[Reference]) -> list[Any]:
+    """All that coverage depends on of them."""
+    return [references_hash(references, WordSettings()), [[one.drive, one.stamp_ns] for one in references]]
+
+
+def build_library(
+    paths: Sequence[Path],
+    out: Path,
+    pipeline: Describing,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> PlaceState:
+    """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
+
+    Raises VplogError where that cannot be.
+    """
+    references: list[Reference] = []
+    opened = [logs.open(path, topics) for path in paths]
+    by_coverage = pipeline.library.choose == "coverage"
+    wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
+    for log, stamps in zip(opened, wanted, strict=True):
+        for done, (stamp_ns, frame, features, _) in enumerate(
+            extract_frames(log.frames(stamps), pipeline.features, threads)
+        ):
+            progress(f"extract {log.name}", done + 1, len(stamps))
+            if frame is not None and features is not None:
+                references.append(Reference(frame.image, features, log.name, stamp_ns))
+    state = pipeline.places.learn(references, threads)
+    state.save(out)
+    return state
+
+
+def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
+    """Stamps of an equal share of references for each log."""
+    size, result = pipeline.library.size or PAPER_SIZE, []
+    for number, log in enumerate(opened):
+        share = size * (number + 1) // len(opened) - size * number // len(opened)
+        seeded = pipeline.library.model_copy(update={"size": share, "seed": pipeline.library.seed + number})
+        result.append(log.stamps()[choose(log.stamps(), seeded)])
+    return result
+
+
+def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, threads: int, progress: Progress) -> list[Ints]:
+    """Stamps of the references of each log that explain the frames of all best; equally many of each are seen."""
+    each = -(-frames_needed(pipeline.library.size) // len(opened))
+    descriptors, owners, seen_ns = [], [], []
+    for number, log in enumerate(opened):
+        stamps = log.stamps()[evenly(len(log.stamps()), each)]
+        frames = extract_frames(log.frames(stamps), pipeline.features, threads)
+        for done, (stamp_ns, _, features, _) in enumerate(frames):
+            progress(f"look at {log.name}", done + 1, len(stamps))
+            if features is not None:
+                descriptors.append(features.descriptors[:STRONGEST].copy())
+                owners.append(number)
+                seen_ns.append(stamp_ns)
+    rows = choose_by_coverage(len(descriptors), descriptors.__getitem__, pipeline.library, threads)
+    owner, stamp = np.array(owners, np.int64)[rows], np.array(seen_ns, np.int64)[rows]
+    return [stamp[owner == number] for number in range(len(opened))]

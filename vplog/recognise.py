@@ -1,0 +1,55 @@
+"""Place recognition of a drive by a learned recogniser: descriptors of all keyframes, and which may be returns."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from vplog.extract import map_in_order, one_thread_each
+from vplog.loops.propose import candidate_stops, propose
+from vplog.places.sequence import rank_places
+from vplog.places.shared import SharesReferences
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from vplog.data import Closures, Keyframes
+    from vplog.features.store import FeaturesOf
+    from vplog.loops.propose import Proposals, ProposeSettings
+    from vplog.places.sequence import SequenceSettings
+    from vplog.stages import PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+def describe(state: PlaceState, features: FeaturesOf, threads: int, progress: Progress) -> Sequence[Any]:
+    """A descriptor for every keyframe, in order."""
+    result = []
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        work = map_in_order(pool, lambda row: state.describe(features[row]), range(len(features)), ahead=4 * threads)
+        for descriptor in work:
+            result.append(descriptor)
+            progress("describe", len(result), len(features))
+    return result
+
+
+def find_candidates(
+    state: PlaceState,
+    descriptors: Sequence[Any],
+    keyframes: Keyframes,
+    settings: ProposeSettings,
+    sequence: SequenceSettings,
+    threads: int,
+) -> Proposals:
+    """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
+    index, stops = state.index(descriptors), candidate_stops(keyframes, settings)
+    return propose(rank_places(index, descriptors, stops, settings.asked, sequence, threads), settings)
+
+
+def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:
+    """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
+    if not isinstance(state, SharesReferences):
+        return closures
+    found = state.shared(descriptors, closures.query, closures.match)
+    return replace(closures, shared_references=found.references, shared_overlap=found.overlap)

@@ -1,0 +1,124 @@
+"""features.parquet: the strongest features of every keyframe, which closures to drives that come later are checked by.
+
+One row group for each keyframe, so that any of them is read alone.
+"""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from vplog.data import Features
+from vplog.errors import ResultError
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+_LEVEL = 1
+"""Of zstd: descriptors hardly shrink, by a fifth, and higher levels take their time for nothing."""
+
+_IN_MEMORY = 128
+"""Keyframes whose features are not read again, some 20 MB: candidates come by match, and queries near each other."""
+
+
+def _column(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Field:
+    return pa.field(name, kind, False, metadata={"unit": unit, "description": description})
+
+
+_FLOATS = pa.list_(pa.field("element", pa.float32(), nullable=False))
+FEATURES = pa.schema(
+    [
+        _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
+        _column("width", pa.int32(), "px", "Of the image."),
+        _column("height", pa.int32(), "px", "Of the image."),
+        _column("x", _FLOATS, "px", "Of each feature, strongest first; 0 is the centre of the leftmost pixel."),
+        _column("y", _FLOATS, "px", "The same; 0 is the centre of the topmost pixel."),
+        _column("size", _FLOATS, "px", "Diameter of the described neighbourhood."),
+        _column("depth", _FLOATS, "m", "Along the camera's z, NaN where unknown."),
+        _column("descriptors", pa.binary(), "bytes", "128 bytes of SIFT for each feature, one after the other."),
+    ]
+)
+
+HEADER = {
+    "vplog.table": "Name of the table.",
+    "vplog.made_from": "Hash of all that the features depend on.",
+    "vplog.most_features": "Features of a keyframe at most.",
+}
+"""What the file says of itself."""
+
+
+def write_features(path: Path, count: int, features: Callable[[int], Features], most: int, made_from: str) -> None:
+    """The `most` strongest features of keyframes 0..count - 1. `made_from` is a hash that `KeptFeatures` asks for."""
+    schema = FEATURES.with_metadata(
+        {"vplog.table": "features", "vplog.made_from": made_from, "vplog.most_features": str(most)}
+    )
+    with (
+        replacing(path) as stream,
+        pq.ParquetWriter(stream, schema, compression="zstd", compression_level=_LEVEL, use_dictionary=False) as writer,
+    ):
+        for row in range(count):
+            own = features(row)
+            floats = [own.points[:most, 0], own.points[:most, 1], own.sizes[:most], own.depth_m[:most]]
+            writer.write_table(
+                pa.Table.from_arrays(
+                    [
+                        *(pa.array([value], pa.int32()) for value in (row, own.width, own.height)),
+                        *(pa.array([np.ascontiguousarray(values, np.float32)], _FLOATS) for values in floats),
+                        pa.array([own.descriptors[:most].tobytes()], pa.binary()),
+                    ],
+                    schema=schema,
+                )
+            )
+
+
+class KeptFeatures:
+    """Features of keyframes in such a file. Reads are safe from any thread."""
+
+    def __init__(self, path: Path, made_from: str, most: int) -> None:
+        """Raises ResultError where there is no such file, or one made from something else or of fewer features."""
+        try:
+            self._file = pq.ParquetFile(path)
+        except (OSError, pa.ArrowException) as error:
+            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}.") from None
+        self._path, self._lock = path, threading.Lock()
+        self._read = lru_cache(_IN_MEMORY)(self._from_file)
+        header = self._file.schema_arrow.metadata or {}
+        held = header.get(b"vplog.most_features", b"")
+        fits = header.get(b"vplog.made_from") == made_from.encode() and held.isdigit() and int(held) >= most
+        if not fits or not self._file.schema_arrow.equals(FEATURES):
+            self.close()
+            raise ResultError(f"{path} is of another state of the drive, or holds fewer features.")
+
+    def __len__(self) -> int:
+        return self._file.num_row_groups
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __getitem__(self, row: int) -> Features:
+        """Raises ResultError where the file is damaged."""
+        return self._read(row)
+
+    def _from_file(self, row: int) -> Features:
+        try:
+            with self._lock:
+                table = self._file.read_row_group(row)
+            width, height = (int(table[name][0].as_py()) for name in ("width", "height"))
+            x, y, size, depth = (
+                table[name].combine_chunks().flatten().to_numpy() for name in ("x", "y", "size", "depth")
+            )
+            data = table["descriptors"][0].as_buffer()
+            descriptors = np.frombuffer(data, np.uint8).reshape(len(x), 128)
+            points = np.column_stack([x, y]).astype(np.float32)
+            if not len(y) == len(size) == len(depth) == len(x):
+                raise ValueError("columns of different length")
+        except (OSError, ValueError, IndexError, pa.ArrowException) as error:
+            raise ResultError(f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0]}.") from None
+        return Features(points, size.astype(np.float32), descriptors, depth.astype(np.float32), width, height)

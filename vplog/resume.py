@@ -1,0 +1,81 @@
+"""Going on with a run that was killed: what was asked for is in its run.json, what was done in its cache."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from vplog import logs
+from vplog.errors import ResultError, SettingsError
+from vplog.pipeline import Pipeline
+from vplog.record import OWN_LIBRARY
+from vplog.remote import located
+from vplog.results import run_record
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a run was asked for."""
+
+    logs: list[Path]
+    """The parts of one recording."""
+    pipeline: Pipeline
+    library: Path | None
+    topics: logs.TopicChoice
+
+
+def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
+    """What the unfinished run in `out` was asked for; logs `given` must be its logs.
+
+    Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
+    """
+    if not (out / "run.json").is_file():
+        raise ResultError(f"Nothing to resume: {out} has no run.json. Begin a run: vplog run LOG -o {out}")
+    account = run_record.read_run_json(out / "run.json")
+    if account.get("finished") is not False:
+        raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")
+    if not isinstance(account.get("topics"), dict):  # several drives in one map, or an older version
+        raise ResultError(
+            f"{out}/run.json does not say all that its run was asked for. Give the same command again without "
+            "--resume: what is done of each drive is found."
+        )
+    paths = [located(text) for text in _texts(account, out)]
+    if given and {path.resolve() for path in given} != {path.resolve() for path in paths}:
+        known = " ".join(map(str, paths))
+        raise SettingsError(
+            f"The run in {out} is of {known}, not of {given[0]}. Leave out the log, or choose another -o."
+        )
+    where = f"{out}/run.json"
+    pipeline = Pipeline.read(_tree(account, "settings", out), where)
+    library = _tree(account, "library", out).get("from")
+    if not isinstance(library, str):
+        raise _lacking(out, "library.from")
+    return Asked(
+        paths,
+        pipeline,
+        None if library == OWN_LIBRARY else located(library),
+        logs.TopicChoice.read(_tree(account, "topics", out), where),
+    )
+
+
+def _texts(account: dict[str, Any], out: Path) -> list[str]:
+    named = account.get("parts") or [account.get("log")]
+    paths = [path for path in named if isinstance(path, str)] if isinstance(named, list) else []
+    if not paths or len(paths) < len(named):
+        raise _lacking(out, "log")
+    return paths
+
+
+def _tree(account: dict[str, Any], name: str, out: Path) -> dict[str, Any]:
+    tree = account.get(name)
+    if not isinstance(tree, dict):
+        raise _lacking(out, name)
+    return tree
+
+
+def _lacking(out: Path, name: str) -> ResultError:
+    return ResultError(f"{out}/run.json lacks {name}. Run again without --resume.")

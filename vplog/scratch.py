@@ -1,0 +1,119 @@
+"""Folders of one machine that go away again, and folders of files as arrays that travel between machines."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.errors import ResultError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    Bytes = NDArray[np.uint8]
+
+_PIECE_BYTES = 2**24
+"""Of a file that travels. Ray's smallest store of objects has 75 MiB, and needs room for several; 16 MiB take about
+10 ms to copy, which is more than the about 1 ms that an object costs by itself."""
+
+
+def own_folder() -> Path:
+    """This user's folder in the machine's temporary one. Raises ResultError where somebody else has made it."""
+    folder = Path(tempfile.gettempdir()) / f"vplog-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        about = folder.lstat()
+    except OSError as error:
+        raise ResultError(f"Cannot make {folder}: {error.strerror}. Set TMPDIR to a folder with room.") from None
+    if folder.is_symlink() or about.st_uid != os.getuid():
+        raise ResultError(f"{folder} belongs to somebody else. Set TMPDIR to a folder of your own.")
+    return folder
+
+
+@contextmanager
+def scratch(name: str) -> Iterator[Path]:
+    """A new folder for the time of the block. Those of processes that were killed are removed on the way."""
+    _sweep(own_folder())
+    folder = Path(tempfile.mkdtemp(prefix=f"{name}-{os.getpid()}-", dir=own_folder()))
+    with (folder / ".new").open("w") as lock:  # goes with the process, however that ends
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        (folder / ".new").rename(folder / ".lock")
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _sweep(own: Path) -> None:
+    for path in own.glob("*/.lock"):
+        with suppress(OSError), path.open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
+            shutil.rmtree(path.parent, ignore_errors=True)
+
+
+def files_in(folder: Path) -> list[str]:
+    """Names of all files in a folder and below it, in order; hidden ones are nobody's result."""
+    found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
+    return [path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts)]
+
+
+def pieces(path: Path) -> Iterator[Bytes]:
+    """The bytes of a file, a piece at a time; one empty piece of an empty file."""
+    with path.open("rb") as stream:
+        block = stream.read(_PIECE_BYTES)
+        yield np.frombuffer(block, np.uint8)
+        while block := stream.read(_PIECE_BYTES):
+            yield np.frombuffer(block, np.uint8)
+
+
+def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
+    """A file of a folder from its pieces. Raises ResultError."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise ResultError(f"A worker gave back a file named {name!r}, which is not inside its folder.")
+    path = folder / name
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as stream:
+            for part in parts:
+                stream.write(part.data)
+    except OSError as error:
+        raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
+
+
+def packed(folder: Path) -> dict[str, Bytes]:
+    """The files of a folder, whole, by name."""
+    return {name: np.fromfile(folder / name, np.uint8) for name in files_in(folder)}
+
+
+def unpacked(files: dict[str, Bytes], name: str) -> Path:
+    """A folder of this machine with these files, which are written once for all that use the name. Raises ResultError.
+
+    The name must stand for the content. A machine may clean up old files one by one, so sizes are looked at.
+    """
+    place = own_folder() / name
+    if not _is_whole(place, files):
+        with scratch("unpack") as folder:
+            for file, data in files.items():
+                write_pieces(folder / "new", file, iter([data]))
+            with suppress(OSError):
+                place.rename(folder / "old")
+            with suppress(OSError):  # another worker may have been first
+                (folder / "new").rename(place)
+        if not _is_whole(place, files):
+            raise ResultError(f"Cannot put {len(files)} files into {place}. Set TMPDIR to a folder with room.")
+    return place
+
+
+def _is_whole(place: Path, files: dict[str, Bytes]) -> bool:
+    return place.is_dir() and all(
+        (place / name).is_file() and (place / name).stat().st_size == data.size for name, data in files.items()
+    )
