@@ -7,17 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow.parquet as pq
-import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from vplog import geometry
-from vplog.demo import SMALL, make_drive
 from vplog.evaluate.truth import read_truth
 from vplog.evaluation import evaluate
-from vplog.joint import run_joint
-from vplog.pipeline import load_pipeline
 from vplog.results import tables
+
+from .joined import QUICK, cut
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,39 +22,6 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.demo.record import Drive
-
-QUICK = ("features.max_features=600", "library.size=12", "pictures.closures=0", "pictures.megapixels=0")
-
-
-def cut(log: Path, at_ns: int, folder: Path, mounted: bool = True) -> list[Path]:
-    """The messages of a log before and from a time on, in a file each; one knows how the camera sits, or both."""
-    files = [folder / "before.mcap", folder / "after.mcap"]
-    with log.open("rb") as stream, files[0].open("wb") as one, files[1].open("wb") as other:
-        writers = [Writer(one), Writer(other)]
-        channels: list[dict[int, int]] = [{}, {}]
-        for writer in writers:
-            writer.start(profile="ros2")
-        for schema, channel, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            for part, writer in enumerate(writers):
-                if not (mounted and channel.topic == "/tf_static") and (message.log_time >= at_ns) != bool(part):
-                    continue
-                if channel.id not in channels[part]:
-                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[part][channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
-                writer.add_message(channels[part][channel.id], message.log_time, message.data, message.publish_time)
-        for writer in writers:
-            writer.finish()
-    return files
-
-
-@pytest.fixture(scope="module")
-def joint(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("joint")
-    parts = cut(drive.log, int(drive.stamp_ns[-14]), folder)
-    elsewhere = make_drive(folder / "elsewhere", SMALL.model_copy(update={"seed": SMALL.seed + 1})).log
-    run_joint([*parts, elsewhere], folder / "out", load_pipeline("default", QUICK), threads=2)
-    return folder / "out"
 
 
 def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_not(joint: Path, drive: Drive) -> None:
@@ -80,7 +43,7 @@ def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_no
         away -= geometry.between(true_first, true)[:, :3, 3]
         assert np.linalg.norm(away, axis=1).max() < 1.5
     assert not (joint / "drive" / "joint_keyframes.parquet").exists()
-    assert not [path.name for path in joint.rglob(".*")]
+    assert {path.name for path in joint.rglob(".*")} == {".cache"}
 
 
 def test_the_ledger_names_both_drives(joint: Path) -> None:

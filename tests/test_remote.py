@@ -160,5 +160,9 @@ def test_paths_stay_paths(tmp_path: Path) -> None:
     remote = RemotePath("s3://bucket/folder/drive.mcap")
     assert (remote.name, remote.stem, remote.suffix) == ("drive.mcap", "drive", ".mcap")
     assert str(remote.relative_to(RemotePath("s3://bucket/folder"))) == "drive.mcap"
+    named = RemotePath("s3://bucket/a%20b") / "drive=x%2Fy" / "z"
+    assert named.place[1] == "bucket/a b/drive=x%2Fy/z", "a URL is unquoted, a name is as it is"
+    assert RemotePath(str(named)).place == named.place
+    assert named.relative_to(RemotePath("s3://bucket/a%20b")).as_posix() == "drive=x%2Fy/z"
     with local_copy(tmp_path) as same:
         assert same == tmp_path

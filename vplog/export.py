@@ -8,12 +8,10 @@ from vplog.errors import ResultError
 from vplog.report import gather_tracks
 from vplog.results import geo, poses, tables, tum
 from vplog.results.atomic import replacing
-from vplog.results.places_map import write_map
 from vplog.results.rrd import write_rrd
 from vplog.retell import finished
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from vplog.report import Tracks
@@ -52,13 +50,6 @@ def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
         case _:
             raise ResultError(f"No format {kind!r}. Formats: {', '.join(FORMATS)}.")
     return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}
-
-
-def export_map(folders: Sequence[Path], path: Path) -> dict[str, Any]:
-    """Write the places of finished runs as one map. Raises ResultError."""
-    for folder in folders:
-        finished(folder)
-    return write_map(path, folders)
 
 
 def _copy(source: Path, path: Path) -> None:

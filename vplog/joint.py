@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import logs, record
-from vplog.back_end import by_odometry
-from vplog.data import EdgeKind, Verdict
+from vplog.between import closures_between, likely_drives, no_candidates, shared_of, with_drive, with_shared
 from vplog.errors import LogError, SettingsError
 from vplog.features.store import FeatureStore
 from vplog.graph import joint as graph_joint
 from vplog.graph.correct import correct_trajectory
-from vplog.graph.refine import rescaled
-from vplog.loops.propose import propose
-from vplog.loops.verify import drive_of, verify_between
-from vplog.pipeline import build_library, check_library, name_shared
+from vplog.joint_graph import between_of, judged_by, own_drive
+from vplog.loops.verify import calibration_share, drive_of
+from vplog.pipeline import build_library, check_library
 from vplog.pipeline import run as run_alone
-from vplog.places.sequence import rank_places
 from vplog.results import g2o, run_record, tables, tum
 from vplog.timing import Watch
 
@@ -29,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from vplog.data import Closures, Floats
+    from vplog.data import Closures
     from vplog.loops.verify import Drive
     from vplog.pipeline import Pipeline, Run
     from vplog.stages import PlaceState
@@ -57,6 +53,7 @@ def run_joint(
     topics: logs.TopicChoice | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    use_cache: bool = True,
 ) -> dict[str, Any]:
     """Drives in, `out` with a run folder for each and what joins them out; the record in its run.json.
 
@@ -78,24 +75,19 @@ def run_joint(
         for name, path in zip(names, paths, strict=True):
             store = stack.enter_context(FeatureStore(out / f".features-{name}"))
             with watch.stage(name):
-                drives.append(
-                    _alone(name, path, out / name, pipeline, library, state, topics, threads, progress, store)
+                alone = _alone(
+                    name, path, out / name, pipeline, library, state, topics, threads, progress, store, use_cache
                 )
-        ledgers: dict[tuple[int, int], Closures] = {}
+                drives.append(alone)
         with watch.stage("between"):
-            for earlier, later in combinations(range(len(drives)), 2):
-                said = f"{names[later]} in {names[earlier]}"
-                ledgers[later, earlier] = closures_between(
-                    drives[later], drives[earlier], state, pipeline, threads,
-                    lambda done, total, said=said: progress(said, done, total),
-                )  # fmt: skip
+            ledgers = _ledgers(drives, state, pipeline, threads, progress)
         with watch.stage("join"):
-            between = [_between(pair, ledger) for pair, ledger in ledgers.items()]
+            between = [between_of(*pair, ledger) for pair, ledger in ledgers.items()]
             own = [_own(alone.done) for alone in drives]
             joined = graph_joint.join(own, between, pipeline.solve, pipeline.join, pipeline.refine)
         with watch.stage("write"):
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-            judged = [_judged(*found) for found in zip(ledgers.values(), joined.weight, joined.residual, strict=True)]
+            judged = [judged_by(*found) for found in zip(ledgers.values(), joined.weight, joined.residual, strict=True)]
             pairs = list(ledgers)
             tables.write_joins(
                 out / "joins.parquet",
@@ -119,23 +111,30 @@ def run_joint(
     return account
 
 
-def closures_between(
-    later: Alone,
-    earlier: Alone,
-    state: PlaceState,
-    pipeline: Pipeline,
-    threads: int,
-    progress: Callable[[int, int], None],
-) -> Closures:
-    """The ledger of the later drive's keyframes (queries) against the earlier one's (matches), any of them."""
-    index = state.index(earlier.descriptors)
-    stops = np.full(len(later.descriptors), len(earlier.descriptors), np.int64)
-    ranked = rank_places(index, later.descriptors, stops, pipeline.propose.asked, pipeline.sequence, threads)
-    ledger = verify_between(propose(ranked, pipeline.propose), later.drive, earlier.drive, threads, progress)
-    both = [*earlier.descriptors, *later.descriptors]  # the two drives' places one after the other
-    numbered = replace(ledger, query=ledger.query + np.int32(len(earlier.descriptors)))
-    named = name_shared(numbered, state, both)
-    return replace(ledger, shared_references=named.shared_references, shared_overlap=named.shared_overlap)
+def _ledgers(
+    drives: Sequence[Alone], state: PlaceState, pipeline: Pipeline, threads: int, progress: Progress
+) -> dict[tuple[int, int], Closures]:
+    """By (later, earlier) drive, the ledger of the later one's keyframes in the earlier one; empty where unlikely."""
+    share = [0.0 if alone.drive.camera.matrix is None else calibration_share(alone.drive, threads) for alone in drives]
+    ledgers = {}
+    for later, own in enumerate(drives):
+        found = no_candidates()
+        for earlier in range(later):
+            found = with_drive(
+                found, earlier, own.descriptors, drives[earlier].descriptors, state, pipeline, threads
+            )  # fmt: skip
+        likely = likely_drives(found, pipeline.join)
+        for earlier in range(later):
+            other = drives[earlier]
+            said = f"{own.name} in {other.name}"
+            proposals = found.of(earlier) if earlier in likely else no_candidates().proposals
+            ledger = closures_between(
+                proposals, own.drive, other.drive, pipeline.join, threads,
+                lambda done, total, said=said: progress(said, done, total), max(share[later], share[earlier]),
+            )  # fmt: skip
+            shared = shared_of(proposals, state, own.descriptors, other.descriptors)
+            ledgers[later, earlier] = with_shared(ledger, proposals, shared)
+    return ledgers
 
 
 def _names(names: Sequence[str]) -> list[str]:
@@ -160,10 +159,11 @@ def _alone(
     threads: int,
     progress: Progress,
     store: FeatureStore,
+    use_cache: bool,
 ) -> Alone:
     done = run_alone(
         path, folder, pipeline, library, topics, threads,
-        lambda stage, count, total: progress(f"{name}: {stage}", count, total), store,
+        lambda stage, count, total: progress(f"{name}: {stage}", count, total), store, use_cache=use_cache,
     )  # fmt: skip
     done = replace(done, keyframes=replace(done.keyframes, drive=name))
     camera = logs.open(path, topics).camera()
@@ -175,48 +175,8 @@ def _alone(
 
 
 def _own(done: Run) -> graph_joint.Drive:
-    """The drive's graph without the closures that its own solve rejected, with the odometry's noise as it was said.
-
-    The metres stay as they were found: with the same noise for all, the joint solve judges it anew.
-    """
-    learned = done.record["odometry"]["sigma_factor"] ** 2
-    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in done.graph.kind], bool)
-    accepted = [verdict in (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER) for verdict in done.closures.verdict]
-    graph = rescaled(done.graph, odometry, odometry, 1.0 / learned, 1.0)
-    of_odometry = by_odometry(graph, done.closures, np.flatnonzero(accepted))
-    kept = np.flatnonzero(odometry | (done.solution.weight > 0.5))
-    graph = replace(
-        graph,
-        world_from_body=done.solution.world_from_body,
-        a=graph.a[kept],
-        b=graph.b[kept],
-        a_from_b=graph.a_from_b[kept],
-        information=graph.information[kept],
-        kind=[graph.kind[edge] for edge in kept.tolist()],
-    )
-    return graph_joint.Drive(graph, of_odometry[kept])
-
-
-def _between(pair: tuple[int, int], ledger: Closures) -> graph_joint.Between:
-    rows = np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
-    return graph_joint.Between(
-        *pair,
-        query=ledger.query[rows].astype(np.int64),
-        match=ledger.match[rows].astype(np.int64),
-        match_from_query=ledger.match_from_query[rows],
-        information=ledger.information[rows],
-        of_odometry=np.array([ledger.scale[row] == "odometry" for row in rows.tolist()], bool),
-    )
-
-
-def _judged(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
-    """The ledger with what the joint solve made of its verified rows."""
-    rows = np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
-    weights, residuals, verdict = np.full(len(ledger), np.nan), np.full(len(ledger), np.nan), list(ledger.verdict)
-    weights[rows], residuals[rows] = weight, residual
-    for row in rows[weight < 0.5].tolist():
-        verdict[row] = Verdict.REJECTED_BY_SOLVER
-    return replace(ledger, weight=weights, residual_after=residuals, verdict=verdict)
+    graph = replace(done.graph, world_from_body=done.solution.world_from_body)
+    return own_drive(graph, done.solution.weight, done.closures, done.record["odometry"]["sigma_factor"])
 
 
 def _write_maps(

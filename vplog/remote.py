@@ -16,7 +16,7 @@ import urllib.parse
 import urllib.request
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
@@ -57,7 +57,7 @@ def located(text: str | Path | RemotePath) -> Path:
 
 
 class RemotePath:
-    """One object, or what has this prefix, on a server."""
+    """One object, or what has this prefix, on a server. A URL has % for what it cannot spell; names here have not."""
 
     def __init__(self, url: str) -> None:
         self._url = url.rstrip("/")
@@ -78,7 +78,7 @@ class RemotePath:
         return self._url < other._url
 
     def __truediv__(self, name: str) -> RemotePath:
-        return RemotePath(f"{self._url}/{name}")
+        return RemotePath(f"{self._url}/{str(name).replace('%', '%25')}")
 
     @property
     def scheme(self) -> str:
@@ -86,7 +86,7 @@ class RemotePath:
 
     @property
     def name(self) -> str:
-        return PurePosixPath(urllib.parse.urlsplit(self._url).path).name
+        return PurePosixPath(urllib.parse.unquote(urllib.parse.urlsplit(self._url).path)).name
 
     @property
     def stem(self) -> str:
@@ -100,7 +100,8 @@ class RemotePath:
         return self
 
     def relative_to(self, folder: RemotePath) -> PurePosixPath:
-        return PurePosixPath(self._url).relative_to(PurePosixPath(str(folder)))
+        below = PurePosixPath(self._url).relative_to(PurePosixPath(str(folder)))
+        return PurePosixPath(urllib.parse.unquote(str(below)))
 
     def exists(self) -> bool:
         return self._kind != "none"
@@ -124,7 +125,7 @@ class RemotePath:
         """A stream that reads what is asked for. Raises OSError."""
         if mode != "rb":
             raise ValueError(f"a remote file is opened with mode rb, not {mode}")
-        raw: Any = _HttpRanges(self._url, self._length) if self._is_http else _Ranges(*self._place, self._length)
+        raw: Any = _HttpRanges(self._url, self._length) if self._is_http else _Ranges(*self.place, self._length)
         return io.BufferedReader(raw, _BLOCK_BYTES)
 
     def read_bytes(self) -> bytes:
@@ -146,22 +147,14 @@ class RemotePath:
         return self.scheme in ("http", "https")
 
     @cached_property
-    def _place(self) -> tuple[FileSystem, str]:
-        from pyarrow import fs
-
+    def place(self) -> tuple[FileSystem, str]:
+        """The file system of an object store, and the path in it."""
         place = urllib.parse.unquote(self._url.split("://", 1)[1])
-        if self.scheme == "gs":
-            return fs.GcsFileSystem(), place
-        endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
-        region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
-        known = {"endpoint_override": endpoint, "region": region}
-        return fs.S3FileSystem(
-            request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, **{k: v for k, v in known.items() if v}
-        ), place
+        return file_system(self.scheme, *s3_place()), place
 
     @cached_property
     def _info(self) -> FileInfo:
-        system, place = self._place
+        system, place = self.place
         return system.get_file_info(place)
 
     @cached_property
@@ -197,9 +190,9 @@ class RemotePath:
             return
         from pyarrow.fs import FileSelector
 
-        system, place = self._place
+        system, place = self.place
         for found in sorted(system.get_file_info(FileSelector(place, recursive=recursive)), key=lambda one: one.path):
-            yield RemotePath(f"{self._url}{found.path[len(place) :]}")
+            yield self / found.path[len(place) + 1 :]
 
 
 class _Ranges(io.RawIOBase):
@@ -258,6 +251,26 @@ class _HttpRanges(_Ranges):
             raise OSError(f"the server says {error.code} {error.reason}") from None
 
 
+def s3_place() -> tuple[str | None, str | None]:
+    """Endpoint and region of S3, as its own tools are told them; None where they are not told."""
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+    return endpoint, os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
+
+
+@lru_cache
+def file_system(scheme: str, endpoint: str | None, region: str | None) -> FileSystem:
+    """One for all objects of a server: it keeps its connections."""
+    from pyarrow import fs
+
+    if scheme == "gs":
+        return fs.GcsFileSystem()
+    known = {"endpoint_override": endpoint, "region": region}
+    return fs.S3FileSystem(  # delayed: a small file is one request, not the three of an upload in parts
+        request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, allow_delayed_open=True,
+        **{name: value for name, value in known.items() if value},
+    )  # fmt: skip
+
+
 @contextmanager
 def local_copy(path: Path | RemotePath) -> Iterator[Path]:
     """A remote folder or file as a local one for the time of the block; a local one as it is. Raises LogError."""
@@ -271,7 +284,7 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
                 raise LogError(f"There is nothing at {path}.")
             _download(path, target)
         except OSError as error:
-            raise LogError(f"Cannot read {path}: {_reason(error)}.") from None
+            raise LogError(f"Cannot read {path}: {reason(error)}.") from None
         yield target
 
 
@@ -294,17 +307,14 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
     if not isinstance(path, RemotePath):
         yield path
         return
-    if path.scheme not in ("s3", "gs"):
-        raise SettingsError(
-            f"Cannot write to {path}: {path.scheme}:// is for reading. Write to s3://, gs:// or a path."
-        )
+    check_writable(path)
     with tempfile.TemporaryDirectory(prefix="vplog-") as folder:
         target = Path(folder) / (path.name or "out")
         yield target
         files = sorted(file for file in target.rglob("*") if file.is_file())
         files.sort(key=lambda file: file.name == "run.json" and file.parent == target)
         try:
-            system, place = path._place
+            system, place = path.place
             for file in files:
                 with (
                     file.open("rb") as source,
@@ -312,8 +322,16 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
                 ):
                     shutil.copyfileobj(source, sink, _BLOCK_BYTES)
         except OSError as error:
-            raise ResultError(f"Cannot write {path}: {_reason(error)}.") from None
+            raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
 
 
-def _reason(error: OSError) -> str:
+def check_writable(path: RemotePath) -> None:
+    """Raises SettingsError for what is only read."""
+    if path.scheme not in ("s3", "gs"):
+        raise SettingsError(
+            f"Cannot write to {path}: {path.scheme}:// is for reading. Write to s3://, gs:// or a path."
+        )
+
+
+def reason(error: OSError) -> str:
     return (error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__)[:300].rstrip(".")

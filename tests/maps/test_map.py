@@ -105,7 +105,7 @@ def test_the_best_of_the_drives_are_those_of_one_index(root: Path, library: str)
         owner += [number] * len(places)
         rows += list(range(len(places)))
     index = state.index(known)
-    answers = search(store, names, state, library, views, 7, SequenceSettings(length=1), 2)
+    answers, _ = search(store, store.drives(), state, views, 7, SequenceSettings(length=1), 2)
     for at, view in enumerate(views):
         ranking = index.query(view, 7)
         count = answers.count[at]

@@ -79,7 +79,7 @@ def _top(scores: np.ndarray, k: int) -> list[int]:
     pairing=st.sampled_from(PAIRINGS),
     k=st.sampled_from([0, 1, 3, 20, 1000]),
     stop=st.one_of(st.none(), st.integers(0, 70)),
-    block=st.sampled_from([1, 7, 16, code_search._BLOCK]),
+    block=st.sampled_from([1, 7, 16, code_search.BLOCK]),
 )
 def test_scores_and_queries_are_those_of_the_formula(
     seed: int, count: int, windows: int, pairing: Pairing, k: int, stop: int | None, block: int
@@ -91,7 +91,7 @@ def test_scores_and_queries_are_those_of_the_formula(
     if count and rng.random() < 0.5:
         query = places.place(int(rng.integers(count)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(code_search, "_BLOCK", block)
+        patch.setattr(code_search, "BLOCK", block)
         index = places.index(9, pairing)
         scores, ranking = index.scores(query, stop), index.query(query, k, stop)
     seen = count if stop is None else min(stop, count)
@@ -105,14 +105,14 @@ def test_scores_and_queries_are_those_of_the_formula(
 def test_over_many_blocks_the_best_are_those_of_a_full_sort(pairing: Pairing) -> None:
     """More places than a block has, and most of them left out unseen: the order is still that of all scores."""
     rng = np.random.default_rng(4)
-    count = 2 * code_search._BLOCK + 1000
+    count = 2 * code_search.BLOCK + 1000
     places = _places(rng, count, J=6, windows=9, library=40)
     index = places.index(40, pairing)
     assert len(index) == count
-    for row in (0, code_search._BLOCK, count - 1):
+    for row in (0, code_search.BLOCK, count - 1):
         query = places.place(row)
         scores = index.scores(query)
-        for stop in (None, code_search._BLOCK, count - 500):
+        for stop in (None, code_search.BLOCK, count - 500):
             assert index.query(query, 20, stop).rows.tolist() == _top(scores[:stop], 20)
 
 
@@ -164,7 +164,7 @@ def test_memory_is_told_to_the_byte() -> None:
 @pytest.mark.parametrize("pairing", PAIRINGS)
 def test_places_as_good_as_their_bound_are_not_left_out(pairing: Pairing, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where every box is the query's own, a score is all that the weights allow: a bound rounded down would be less."""
-    monkeypatch.setattr(code_search, "_BLOCK", 64)
+    monkeypatch.setattr(code_search, "BLOCK", 64)
     rng = np.random.default_rng(8)
     references = rng.permuted(np.tile(np.arange(8), (3000, 1)), axis=1)[:, :6].astype(np.uint16)
     weights = rng.integers(1, 256, references.shape).astype(np.uint8)

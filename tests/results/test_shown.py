@@ -22,7 +22,7 @@ from vplog.errors import ResultError
 from vplog.results import geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.mcap import camera_topic, write_mcap
-from vplog.results.previews import PictureSettings, Previews, jpeg, scaled_size, shrink
+from vplog.results.previews import PictureSettings, Previews, jpeg, preview, scaled_size, shrink
 from vplog.results.shown import Earth, Explained, Shown
 
 from .example import COUNT, METADATA, make_run
@@ -184,24 +184,20 @@ def test_a_cameras_name_becomes_a_topic(name: str) -> None:
     assert not set(topic[5:]) - set("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789_.-")
 
 
-def test_previews_come_back_small(tmp_path: Path) -> None:
+def test_previews_are_small() -> None:
     settings = PictureSettings(megapixels=0.01)
     images = [np.random.default_rng(row).integers(0, 255, (60 + row, 400), np.uint8) for row in range(5)]
-    with Previews(tmp_path / "p", settings) as previews:
-        for image in images:
-            previews.append(image)
-        assert len(previews) == 5
-        for row in (4, 0, 2):
-            size = scaled_size(400, 60 + row, 0.01)
-            assert size[0] * size[1] <= 1.02e4
-            assert previews.image(row).shape == size[::-1]
-            assert previews[row] == jpeg(shrink(images[row], 0.01), settings.quality)
-        with pytest.raises(IndexError):
-            previews[5]
-    assert not (tmp_path / "p").exists()
-    with Previews(tmp_path / "p", PictureSettings(megapixels=0)) as previews:
-        previews.append(images[0])
-        assert len(previews) == 0
+    kept = [preview(image, settings) for image in images]
+    previews = Previews(len(kept), kept.__getitem__)
+    assert len(previews) == 5
+    for row in (4, 0, 2):
+        size = scaled_size(400, 60 + row, 0.01)
+        assert size[0] * size[1] <= 1.02e4
+        assert previews.image(row).shape == size[::-1]
+        assert previews[row] == jpeg(shrink(images[row], 0.01), settings.quality)
+    with pytest.raises(IndexError):
+        previews[5]
+    assert preview(images[0], PictureSettings(megapixels=0)) == b""
 
 
 def test_a_picture_is_never_enlarged() -> None:

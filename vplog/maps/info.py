@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
-from vplog.errors import ResultError
+from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.joint_record import components_of
+from vplog.maps.store import other_library
 from vplog.places.stored import read_library_record
 from vplog.results import run_record
 
@@ -18,45 +18,46 @@ if TYPE_CHECKING:
 
     from vplog.maps.store import Store
 
+_READ_AT_ONCE = 16
+"""Drives: on an object store each is a request that takes some 20 to 50 ms."""
+
 
 def describe_map(root: Path) -> dict[str, Any]:
-    """Drives, places, bytes, library and failures of a map, without reading a descriptor. Raises ResultError."""
-    store = map_store.Store(root)
-    head, drives, problems = store.head(), [], []
+    """Drives, places, bytes, library, what joins the drives, and failures of a map, without reading a descriptor.
+
+    Raises ResultError.
+    """
+    with map_store.reading(root) as store:
+        return _describe(store)
+
+
+def _describe(store: Store) -> dict[str, Any]:
+    head, problems, abouts = store.head(), list[str](), store.drives()
     now, other = (keys.key_of(head.settings), keys.code_hash()), []
-    for drive, about in store.drives().items():
+    for drive, about in abouts.items():
         if about["library"] != head.library:
             problems.append(other_library(store, drive, about["library"], head.library))
         if (about.get("settings"), about.get("code")) != now:
             other.append(about["log"])
-        record = run_record.read_run_json(store.run(drive) / "run.json")
-        path = store.run(drive) / "descriptors.parquet"
-        drives.append({
-            "drive": drive,
-            "log": about["log"],
-            "keyframes": row_count(path),
-            "candidates": row_count(store.run(drive) / "closures.parquet"),
-            "accepted": record.get("counts", {}).get("verdicts", {}).get("accepted", 0),
-            "descriptor_bytes": path.stat().st_size,
-            "descriptor_bits": record.get("descriptor_bits"),
-            "bytes": sum(file.stat().st_size for file in store.run(drive).rglob("*") if file.is_file()),
-            "seconds": record.get("totals", {}).get("seconds"),
-            "peak_memory_mb": record.get("totals", {}).get("peak_memory_mb"),
-        })  # fmt: skip
+    with ThreadPoolExecutor(_READ_AT_ONCE if store.mirror else 1) as pool:
+        drives = list(
+            pool.map(lambda drive: store.read(drive, lambda _: _drive(store, drive, abouts[drive]), ()), abouts)
+        )
     if other:
         problems.append(
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
             f"another version of vplog. `vplog batch` with their logs makes them anew; the first is {other[0]}."
         )
-    known = {map_store.folder_name(one["drive"]) for one in drives}
-    for name in map_store.TABLES:
-        left = sorted(path.name for path in root.glob(f"{name}/drive=*") if path.name not in known)
-        problems += [f"{root}/{name}/{folder} is of no drive in the map: remove it." for folder in left]
+    problems += _left_behind(store, list(abouts))
     places = sum(one["keyframes"] for one in drives)
     stored = sum(one["descriptor_bytes"] for one in drives)
-    about_library = read_library_record(store.library(head.library)) if head.library else {}
+    about_library = {}
+    try:
+        about_library = read_library_record(store.library(head.library)) if head.library else {}
+    except LibraryError as error:
+        problems.append(f"{store} has lost its library {str(head.library)[:12]}: {error}")
     return {
-        "map": str(root),
+        "map": str(store),
         "library": {
             "hash": head.library,
             **{name: about_library.get(name) for name in ("references", "features")},
@@ -65,24 +66,55 @@ def describe_map(root: Path) -> dict[str, Any]:
         "descriptor_bytes": stored,
         "bytes_per_place": round(stored / places, 1) if places else None,
         "bytes": sum(one["bytes"] for one in drives),
+        "on_earth": sum(one["on_earth"] for one in drives),
+        "components": _components(store, problems),
         "drives": drives,
         "failures": store.failures(),
         "problems": problems,
     }
 
 
-def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:
-    """Why a drive's places may not be mixed with those of the map, in one line."""
-    return (
-        f"{store.run(drive)} was described with library {found[:12]}, and the map's is {str(wanted)[:12]}: their "
-        f"places do not compare. Remove the drive's folders (rm -r {store.root}/*/{map_store.folder_name(drive)}), or "
-        "add its log with `vplog batch`."
-    )
+def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
+    def read(_: Path) -> dict[str, Any]:
+        record = run_record.read_run_json(store.file(drive, "run.json"))
+        sizes = store.sizes(drive)
+        return {
+            "drive": drive,
+            "log": about["log"],
+            "keyframes": store.rows("descriptors", drive),
+            "candidates": store.rows("closures", drive),
+            "accepted": record.get("counts", {}).get("verdicts", {}).get("accepted", 0),
+            "on_earth": store.earth(drive) is not None,
+            "descriptor_bytes": sizes.get("descriptors.parquet", 0),
+            "descriptor_bits": record.get("descriptor_bits"),
+            "bytes": sum(sizes.values()),
+            "seconds": record.get("totals", {}).get("seconds"),
+            "peak_memory_mb": record.get("totals", {}).get("peak_memory_mb"),
+        }
+
+    return store.read(drive, read, ())
 
 
-def row_count(path: Path) -> int:
-    """Rows of a table, by its footer. Raises ResultError."""
+def _components(store: Store, problems: list[str]) -> list[dict[str, Any]] | None:
+    """The drives that closures join in one frame, as joint.json has them; None where nothing was joined yet."""
     try:
-        return pq.read_metadata(path).num_rows
-    except (OSError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Remove the drive's folders.") from None
+        if store.mirror is not None:
+            store.mirror.rest(["joint.json"])
+        return components_of(store.root) if (store.root / "joint.json").is_file() else None
+    except ResultError as error:
+        problems.append(str(error))
+        return None
+
+
+def _left_behind(store: Store, drives: list[str]) -> list[str]:
+    """Folders that are of no drive in the map, each in a sentence."""
+    if store.mirror is not None:
+        return []  # a writer there removes them
+    known, root = {map_store.folder_name(drive) for drive in drives}, store.root
+    left = [
+        f"{name}/{path.name}"
+        for name in ("runs", *map_store.TABLES)
+        for path in sorted(root.glob(f"{name}/drive=*"))
+        if path.name not in known
+    ]
+    return [f"{root}/{name} is of no drive in the map: remove it." for name in left]

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
+from dataclasses import replace
 from functools import cache
-from pathlib import Path
-from typing import Any
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
 
-import vplog
-from vplog.maps.store import sha256_of
-from vplog.results import run_record
+from vplog.code_hash import code_of
+from vplog.results import run_record, tables
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from pathlib import Path
 
 
 def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, Any]], inputs: list[Any]) -> list[str]:
@@ -38,13 +43,39 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
     return [drive for drive in result if drive is not None]
 
 
+def free_name(drive: str, log: str, known: Collection[str]) -> str:
+    """The ID of a drive from another map: its own, or where that is taken the log's name with the first free number.
+
+    So numbered that `drive_names` still knows it by its log.
+    """
+    named = re.fullmatch(r"(.+)-\d+", drive)
+    base = named[1] if named and not PurePath(log).name.startswith(drive) else drive
+    number, free = 2, drive
+    while free in known:
+        free, number = f"{base}-{number}", number + 1
+    return free
+
+
+def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
+    """drive.json of the same drive under another ID: with the key that a batch would give it."""
+    made_from = {name: value for name, value in record.items() if name not in ("key", "log", "earth")}
+    if key_of(made_from) != record["key"]:
+        return {**record, "drive": drive}
+    return {**record, "drive": drive, "key": key_of({**made_from, "drive": drive})}
+
+
+def name_keyframes(path: Path, drive: str) -> None:
+    """Give keyframes.parquet of a drive the ID that it has in the map. Raises ResultError."""
+    header = tables.read_metadata(path)
+    keyframes, world_from_body = tables.read_keyframes(path)
+    about = tables.TableMetadata(json.loads(header["vplog.settings"]), header["vplog.library"])
+    tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about)
+
+
 @cache
 def code_hash() -> str:
-    """sha256 over every .py file of the package, by name: any change of the code counts as one of the result."""
-    package, digest = Path(vplog.__file__).parent, hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(f"{path.relative_to(package).as_posix()} {sha256_of(path)}\n".encode())
-    return digest.hexdigest()
+    """sha256 over the files of the package that a run uses: a change of any of them counts as one of the result."""
+    return code_of("vplog.pipeline")["code"]
 
 
 def key_of(made_from: dict[str, Any]) -> str:

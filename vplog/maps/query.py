@@ -3,61 +3,38 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from vplog import logs
-from vplog.errors import LibraryError, LogError, ResultError
+from vplog.errors import LogError, ResultError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.keyframes import select_keyframes
 from vplog.maps import store as map_store
-from vplog.maps.info import other_library, row_count
+from vplog.maps.index import update_index
+from vplog.maps.search import best_places
+from vplog.maps.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
 from vplog.pipeline import Pipeline
-from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.places.bobb import BobbState
+from vplog.places.sequence import SequenceSettings
 from vplog.results import tables
-from vplog.results.atomic import replacing
+from vplog.results.placed import placed_table, write_placed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Mapping, Sequence
+    from concurrent.futures import Executor
 
-    from vplog.data import Float32s, Int32s, Ints
+    import pyarrow as pa
+
+    from vplog.data import Ints
+    from vplog.maps.answers import Answers
     from vplog.maps.store import Store
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]
-
-PLACED = pa.schema(
-    [
-        pa.field("query", pa.int32(), False, metadata={"unit": "row", "description": "View of the log, 0 the first."}),
-        pa.field("query_stamp_ns", pa.int64(), False, metadata={"unit": "ns", "description": "Its stamp."}),
-        pa.field("rank", pa.int32(), False, metadata={"unit": "1", "description": "0 is the view's best answer."}),
-        pa.field("drive", pa.string(), False, metadata={"unit": "", "description": "Drive of the place."}),
-        pa.field("keyframe", pa.int32(), False, metadata={"unit": "row", "description": "Keyframe of that drive."}),
-        pa.field("stamp_ns", pa.int64(), False, metadata={"unit": "ns", "description": "Stamp of the keyframe."}),
-        pa.field("score", pa.float32(), False, metadata={"unit": "1", "description": "The recogniser's similarity."}),
-        pa.field("support", pa.int32(), False, metadata={"unit": "1", "description": "Neighbours that agree."}),
-    ]
-)
-"""What a query answers, in order of the views, then of rank. `drive` and `keyframe` join with MAP/keyframes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """The best places of a map for Q views, best first; a row beyond `count` is none."""
-
-    count: Ints
-    """(Q,) how many of the K there are."""
-    drive: Int32s
-    """(Q, K) number of the drive, in order of IDs."""
-    keyframe: Int32s
-    """(Q, K) row of the drive's keyframes."""
-    score: Float32s
-    support: Int32s
 
 
 def query_map(
@@ -69,37 +46,25 @@ def query_map(
     out: Path | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    executor: Executor | None = None,
 ) -> dict[str, Any]:
     """The `top` places of the map that are most like each view of a log, in `out` too where given.
 
-    Views are chosen and described as the map's drives were, with its library; drives are searched one by one, exactly,
-    so memory is that of the largest. With `sequence` views in a window (None: as the map's settings say; 1: each view
-    for itself) lines run within a drive. Raises VplogError with one line.
+    Views are chosen and described as the map's drives were, with its library. With `sequence` views in a window (None:
+    as the map's settings say; 1: each view for itself) lines run within a drive. With an executor its workers search
+    the map; they must see its folder. Raises VplogError with one line.
     """
-    store = map_store.Store(root)
-    head = store.head()
-    drives = store.drives()
-    if head.library is None or not drives:
-        raise ResultError(f"{root} has no finished drive yet. Add some: vplog batch LOG... -o {root}")
-    for drive, about in drives.items():
-        if about["library"] != head.library:
-            raise LibraryError(other_library(store, drive, about["library"], head.library))
-    pipeline = Pipeline.read(head.settings, f"{root}/map.json")
-    state = pipeline.places.load(store.library(head.library), threads)
-    log = logs.open(path, topics)
-    stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
-    settings = pipeline.sequence
-    if sequence is not None:
-        settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
-    top = min(top, sum(row_count(store.run(drive) / "descriptors.parquet") for drive in drives))
-    answers = search(store, list(drives), state, head.library, descriptors, top, settings, threads, progress)
-    table = _table(store, list(drives), answers, stamps)
+    with map_store.reading(root) as store:
+        drives, pipeline, state = open_map(store, threads)
+        log = logs.open(path, topics)
+        stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
+        settings = pipeline.sequence
+        if sequence is not None:
+            settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
+        answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
+        table = _table(store, list(drives), answers, stamps)
     if out is not None:
-        about = tables.TableMetadata(head.settings, head.library).record()
-        with replacing(out) as stream:
-            pq.write_table(
-                table.replace_schema_metadata({**about, "vplog.table": "placed"}), stream, compression="zstd"
-            )
+        write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
     return {
         "map": str(root),
         "log": str(path),
@@ -109,9 +74,35 @@ def query_map(
         "best_by_drive": {
             drive: int((answers.drive[answers.count > 0, 0] == number).sum()) for number, drive in enumerate(drives)
         },
-        "warnings": log.warnings + warnings,
+        "warnings": log.warnings + warnings + told,
         "answers": table.to_pylist(),
     }
+
+
+def index_map(root: Path, threads: int = 1, progress: Progress = lambda *_: None) -> dict[str, Any]:
+    """Bring the index of a map up to its drives, which the next query would do. Raises VplogError with one line."""
+    if not isinstance(root, Path):
+        raise ResultError(f"{root} is read through a folder that goes with the query, so its index does, too.")
+    store = map_store.Store(root)
+    drives, _, state = open_map(store, threads)
+    if not isinstance(state, BobbState):
+        raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
+    parts, warnings = update_index(store, drives, state.hash, state, threads, progress)
+    return {
+        "map": str(root),
+        "drives": list(drives),
+        "places": sum(part.places for part in parts),
+        "segments": [str(part.path) for part in parts if part.path is not None],
+        "bytes": sum(part.path.stat().st_size for part in parts if part.path is not None),
+        "warnings": warnings,
+    }
+
+
+def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pipeline, PlaceState]:
+    """The drives of a map, its settings, and the library that describes its places. Raises VplogError."""
+    library, drives = map_store.one_library(store)
+    pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
+    return drives, pipeline, pipeline.places.load(store.library(library), threads)
 
 
 def describe_log(
@@ -151,70 +142,54 @@ def describe_log(
 
 def search(
     store: Store,
-    drives: Sequence[str],
+    drives: Mapping[str, Mapping[str, Any]],
     state: PlaceState,
-    library: str,
     descriptors: Sequence[Any],
     top: int,
     settings: SequenceSettings,
     threads: int = 1,
     progress: Progress = lambda *_: None,
-) -> Answers:
-    """The `top` best places of all drives for each of Q views in order; ties go to the earlier drive, then row.
+    executor: Executor | None = None,
+) -> tuple[Answers, list[str]]:
+    """The `top` best places of all drives for each of Q views in order, and what the user should know of them.
 
-    The score of a single view does not depend on the other places of an index, so the best of the drives' best are
-    those of all. That of a sequence is how much more alike it is than is usual in its drive, in the same unit. Raises
-    LibraryError where a drive's descriptors are of another library.
+    Ties go to the earlier drive, then row. Single views are ranked exactly, by the map's index where the recogniser is
+    `bobb`. Lines are drawn in every drive of a map of up to EXACT_PLACES, else in the likely ones (`sequences.py`).
     """
-    count = len(descriptors)
-    best = Answers(
-        np.zeros(count, np.int64), np.zeros((count, top), np.int32), np.zeros((count, top), np.int32),
-        np.full((count, top), -np.inf, np.float32), np.zeros((count, top), np.int32),
-    )  # fmt: skip
-    for number, drive in enumerate(drives):
-        column, made_by = tables.read_descriptors(store.run(drive) / "descriptors.parquet")
-        if made_by != library:
-            raise LibraryError(other_library(store, drive, made_by, library))
-        try:
-            column = column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
-        except pa.ArrowException:
-            raise ResultError(
-                f"{store.run(drive)}/descriptors.parquet is of another recogniser. Remove the drive's folders."
-            ) from None
-        index = state.index(state.from_arrow(column))
-        stops = np.full(count, len(column), np.int64)
-        for row, (ranking, support) in enumerate(rank_places(index, descriptors, stops, top, settings, threads)):
-            _merge(best, row, number, ranking.rows, ranking.score, support)
-        progress("search", number + 1, len(drives))
-    return best
-
-
-def _merge(best: Answers, row: int, number: int, rows: Int32s, score: Float32s, support: Int32s) -> None:
-    """Take a drive's ranking into the answers of a view, in place."""
-    had, top = int(best.count[row]), best.score.shape[1]
-    every = np.concatenate([best.score[row, :had], score])
-    order = np.argsort(-every, kind="stable")[:top]  # stable: what was there is of an earlier drive
-    for kept, more in (
-        (best.drive, np.full(len(rows), number, np.int32)),
-        (best.keyframe, rows),
-        (best.support, support),
-        (best.score, score),
-    ):
-        kept[row, : len(order)] = np.concatenate([kept[row, :had], more])[order]
-    best.count[row] = len(order)
+    numbered = dict(enumerate(drives))
+    if not isinstance(state, BobbState):
+        top = min(top, sum(store.rows("descriptors", drive) for drive in drives))
+        return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), []
+    parts, told = update_index(store, drives, state.hash, state, threads, progress)
+    places = sum(part.places for part in parts)
+    top = min(top, places)
+    if settings.length == 1:
+        return best_places(parts, state, descriptors, top, threads, executor, progress), told
+    if places > EXACT_PLACES:
+        single = best_places(parts, state, descriptors, PLACES_A_VIEW, threads, executor, progress)
+        numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
+        told.append(f"Sequences were looked for in the {len(numbered)} of {len(drives)} drives most like single views.")
+    return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
 
 
 def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:
     """One row for every answer."""
-    stamped = [pq.read_table(store.run(drive) / "descriptors.parquet", columns=["stamp_ns"]) for drive in drives]
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]
-    known = [table["stamp_ns"].to_numpy() for table in stamped]
-    stamp = np.array([known[one][row] for one, row in zip(number.tolist(), keyframe.tolist(), strict=True)], np.int64)
-    columns = [
-        query.astype(np.int32), stamps[query], rank.astype(np.int32), [drives[one] for one in number.tolist()],
-        keyframe, stamp, answers.score[there], answers.support[there],
-    ]  # fmt: skip
-    arrays = [pa.array(values, field.type) for values, field in zip(columns, PLACED, strict=True)]
-    return pa.Table.from_arrays(arrays, schema=PLACED)
+    stamp = np.empty(len(query), np.int64)
+    numbers: list[int] = number.tolist()
+    for one in set(numbers):
+        path = store.file(drives[one], "descriptors.parquet")
+        known = pq.read_table(path, columns=["stamp_ns"])["stamp_ns"].to_numpy()
+        rows = keyframe[number == one]
+        if rows.max() >= len(known):
+            raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
+        stamp[number == one] = known[rows]
+    names = [drives[one] for one in numbers]
+    return placed_table(
+        [
+            query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,
+            answers.score[there], answers.support[there],
+        ]
+    )  # fmt: skip

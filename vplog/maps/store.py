@@ -1,4 +1,4 @@
-"""A map on disk: finished drives as folders that appear whole, described with one library, read by anyone at any time.
+"""A map: finished drives that appear whole, described with one library, read by anyone at any time.
 
     MAP/map.json                               format, library, settings
     MAP/libraries/HASH/                        the references that all places are described with
@@ -7,37 +7,48 @@
     MAP/descriptors/... closures/... edges/... trajectory/...   it; hard links to the run folder's files
     MAP/failures.json                          drives that could not be run, each with its error
 
-A drive is in the map when its run folder is: that is one rename. Its tables are links: no byte is stored twice, both
-names always show the same bytes (every writer here replaces a file and never changes one), and one look at the inode
-tells whether a link is missing. Removing a drive is removing its folders: `rm -r MAP/*/drive=ID`.
+A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when its manifest is
+(mirror.py). Its tables are links: no byte is stored twice, both names always show the same bytes (every writer here
+replaces a file and never changes one), and one look at the inode tells whether a link is missing. Removing a drive is
+removing its folders: `rm -r MAP/*/drive=ID`.
 """
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
-import os
-import re
-import shutil
+import tempfile
+import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 import vplog
-from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.errors import LibraryError, ResultError
+from vplog.maps import local
+from vplog.maps.earth import earth_as_plain, earth_from_plain, earth_of_run
+from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
+from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
-from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+    from collections.abc import Callable, Iterable, Iterator
 
-FORMAT = 1
-"""Version of this layout. A reader refuses another one."""
-TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
-"""Data sets of a map: each is a file of this name in every run folder."""
-_HASH = re.compile(r"[0-9a-f]{64}")
+    from vplog.maps.mirror import Mirror
+    from vplog.results.shown import Earth
+
+    T = TypeVar("T")
+
+__all__ = [
+    "TABLES", "Head", "Store", "add_library", "folder_name", "one_library", "other_library", "publish", "reading",
+    "remove", "row_count", "writing",
+]  # fmt: skip
+
+_TRIES, _PAUSE_S = 6, 0.02
+"""A drive is read again where it was replaced while it was read, after a pause that doubles: 1.3 s in all. A batch
+replaces each once, and a rename takes less than a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +63,16 @@ class Head:
 
 @dataclass(frozen=True)
 class Store:
-    """The names in a map."""
+    """The names in a map. Of one on an object store `root` is a local folder, where `run`, `table` and `library` put
+    what they are asked for."""
 
     root: Path
+    mirror: Mirror | None = None
+    """None for a map that is a folder."""
+
+    def __str__(self) -> str:
+        """As its user calls it."""
+        return str(self.root if self.mirror is None else self.mirror.remote)
 
     @property
     def staging(self) -> Path:
@@ -62,18 +80,83 @@ class Store:
         return self.root / ".staging"
 
     def run(self, drive: str) -> Path:
+        """The run folder; of a map on a store with its tables and run.json alone (`whole` has the rest)."""
+        if self.mirror is not None:
+            self.mirror.fetch(drive, AT_HAND)
         return self.root / "runs" / folder_name(drive)
 
+    def file(self, drive: str, name: str) -> Path:
+        """One file of the run folder, where it has one of this name."""
+        if self.mirror is not None:
+            self.mirror.fetch(drive, [name])
+        return self.root / "runs" / folder_name(drive) / name
+
+    def whole(self, drive: str) -> Path:
+        """The run folder with all that is in it."""
+        if self.mirror is not None:
+            self.mirror.fetch(drive, self.sizes(drive))
+        return self.root / "runs" / folder_name(drive)
+
+    def forget(self, drive: str) -> None:
+        """Of a map on a store, free the disk of what was asked for of a drive."""
+        if self.mirror is not None:
+            self.mirror.forget(drive)
+
     def table(self, name: str, drive: str) -> Path:
+        """One table of a drive, under its data set; of a map on a store, in the run folder."""
+        if self.mirror is not None:
+            return self.file(drive, f"{name}.parquet")
         return self.root / name / folder_name(drive) / f"{name}.parquet"
 
     def library(self, digest: str) -> Path:
+        if self.mirror is not None:
+            self.mirror.library(digest)
         return self.root / "libraries" / digest
+
+    def sizes(self, drive: str) -> dict[str, int]:
+        """Bytes of each file of a run folder, by name."""
+        if self.mirror is not None:
+            return {name: about["bytes"] for name, about in self.mirror.manifests[drive]["files"].items()}
+        run = self.run(drive)
+        files = [file for file in sorted(run.rglob("*")) if file.is_file()]
+        return {file.relative_to(run).as_posix(): file.stat().st_size for file in files}
+
+    def rows(self, name: str, drive: str) -> int:
+        """Rows of a table of a drive, by its footer. Raises ResultError."""
+        if self.mirror is not None:
+            return int(self.mirror.manifests[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
+        return row_count(self.run(drive) / f"{name}.parquet")
+
+    def earth(self, drive: str) -> Earth | None:
+        """Where on earth a drive is, None where nothing says so. Raises ResultError."""
+        about = drive_record(self.root / "runs" / folder_name(drive))
+        return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
 
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order. Raises ResultError where one cannot be read."""
-        found = [drive_record(folder) for folder in sorted(self.root.glob("runs/drive=*")) if folder.is_dir()]
+        folders = sorted(self.root.glob("runs/drive=*"))
+        found = [drive_record(folder) for folder in folders if (folder / "drive.json").is_file()]
         return {record["drive"]: record for record in sorted(found, key=lambda record: record["drive"])}
+
+    def read(self, drive: str, of: Callable[[Path], T], names: Iterable[str] = AT_HAND) -> T:
+        """What a function makes of these files of the run folder, all of one state of the drive: of the folder that a
+        writer put in place of another meanwhile, it is asked again. Raises ResultError."""
+        folder = self.root / "runs" / folder_name(drive)
+        if self.mirror is not None:
+            self.mirror.fetch(drive, names)
+            return of(folder)  # of one generation, always
+        for number in range(_TRIES):
+            time.sleep(_PAUSE_S * (2**number - 1))
+            before = _identity(folder)
+            try:
+                found = of(folder)
+            except ResultError:
+                if before is not None and _identity(folder) == before:
+                    raise
+                continue
+            if before is not None and _identity(folder) == before:
+                return found
+        raise ResultError(f"{folder} is being replaced or removed. Run again when that is done.")
 
     def failures(self) -> dict[str, dict[str, Any]]:
         """Log and error of each drive that failed when it was last tried, by ID."""
@@ -84,9 +167,7 @@ class Store:
         """map.json. Raises ResultError where the folder is no map, or one of another version."""
         path = self.root / "map.json"
         if not path.is_file():
-            raise ResultError(
-                f"{self.root} is not a map: it has no map.json. Make one: vplog batch LOG... -o {self.root}"
-            )
+            raise ResultError(f"{self} is not a map: it has no map.json. Make one: vplog batch LOG... -o {self}")
         record = run_record.read_run_json(path)
         if record.get("format") != FORMAT:
             raise ResultError(
@@ -94,7 +175,7 @@ class Store:
                 f"it ({record.get('vplog')!r})."
             )
         library, settings = record.get("library"), record.get("settings")
-        known = library is None or (isinstance(library, str) and _HASH.fullmatch(library))
+        known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
             raise ResultError(f"{path} has no sound library or settings. Run `vplog batch` again to write it anew.")
         return Head(library, settings)
@@ -102,133 +183,144 @@ class Store:
     def write_head(self, head: Head) -> None:
         """map.json, unless it says that already."""
         record = {"format": FORMAT, "vplog": vplog.__version__, "library": head.library, "settings": head.settings}
-        _write_changed(self.root / "map.json", record)
+        self._write("map.json", record)
 
     def write_failures(self, failures: dict[str, dict[str, Any]]) -> None:
-        _write_changed(self.root / "failures.json", dict(sorted(failures.items())))
+        self._write("failures.json", dict(sorted(failures.items())))
+
+    def _write(self, name: str, record: dict[str, Any]) -> None:
+        """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
+        path = self.root / name
+        if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+            return
+        run_record.write_run_json(path, record)
+        if self.mirror is not None:
+            from vplog.maps.sending import write_json
+
+            write_json(self.mirror, name)
 
 
-def folder_name(drive: str) -> str:
-    """What a partition of a data set is called; other characters than letters, digits and `_.-~` as in a URL."""
-    return f"drive={quote(drive, safe='')}"
-
-
-def drive_record(folder: Path) -> dict[str, Any]:
-    """drive.json of a run folder in a map. Raises ResultError."""
-    record = run_record.read_run_json(folder / "drive.json")
-    wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
-    if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
-        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Remove the folder and run again.")
-    if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
-        raise ResultError(f"{folder} holds drive {record['drive']!r}. Remove the folder and run again.")
-    return record
-
-
-def _write_changed(path: Path, record: dict[str, Any]) -> None:
-    """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
-    if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+@contextmanager
+def reading(root: Path) -> Iterator[Store]:
+    """A map, local or on an object store, for those who only read it. Raises ResultError."""
+    if not isinstance(root, RemotePath):
+        yield Store(root)
         return
-    run_record.write_run_json(path, record)
+    from vplog.maps.mirror import Mirror
+
+    with tempfile.TemporaryDirectory(prefix="vplog-map-") as folder:
+        yield Store(Path(folder), Mirror(root, Path(folder)))
 
 
 @contextmanager
 def writing(root: Path) -> Iterator[Store]:
-    """The map for one writer, made where it is not there yet; the lock goes with the process that holds it.
+    """The map for one writer, made where it is not there yet.
 
     What a writer that was killed had finished is put in; what it had not is removed. Raises SettingsError where the
     folder holds other things, or where another process writes.
     """
-    store = Store(root)
-    if root.is_dir() and not (root / "map.json").exists():
-        others = [path.name for path in root.iterdir() if not path.name.startswith(".")]
-        if others:
-            raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        lock = (root / ".lock").open("a")
-    except OSError as error:
-        raise SettingsError(f"Cannot make the map {root}: {error.strerror}. Choose another folder with -o.") from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SettingsError(
-                f"Another `vplog batch` is writing to {root}. Wait for it to end, or choose another folder with -o."
-            ) from None
-        except OSError as error:  # file systems without locks
-            raise SettingsError(f"Cannot lock {root}/.lock: {error.strerror}. Choose another folder with -o.") from None
-        _settle(store)
+    if isinstance(root, RemotePath):
+        with _writing_remote(root) as store:
+            yield store
+        return
+    with local.locked(root):
+        store = Store(root)
+        local.settle(store)
         yield store
-        shutil.rmtree(store.staging, ignore_errors=True)
+        local.clear(store)
 
 
-def _settle(store: Store) -> None:
-    """Put in what a killed writer had finished: a folder with drive.json, which is written last."""
-    for folder in sorted(store.staging.glob("*/drive.json")):
-        record = drive_record(folder.parent)
-        if not store.run(record["drive"]).exists():
-            publish(store, record["drive"], folder.parent)
-    shutil.rmtree(store.staging, ignore_errors=True)
-    store.staging.mkdir(parents=True, exist_ok=True)
-    for drive in store.drives():
-        link_tables(store, drive)
+@contextmanager
+def _writing_remote(root: RemotePath) -> Iterator[Store]:
+    from vplog.maps import bucket_lock, sending
+    from vplog.maps.mirror import Mirror
+
+    check_writable(root)
+    with bucket_lock.held(root) as lock, tempfile.TemporaryDirectory(prefix="vplog-map-") as folder:
+        mirror = Mirror(root, Path(folder), lock)
+        sending.begin(mirror)
+        mirror.rest()
+        store = Store(Path(folder), mirror)
+        store.staging.mkdir()
+        yield store
+        sending.send_rest(mirror)
 
 
 def publish(store: Store, drive: str, made: Path) -> None:
-    """Make a finished run folder the drive's, in place of the one it may have, and link its tables."""
-    run, replaced = store.run(drive), store.staging / f"replaced-{os.getpid()}"
-    try:
-        run.parent.mkdir(exist_ok=True)
-        if run.exists():
-            shutil.rmtree(replaced, ignore_errors=True)
-            run.rename(replaced)
-            (replaced / "drive.json").unlink()  # so that nobody takes it for a new one
-        made.rename(run)
-    except OSError as error:
-        raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
-    shutil.rmtree(replaced, ignore_errors=True)
-    link_tables(store, drive)
+    """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have. Where it is on
+    earth is noted with it. Raises ResultError; then the map has the drive as before.
+    """
+    about = drive_record(made)
+    if "earth" not in about:
+        run_record.write_run_json(made / "drive.json", {**about, "earth": earth_as_plain(earth_of_run(made))})
+    if store.mirror is None:
+        local.publish(store, drive, made)
+        return
+    from vplog.maps import sending
+
+    sending.publish(store.mirror, drive, made)
 
 
-def link_tables(store: Store, drive: str) -> None:
-    """Each table of the run folder under its data set; a copy on file systems without hard links."""
-    for name in TABLES:
-        source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
-        if not source.is_file():
-            raise ResultError(f"{source} is not there. Remove {store.run(drive)} and run again.")
-        if path.exists() and (path.samefile(source) or _same_copy(source, path)):
-            continue
-        part = store.staging / f"{name}-{os.getpid()}.parquet"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.unlink(missing_ok=True)
-            os.link(source, part)
-            part.replace(path)
-        except OSError:  # no hard links here; what else is wrong, the copy says
-            with replacing(path) as stream, source.open("rb") as whole:
-                shutil.copyfileobj(whole, stream)
+def remove(store: Store, drive: str) -> None:
+    """Take a drive out, with all that bears its name. Raises ResultError."""
+    if store.mirror is None:
+        local.remove(store, drive)
+        return
+    from vplog.maps import sending
 
-
-def _same_copy(source: Path, path: Path) -> bool:
-    """Whether a file that is no link holds the same, told by its bytes."""
-    return source.stat().st_size == path.stat().st_size and sha256_of(source) == sha256_of(path)
-
-
-def sha256_of(path: Path) -> str:
-    """Of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    sending.remove(store.mirror, drive)
 
 
 def add_library(store: Store, made: Path, digest: str) -> Path:
     """Make a folder in staging the library of this hash; it stays as it is where the map has it."""
-    folder = store.library(digest)
-    if not _HASH.fullmatch(digest):
+    if not HASH.fullmatch(digest):
         raise LibraryError(f"{made} has no sound hash ({digest[:20]!r}). Build the library anew.")
+    folder = store.library(digest)
     try:
         folder.parent.mkdir(exist_ok=True)
         if not folder.exists():
             made.rename(folder)
     except OSError as error:
-        raise ResultError(f"Cannot put the library into {store.root}: {error.strerror}.") from None
+        raise ResultError(f"Cannot put the library into {store}: {error.strerror}.") from None
+    if store.mirror is not None:
+        from vplog.maps.sending import send_library
+
+        send_library(store.mirror, digest)
     return folder
+
+
+def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:
+    """Why a drive's places may not be mixed with those of the map, in one line."""
+    return (
+        f"{drive} in {store} was described with library {found[:12]}, and the map's is {str(wanted)[:12]}: their "
+        f"places do not compare. Take it out (vplog map remove {store} {drive}), or add its log with `vplog batch`."
+    )
+
+
+def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
+    """The library of a map, and its drives, all described with it. Raises LibraryError where one is not, and
+    ResultError where there is none."""
+    head, drives = store.head(), store.drives()
+    if head.library is None or not drives:
+        raise ResultError(f"{store} has no finished drive yet. Add some: vplog batch LOG... -o {store}")
+    for drive, about in drives.items():
+        if about["library"] != head.library:
+            raise LibraryError(other_library(store, drive, about["library"], head.library))
+    return head.library, drives
+
+
+def row_count(path: Path) -> int:
+    """Rows of a table, by its footer. Raises ResultError."""
+    try:
+        return pq.read_metadata(path).num_rows
+    except (OSError, pa.ArrowException) as error:
+        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Remove the drive's folders.") from None
+
+
+def _identity(run: Path) -> tuple[int, int, int] | None:
+    """Of the folder that has the name now; None where there is none."""
+    try:
+        found = (run / "drive.json").stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_mtime_ns

@@ -25,6 +25,7 @@ from pydantic import Field, model_validator
 
 from vplog.errors import LibraryError
 from vplog.places import expected_votes, stored
+from vplog.places.code_lists import BLOCK, CodeLists, build_lists
 from vplog.places.code_search import CodeIndex
 from vplog.places.columns import check_type, check_values
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
@@ -243,9 +244,16 @@ class BobbState:
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
-        return CodeIndex(*self._arrays(descriptors), self._overlaps(), len(self.matcher), self.settings.pairing)
+        return CodeIndex(*self._arrays(descriptors), self.overlaps(), len(self.matcher), self.settings.pairing)
 
-    def _overlaps(self) -> Bytes:
+    def lists(self, *columns: pa.Array) -> CodeLists:
+        """The inverted lists of the places of tables' columns, one after the other: what an index on disk holds.
+        Raises LibraryError where one is of another kind or library."""
+        references, weights, boxes = (np.concatenate(part) for part in zip(*map(self._coded, columns), strict=True))
+        return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
+
+    def overlaps(self) -> Bytes:
+        """(256, 256) cells that the boxes of two numbers share."""
         s = self.settings
         return expected_votes.overlaps(
             s.columns - s.box_columns + 1, s.rows - s.box_rows + 1, s.box_columns, s.box_rows
@@ -255,7 +263,7 @@ class BobbState:
         """The parts of the score of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
         s = self.settings
         references, weights, boxes = self._arrays(places)
-        table = self._overlaps()
+        table = self.overlaps()
 
         def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
             cells = table[boxes[rows, ranks][:, :, None], boxes[others, other_ranks][:, None, :]].astype(np.float64)
@@ -283,6 +291,10 @@ class BobbState:
 
     def from_arrow(self, column: pa.Array) -> list[Place]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""
+        return [Place(r, w, b) for r, w, b in zip(*self._coded(column), strict=True)]
+
+    def _coded(self, column: pa.Array) -> tuple[Uint16s, Bytes, Bytes]:
+        """(N, J) references and weights, (N, J, I) boxes of a table's column, as `from_arrow`."""
         s = self.settings
         check_type(column, self.arrow_type)
         lists = [column.field(part.name) for part in self.arrow_type]
@@ -293,12 +305,11 @@ class BobbState:
         positions = (s.columns - s.box_columns + 1) * (s.rows - s.box_rows + 1)
         if np.any((boxes >= positions) & (boxes != NOWHERE)):
             raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")
-        parts = (
+        return (
             references.reshape(-1, s.references),
             weights.reshape(-1, s.references),
             boxes.reshape(-1, s.references, s.boxes),
         )
-        return [Place(r, w, b) for r, w, b in zip(*parts, strict=True)]
 
     def save(self, folder: Path) -> None:
         stored.save_references(self.matcher.references, self.settings, folder)

@@ -11,7 +11,7 @@ the best places found so far: nothing that could be among them is left out.
 from __future__ import annotations
 
 import heapq
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 import numba
 import numpy as np
@@ -20,24 +20,24 @@ from numba import types
 from numba.extending import intrinsic
 
 from vplog.data import Ranking
+from vplog.places.code_lists import BLOCK, MOST_ROWS, STEPS, CodeLists, build_lists
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Bytes, Float32s
+    from vplog.data import Bytes, Float32s, Ints, Uint16s
 
-    Uint16s = NDArray[np.uint16]
+    Bools = NDArray[np.bool_]
+    Pairing = Literal["best", "same", "both"]
 
 _PAIRINGS = {"best": (1, 0), "same": (0, 1), "both": (1, 1)}
 """Weights of a box's best overlap and of its overlap with the same window's box."""
-_BLOCK = 8192
-"""Rows of a block, at most 2^16: their bounds take 32 kB, a core's first cache; 4096 to 32768 cost the same to 20 %."""
-_STEPS = 255
-"""A bound is a product of two unit vectors, each value a whole number of these steps, rounded up."""
 _ROUNDING = 1e-6
 """Scores round to float32, by a share of 6e-8; what is below the worst of the best by more than this is below it."""
 _LANES = 8
 """Windows whose overlaps stand side by side in a word of 64 bits."""
+_ALL = np.zeros(1, np.int64), np.ones(1, np.bool_)
+"""One run of rows, all of which count."""
 
 
 class CodedPlace(Protocol):
@@ -53,111 +53,84 @@ class CodeIndex:
     """Places of a map; rows are in the order given."""
 
     def __init__(
-        self,
-        references: Uint16s,
-        weights: Bytes,
-        boxes: Bytes,
-        overlap: Bytes,
-        library_size: int,
-        pairing: Literal["best", "same", "both"],
+        self, references: Uint16s, weights: Bytes, boxes: Bytes, overlap: Bytes, library_size: int, pairing: Pairing
     ) -> None:
         """`references` and `weights` (N, J), a reference beyond the library is none; `boxes` (N, J, I) numbers of
         boxes; `overlap` (256, 256) cells that two boxes share."""
-        self._count, _, windows = boxes.shape
-        self._overlap, self._pairing = overlap, _PAIRINGS[pairing]
-        self._windows = (0,) * windows
-        self._whole = int(overlap.max(initial=1)) * sum(self._pairing) * windows
-        start = _count_entries(references, library_size, _BLOCK)
-        entries = int(start[-1, -1])
-        offset, weight = np.empty(entries, np.uint16), np.empty(entries, np.uint8)
-        share, coded = np.empty(entries, np.uint8), np.empty((entries, windows), np.uint8)
-        square = np.empty(self._count, np.uint32)
-        _fill(references, weights, boxes, _BLOCK, _STEPS, start, offset, weight, share, coded, square)
-        self._longest = int(np.diff(start).max(initial=0))
-        self._lists = start, offset, weight, share, coded, square
+        self._set(build_lists(references, weights, boxes, library_size, BLOCK), overlap, pairing)
+
+    @classmethod
+    def of(cls, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> Self:
+        """Over lists that are there already, as in a file."""
+        index = cls.__new__(cls)
+        index._set(lists, overlap, pairing)
+        return index
+
+    def _set(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
+        self._lists, self._overlap, self._pairing = lists, overlap, _PAIRINGS[pairing]
+        self._windows = (0,) * lists.boxes.shape[1]
+        self._whole = int(overlap.max(initial=1)) * sum(self._pairing) * len(self._windows)
+        self._longest = lists.longest
+        for part in lists.parts:
+            part.flags.writeable = False  # a kernel is compiled once, for lists in memory and for those of a file
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._lists)
 
     @property
     def nbytes(self) -> int:
-        """Memory that the map takes, in bytes: 13 a reference of a place with nine boxes, and 4 a place.
+        """Memory that the map takes, in bytes."""
+        return self._lists.nbytes
 
-        Beside it, 8 a reference of the library and block of rows: 1 a place where L = 1000."""
-        return sum(part.nbytes for part in self._lists)
+    @property
+    def blocks(self) -> int:
+        """Blocks of rows, which a search may be split by."""
+        return self._lists.start.shape[1] - 1
 
     def scores(self, descriptor: CodedPlace, stop: int | None = None) -> Float32s:
         """(stop,) 0..1: mean overlap of the boxes, weighted by the references' weights as unit vectors; 1 is equal."""
         result = np.zeros(self._end(stop), np.float32)
-        _score_all(*self._query(descriptor), self._windows, self._pairing, _BLOCK, *self._lists, result)
+        query, lists = self._query(descriptor), self._lists
+        _score_all(*query, self._windows, self._pairing, lists.block, *lists.parts, result)
         return result
 
     def query(self, descriptor: CodedPlace, k: int, stop: int | None = None) -> Ranking:
         """The k best places below row `stop` that overlap at all; ties go to the earlier row."""
+        return self.best(descriptor, k, stop=self._end(stop))
+
+    def best(
+        self,
+        descriptor: CodedPlace,
+        k: int,
+        blocks: tuple[int, int] | None = None,
+        least: float = 0.0,
+        runs: tuple[Ints, Bools] = _ALL,
+        stop: int | None = None,
+    ) -> Ranking:
+        """The k best places among the rows of blocks first..last that reach a score of `least`, which those found
+        elsewhere may set. `runs` are the first rows (D,) of drives, rising from 0, and whether each counts."""
+        lists = self._lists
+        first, last = (0, self.blocks) if blocks is None else blocks
+        last = min(last, -(-self._end(stop) // lists.block))
         rows, score = _find_best(
-            *self._query(descriptor),
-            self._windows,
-            self._pairing,
-            _BLOCK,
-            *self._lists,
-            self._longest,
-            self._end(stop),
-            k,
-        )
+            *self._query(descriptor), self._windows, self._pairing, lists.block, *lists.parts, self._longest,
+            first, last, self._end(stop), k, np.float32(least), *runs,
+        )  # fmt: skip
         order = np.lexsort((rows, -score))
         return Ranking(rows[order], score[order])
 
     def _end(self, stop: int | None) -> int:
-        return self._count if stop is None else max(min(stop, self._count), 0)
+        return len(self) if stop is None else max(min(stop, len(self)), 0)
 
     def _query(self, descriptor: CodedPlace) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
         """The query's references in the library (Q,), their weights (Q,), the (Q, 256, words x 8) cells that a box of
         any number shares with the box of each of the query's windows, their words, and what sums are divided by beside
         the length of the place's own weights."""
         weights = descriptor.weights.astype(np.int64)
-        known = np.flatnonzero(descriptor.references < len(self._lists[0]))
+        known = np.flatnonzero(descriptor.references < len(self._lists.start))
         cells = _cells(self._overlap, descriptor.boxes[known], -(-len(self._windows) // _LANES) * _LANES)
         scale = np.sqrt(max(int((weights**2).sum()), 1)) * self._whole
         return descriptor.references[known].astype(np.int64), weights[known], cells, cells.view(np.uint64), scale
-
-
-@numba.njit(cache=True, nogil=True)
-def _count_entries(references, library_size, block):
-    """(L, B + 1) int64: the entries of reference r in block b of rows are start[r, b]..start[r, b + 1]."""
-    N, J = references.shape
-    start = np.zeros((library_size, (N + block - 1) // block + 1), np.int64)
-    for row in range(N):
-        for j in range(J):
-            if references[row, j] < library_size:
-                start[references[row, j], row // block + 1] += 1
-    total = 0
-    for r in range(start.shape[0]):
-        for b in range(start.shape[1]):
-            total += start[r, b]
-            start[r, b] = total
-    return start
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill(references, weights, boxes, block, steps, start, offset, weight, share, coded, square):
-    """Write the lists: by reference, then by row."""
-    N, J, windows = boxes.shape
-    at = start[:, 0].copy()
-    for row in range(N):
-        total = np.int64(0)
-        for j in range(J):
-            total += np.int64(weights[row, j]) * np.int64(weights[row, j])
-        square[row] = max(total, 1)
-        length = np.sqrt(np.float64(square[row]))
-        for j in range(J):
-            reference = references[row, j]
-            if reference < start.shape[0]:
-                e = at[reference]
-                at[reference] += 1
-                offset[e], weight[e] = row % block, weights[row, j]
-                share[e] = np.ceil(weights[row, j] * steps / length)
-                for i in range(windows):
-                    coded[e, i] = boxes[row, j, i]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -228,7 +201,7 @@ def _score_all(
 ):  # fmt: skip
     """Write the scores of the first rows into `result`."""
     stop = result.shape[0]
-    total = np.zeros(block, np.int64)
+    total = np.zeros(MOST_ROWS, np.int64)  # an offset of a damaged file may be beyond the block
     for b in range((stop + block - 1) // block):
         rows = min(stop - b * block, block)
         total[:rows] = 0
@@ -241,7 +214,8 @@ def _score_all(
         for row in range(rows):
             if total[row] > 0:
                 place = b * block + row
-                result[place] = total[row] / (np.sqrt(np.float64(square[place])) * scale)
+                length = np.sqrt(np.float64(max(square[place], np.uint32(1))))
+                result[place] = total[row] / (length * scale)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -252,22 +226,23 @@ def _reach(weights, cells, pairing, scale):
         most = 0
         for i in range(cells.shape[2]):
             most += np.int64(cells[j, :, i].max())
-        result[j] = np.ceil(weights[j] * most * (pairing[0] + pairing[1]) * _STEPS / scale)
+        result[j] = np.ceil(weights[j] * most * (pairing[0] + pairing[1]) * STEPS / scale)
     return result
 
 
 @numba.njit(cache=True, nogil=True)
 def _find_best(
     known, weights, cells, words, scale, windows, pairing, block,
-    start, offset, weight, share, coded, square, longest, stop, k,
+    start, offset, weight, share, coded, square, longest, begin, end, stop, k, floor, runs, counts,
 ):  # fmt: skip
-    """(rows, scores) of the k best rows below `stop`, in no order."""
+    """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach `floor`, in no order."""
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
     reach = _reach(weights, cells, pairing, scale)
-    bound, total = np.zeros(block, np.int32), np.zeros(block, np.int64)
-    touched, keep = np.empty(block, np.int64), np.empty(longest + 1, np.int64)
-    worst, least = np.float32(0.0), np.int64(0)
-    for b in range((stop + block - 1) // block if k > 0 else 0):
+    bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores
+    touched, keep = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
+    worst = floor
+    least = _reached(worst)
+    for b in range(begin, end if k > 0 else begin):
         rows = min(stop - b * block, block)
         bound[:rows] = 0
         for j in range(known.shape[0]):
@@ -292,17 +267,29 @@ def _find_best(
                 total[row[e]] += more
         for row in touched[:count]:
             place = b * block + row
-            score = np.float32(total[row] / (np.sqrt(np.float64(square[place])) * scale))
+            length = np.sqrt(np.float64(max(square[min(place, stop - 1)], np.uint32(1))))
+            score = np.float32(total[row] / (length * scale))
             total[row] = 0
-            if len(found) < k:
-                heapq.heappush(found, (score, -place))
-            elif score >= worst and (score, -place) > found[0]:
-                heapq.heapreplace(found, (score, -place))
-            else:
-                continue
+            if row < rows and score >= worst and counts[np.searchsorted(runs, place, side="right") - 1]:
+                _offer(found, k, score, place)
             worst = found[0][0] if len(found) == k else worst
-        least = np.int64(np.float64(worst) * (1.0 - _ROUNDING) * _STEPS * _STEPS)
+        least = _reached(worst)
     score, place = np.empty(len(found), np.float32), np.empty(len(found), np.int32)
     for n in range(len(found)):
         score[n], place[n] = found[n][0], -found[n][1]
     return place, score
+
+
+@numba.njit(cache=True, nogil=True)
+def _offer(found, k, score, place):
+    """Take a place into a heap of the k best, unless it is worse than all of them."""
+    if len(found) < k:
+        heapq.heappush(found, (score, -place))
+    elif (score, -place) > found[0]:
+        heapq.heapreplace(found, (score, -place))
+
+
+@numba.njit(cache=True, nogil=True)
+def _reached(worst):
+    """Least bound of a place that may score `worst`."""
+    return np.int64(np.float64(worst) * (1.0 - _ROUNDING) * STEPS * STEPS)

@@ -62,7 +62,7 @@ class Library:
     """(F, 2) px of its reference."""
     settings: WordSettings
     words: Words
-    """Of the library's own features: each has its own number at least."""
+    """Of the library's own features, where they were asked for: each has its own number at least."""
     index: Any
 
     def __len__(self) -> int:
@@ -78,8 +78,11 @@ class Library:
         return _translate(self.index, self.descriptors, descriptors, self.settings, own=False)
 
 
-def build_library(references: Iterable[Reference], settings: WordSettings, threads: int) -> Library:
-    """Index the references' strongest features. Raises LibraryError where they have none."""
+def build_library(references: Iterable[Reference], settings: WordSettings, threads: int, own: bool = True) -> Library:
+    """Index the references' strongest features; without `own`, who only translates, these get no words themselves.
+
+    Raises LibraryError where there is no feature.
+    """
     kept = [strongest(reference, settings.features) for reference in references]
     if not kept:
         raise LibraryError("A library needs at least one reference image; none was given.")
@@ -90,7 +93,8 @@ def build_library(references: Iterable[Reference], settings: WordSettings, threa
     points = np.concatenate([reference.features.points for reference in kept])
     breadth = max(settings.hnsw_ef_search, settings.neighbours)
     index = hnsw(descriptors.astype(np.float32), settings.hnsw_links, settings.hnsw_ef_construction, breadth)
-    words = _own_words(index, descriptors, settings, threads)
+    nothing = Words(np.zeros(1, np.int32), np.zeros(0, np.int32))
+    words = _own_words(index, descriptors, settings, threads) if own else nothing
     return Library(kept, start, descriptors, points, settings, words, index)
 
 

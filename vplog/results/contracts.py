@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.results import messages, places_map, tables
+from vplog.results import kept_features, messages, placed, places_map, tables
 from vplog.results.atomic import replacing
 from vplog.results.layouts import layouts
 from vplog.results.mcap import TOPICS
@@ -54,6 +54,8 @@ def table_schemas() -> dict[str, pa.Schema]:
         "joins": tables.JOINS,
         "edges": tables.EDGES,
         "trajectory": tables.TRAJECTORY,
+        "placed": placed.PLACED,
+        "features": kept_features.FEATURES,
         "map": pa.schema([*places_map.PLACE, tables.descriptors_schema(pa.binary()).field("descriptor")]),
     }
 
@@ -75,6 +77,13 @@ def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
             }
         )
     contract = {"table": name, "file": f"{name}.parquet", "metadata": _HEADER, "columns": columns}
+    if name == "features":
+        contract |= {"file": "MAP/joins/drive=ID/features.parquet", "metadata": kept_features.HEADER}
+    if name == "joins":
+        files = "joins.parquet, MAP/joins/drive=ID/match=ID.parquet, MAP/joint/component=KEY/joins.parquet"
+        contract |= {"file": files}
+    if name == "placed":
+        contract |= {"file": "named by `vplog map query -o`"}
     if name == "map":
         contract |= {"file": "named by `vplog map export -o`", "metadata": {**_HEADER, **_MAP_HEADER}}
     return {**contract, "descriptor": layouts()} if columns[-1]["name"] == "descriptor" else contract

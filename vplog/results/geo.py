@@ -59,26 +59,25 @@ def write_geoparquet(path: Path, trajectory: Trajectory, earth: Earth, header: d
     `header` is what the run's own tables say of it.
     """
     where = on_earth(earth, trajectory.world_from_body)
-    points = pa.array([_POINT_Z + row.tobytes() for row in where.astype("<f8")], pa.binary())
     low, high = (where.min(0), where.max(0)) if len(where) else (np.zeros(3), np.zeros(3))
-    geo = {
-        "version": "1.1.0",
-        "primary_column": "geometry",
-        "columns": {
-            "geometry": {
-                "encoding": "WKB",
-                "geometry_types": ["Point Z"],
-                "bbox": [*low.tolist(), *high.tolist()],
-            }
-        },
-    }
     schema = pa.schema(
         [pa.field("stamp_ns", pa.int64(), False), pa.field("geometry", pa.binary(), False)],
-        metadata={**header, "vplog.table": "geo", "geo": json.dumps(geo)},
+        metadata={**header, "vplog.table": "geo", **geo_header(low, high)},
     )
-    table = pa.Table.from_arrays([pa.array(trajectory.stamp_ns, pa.int64()), points], schema=schema)
+    table = pa.Table.from_arrays([pa.array(trajectory.stamp_ns, pa.int64()), points(where)], schema=schema)
     with replacing(path) as stream:
         pq.write_table(table, stream, compression="zstd")
+
+
+def points(where: Floats) -> pa.Array:
+    """(T, 3) longitudes, latitudes and altitudes as WKB."""
+    return pa.array([_POINT_Z + row.tobytes() for row in where.astype("<f8")], pa.binary())
+
+
+def geo_header(low: Floats, high: Floats) -> dict[str, str]:
+    """What GeoParquet asks of the header of a table with such points; `low` and `high` (3,) are those of the box."""
+    column = {"encoding": "WKB", "geometry_types": ["Point Z"], "bbox": [*low.tolist(), *high.tolist()]}
+    return {"geo": json.dumps({"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}})}
 
 
 def _line(where: list[list[float]], properties: dict[str, Any]) -> dict[str, Any]:

@@ -73,6 +73,13 @@ def read_pictures(path: Path) -> Found:
     return Found(pictures, references, _gps(fixes) if fixes else None)
 
 
+def read_fixes(path: Path) -> Gps | None:
+    """The satellite fixes alone, None without any. Raises ResultError as above."""
+    with _reading(path) as reader:
+        fixes = [LocationFix.FromString(message.data) for _, _, message in reader.iter_messages(topics=[FIXES])]
+    return _gps(fixes) if fixes else None
+
+
 def read_images(path: Path) -> Iterator[Seen]:
     """The camera's pictures in order of time, one in memory at a time. Raises ResultError as above."""
     with _reading(path) as reader:

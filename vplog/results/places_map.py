@@ -8,6 +8,8 @@ header says how the bytes are to be taken.
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +18,14 @@ import pyarrow.parquet as pq
 
 from vplog import geometry
 from vplog.errors import ResultError
-from vplog.results import tables
+from vplog.results import geo, tables
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
+
+    from vplog.data import Floats, Int32s, Ints
 
 ROWS_PER_GROUP = 16_384
 """Places of a row group: 2 MB of the default's descriptors."""
@@ -38,48 +42,107 @@ _COUNTED = ("keyframe", "stamp_ns")
 """Columns that grow by little from row to row."""
 
 
+@dataclass(frozen=True, eq=False)
+class DrivePlaces:
+    """The places of one drive."""
+
+    drive: str
+    source: Path
+    """The run they are of."""
+    keyframe: Int32s
+    """(P,) rows of the drive's keyframes."""
+    stamp_ns: Ints
+    world_from_body: Floats
+    """(P, 4, 4)."""
+    descriptors: pa.Array
+    header: dict[str, str]
+    """Of the table of descriptors; it names the library."""
+    where: Floats | None = None
+    """(P, 3) longitude and latitude in degrees and altitude in m; None where nothing says so."""
+
+    def of(self, rows: Ints) -> DrivePlaces:
+        """Some of them."""
+        return replace(
+            self, keyframe=self.keyframe[rows], stamp_ns=self.stamp_ns[rows],
+            world_from_body=self.world_from_body[rows], descriptors=self.descriptors.take(pa.array(rows)),
+            where=None if self.where is None else self.where[rows],
+        )  # fmt: skip
+
+
+def read_places(folder: Path, drive: str | None = None) -> DrivePlaces:
+    """All places of a run, under the name of its drive or the one given. Raises ResultError."""
+    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    header = tables.read_metadata(folder / "descriptors.parquet")
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    if len(column) != len(keyframes.stamp_ns):
+        raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes.")
+    rows = np.arange(len(column), dtype=np.int32)
+    return DrivePlaces(drive or keyframes.drive, folder, rows, keyframes.stamp_ns, world_from_body, column, header)
+
+
 def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:
     """One row for every keyframe of the runs, drives in the order given; what was written.
 
     Raises ResultError where the descriptors were not made with one library, and so do not compare, or where two
     drives bear one name.
     """
-    first, library = tables.read_descriptors(folders[0] / "descriptors.parquet")
-    header = tables.read_metadata(folders[0] / "descriptors.parquet")
-    parts = list(_parts(first.type, ""))
-    columns = [pa.field(name, _stored(kind), False) for name, kind in parts]
-    names = _names(folders)
+    return write_places(path, names_of(folders), (read_places(folder) for folder in folders))
+
+
+def write_places(
+    path: Path, names: Sequence[str], parts: Iterable[DrivePlaces], bounds: tuple[Floats, Floats] | None = None
+) -> dict[str, Any]:
+    """One row for every place, one drive in memory at a time; what was written. `names` are those of all drives.
+
+    With the bounds of their points, (3,) each as `where` has them, the file is GeoParquet 1.1 too, whose header comes
+    first. Raises ResultError as above, where there is no place at all, and where one is beyond the bounds.
+    """
+    rest = iter(parts)
+    first = next(rest, None)
+    if first is None:
+        raise ResultError("There is no place to write.")
+    kind, library = first.descriptors.type, first.header.get("vplog.library", "")
+    described = list(_parts(kind, ""))
+    columns = [pa.field(name, _stored(part), False) for name, part in described]
     about = {
-        **{key: header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
+        **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
         "vplog.table": "map",
-        "vplog.descriptor": json.dumps([_described(name, kind) for name, kind in parts]),
+        "vplog.descriptor": json.dumps([_described(name, part) for name, part in described]),
+        **({} if bounds is None else geo.geo_header(*bounds)),
     }
-    schema = pa.schema([*PLACE, *columns], metadata=about)
+    points = [] if bounds is None else [pa.field("geometry", pa.binary(), False)]
+    schema = pa.schema([*PLACE, *columns, *points], metadata=about)
     places = 0
     with replacing(path) as stream, pq.ParquetWriter(
         stream, schema, compression="zstd", compression_level=ZSTD_LEVEL,
         use_dictionary=["drive"],  # pyright: ignore[reportArgumentType] (the stubs know bool alone)
         column_encoding=dict.fromkeys(_COUNTED, "DELTA_BINARY_PACKED"),
     ) as writer:  # fmt: skip
-        for number, folder in enumerate(folders):
-            column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
-            if made_by != library or column.type != first.type:
+        for part in chain([first], rest):
+            if part.header.get("vplog.library", "") != library or part.descriptors.type != kind:
                 raise ResultError(
-                    f"The places of {folder} were not described with the library of {folders[0]}, so they do not "
-                    "compare. Run both with one library: vplog library LOG... -o LIB, then vplog run LOG --library LIB."
+                    f"The places of {part.source} were not described with the library of {first.source}, so they do "
+                    "not compare. Run both with one library: vplog library LOG... -o LIB, then vplog run LOG "
+                    "--library LIB."
                 )
-            keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-            if len(column) != len(keyframes.stamp_ns):
-                raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes.")
-            drive = pa.DictionaryArray.from_arrays(pa.array([number] * len(column), pa.int32()), pa.array(names))
-            rows = np.arange(len(column), dtype=np.int32)
-            quaternions = geometry.quaternion(world_from_body[:, :3, :3])
-            where = np.ascontiguousarray(np.concatenate([world_from_body[:, :3, 3], quaternions], axis=1).T)
-            arrays = [drive, pa.array(rows), pa.array(keyframes.stamp_ns), *map(pa.array, where)]
-            arrays += [_packed(part) for part in _values(column)]
+            arrays = _arrays(part, names)
+            if bounds is not None:
+                if part.where is None or np.any(part.where < bounds[0]) or np.any(part.where > bounds[1]):
+                    raise ResultError(f"{part.source} was changed while it was read. Run again.")
+                arrays.append(geo.points(part.where))
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=ROWS_PER_GROUP)
-            places += len(column)
-    return {"map": str(path), "drives": names, "places": places, "library": library}
+            places += len(part.keyframe)
+    return {"map": str(path), "drives": list(names), "places": places, "library": library}
+
+
+def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
+    """The columns of a drive's places."""
+    number = names.index(part.drive)
+    drive = pa.DictionaryArray.from_arrays(pa.array([number] * len(part.keyframe), pa.int32()), pa.array(names))
+    quaternions = geometry.quaternion(part.world_from_body[:, :3, :3])
+    where = np.ascontiguousarray(np.concatenate([part.world_from_body[:, :3, 3], quaternions], axis=1).T)
+    packed = [_packed(one) for one in _values(part.descriptors)]
+    return [drive, pa.array(part.keyframe), pa.array(part.stamp_ns), *map(pa.array, where), *packed]
 
 
 def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
@@ -100,7 +163,8 @@ def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
     return table.select(PLACE.names), _joined(kind, columns)
 
 
-def _names(folders: Sequence[Path]) -> list[str]:
+def names_of(folders: Sequence[Path]) -> list[str]:
+    """The drive of each run. Raises ResultError where two bear one name."""
     names = []
     for folder in folders:
         keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")

@@ -175,12 +175,29 @@ def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadat
 
 def write_joins(path: Path, ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], metadata: TableMetadata) -> None:
     """joins.parquet: the ledgers of pairs of drives, the later one (its keyframes are the queries) and the earlier."""
+    _write_table(path, "joins", _joins(ledgers), metadata)
+
+
+def joins_as_bytes(
+    ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], metadata: TableMetadata, made_from: str
+) -> bytes:
+    """The bytes of such a table, whose header says what it was made from: a hash, which `read_metadata` gives back as
+    `vplog.made_from`."""
+    table = _joins(ledgers)
+    schema = _with_metadata(table.schema, "joins", metadata)
+    sink = pa.BufferOutputStream()
+    table = table.cast(schema.with_metadata({**(schema.metadata or {}), "vplog.made_from": made_from}))
+    pq.write_table(table, sink, compression="zstd", row_group_size=ROWS_PER_GROUP)
+    return sink.getvalue().to_pybytes()
+
+
+def _joins(ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]]) -> pa.Table:
     parts = []
     for later, earlier, closures in ledgers:
         drives = {"query_drive": [later.drive] * len(closures), "match_drive": [earlier.drive] * len(closures)}
         parts.append(_arrays(JOINS, {**drives, **_ledger_columns(closures, later, earlier)}))
     table = pa.concat_tables([pa.Table.from_arrays(part, schema=JOINS) for part in parts] or [JOINS.empty_table()])
-    _write_table(path, "joins", table.combine_chunks(), metadata)
+    return table.combine_chunks()
 
 
 def _ledger_columns(closures: Closures, query: Keyframes, match: Keyframes) -> dict[str, Any]:
@@ -219,7 +236,20 @@ _SCALES = ("odometry", "depth", "stereo", "none")
 
 def read_closures(path: Path) -> Closures:
     """The ledger."""
-    table = _read(path, "closures", CLOSURES)
+    return _ledger_from(_read(path, "closures", CLOSURES), path)
+
+
+def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
+    """The ledger of each pair of drives (query's, match's) in a table of joins, in order."""
+    table = _read(path, "joins", JOINS)
+    drives = list(zip(table["query_drive"].to_pylist(), table["match_drive"].to_pylist(), strict=True))
+    rows: dict[tuple[str, str], list[int]] = {}
+    for row, pair in enumerate(drives):
+        rows.setdefault(pair, []).append(row)
+    return {pair: _ledger_from(table.take(pa.array(own)), path) for pair, own in rows.items()}
+
+
+def _ledger_from(table: pa.Table, path: Path) -> Closures:
     try:
         verdict = [Verdict(text) for text in table["verdict"].to_pylist()]
     except ValueError as error:

@@ -1,0 +1,29 @@
+"""A server that speaks S3, on loopback."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@contextmanager
+def serving() -> Iterator[None]:
+    """With a bucket named `bucket`, found by all that ask for S3."""
+    moto = pytest.importorskip("moto.server", reason="moto speaks S3 on loopback: pip install 'moto[server]'")
+    boto3 = pytest.importorskip("boto3", reason="boto3 asks S3 for conditional writes: pip install boto3")
+    started = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    started.start()
+    host, port = started.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        patch.setenv("AWS_ACCESS_KEY_ID", "test")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+        patch.setenv("AWS_REGION", "us-east-1")
+        boto3.client("s3", region_name="us-east-1").create_bucket(Bucket="bucket")
+        yield
+    started.stop()

@@ -1,0 +1,86 @@
+"""Run folders of a few kB that a map takes for finished drives."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+
+from tests.results.example import COUNT, make_run
+from vplog.maps import keys
+from vplog.maps import store as map_store
+from vplog.results import run_record, tables, tum
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Floats
+    from vplog.maps.store import Store
+
+LIBRARY, OTHER_LIBRARY = "a" * 64, "b" * 64
+PLACES = COUNT
+"""Of every drive."""
+KIND = pa.struct([("references", pa.list_(pa.uint16(), 3)), ("boxes", pa.list_(pa.uint8(), 6))])
+
+
+def write_run(
+    folder: Path, drive: str, seed: int = 0, library: str = LIBRARY, world_from_enu: Floats | None = None
+) -> Path:
+    """Every file of a run says `seed` in its own way. On earth where it says how it lies there."""
+    run, rng, about = make_run(seed), np.random.default_rng(seed), tables.TableMetadata({"seed": seed}, library)
+    folder.mkdir(parents=True)
+    keyframes = replace(run.keyframes, drive=drive)
+    column = pa.array(
+        [{"references": rng.integers(100, size=3), "boxes": rng.integers(256, size=6)} for _ in range(COUNT)], KIND
+    )
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, run.solution.world_from_body, about)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, [column], KIND, about)
+    tables.write_closures(folder / "closures.parquet", run.closures, keyframes, about)
+    residual = np.zeros(len(run.graph.a))
+    tables.write_edges(folder / "edges.parquet", run.graph, run.solution, residual, about)
+    tables.write_trajectory(folder / "trajectory.parquet", run.trajectory, run.odometry, about)
+    tum.write_tum(folder / "trajectory.tum", run.trajectory)
+    origin = {"latitude_deg": 48.0, "longitude_deg": 11.0, "altitude_m": 500.0}
+    gps = None if world_from_enu is None else {"origin": origin, "world_from_enu": world_from_enu.tolist()}
+    run_record.write_run_json(folder / "run.json", {"finished": True, "settings": {"seed": seed}, "gps": gps})
+    made_from = {"drive": drive, "inputs": {"log": f"sha256 of {seed}"}, "library": library, "topics": {}}
+    log = f"/logs/{seed}/{drive.partition('-')[0]}.mcap"
+    run_record.write_run_json(folder / "drive.json", {**made_from, "key": keys.key_of(made_from), "log": log})
+    return folder
+
+
+def make_map(root: Path, drives: dict[str, int], library: str = LIBRARY) -> Path:
+    """A map of such drives, by ID and seed."""
+    with map_store.writing(root) as store:
+        put_library(store, library)
+        for drive, seed in drives.items():
+            put(store, drive, seed, library)
+    return root
+
+
+def put_library(store: Store, library: str = LIBRARY) -> None:
+    made = store.staging / "library"
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir()
+    (made / "features.parquet").write_bytes(b"features")
+    (made / "library.json").write_text(json.dumps({"hash": library, "settings": {}, "references": 3, "features": 9}))
+    map_store.add_library(store, made, library)
+    store.write_head(map_store.Head(library, {"seed": 0}))
+
+
+def put(store: Store, drive: str, seed: int, library: str = LIBRARY, **more: Any) -> None:
+    folder = store.staging / f"{seed}"
+    shutil.rmtree(folder, ignore_errors=True)
+    map_store.publish(store, drive, write_run(folder, drive, seed, library, **more))
+
+
+def seeds(run: Path) -> set[Any]:
+    """What the files of a run folder say."""
+    said: set[Any] = {run_record.read_run_json(run / "run.json")["settings"]["seed"]}
+    for name in map_store.TABLES:
+        said.add(json.loads(tables.read_metadata(run / f"{name}.parquet")["vplog.settings"])["seed"])
+    return said

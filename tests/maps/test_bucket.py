@@ -1,0 +1,321 @@
+"""A map on an object store, against a server that speaks S3 on loopback."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from itertools import count
+from typing import TYPE_CHECKING, Any
+
+import pyarrow.dataset as ds
+import pytest
+
+from vplog.errors import ResultError, SettingsError
+from vplog.maps import bucket_lock, objects, sending
+from vplog.maps import store as map_store
+from vplog.maps.info import describe_map
+from vplog.remote import located
+
+from .bucket import serving
+from .runs import LIBRARY, PLACES, make_map, put, put_library, seeds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from conftest import Said
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[None]:
+    with serving():
+        yield
+
+
+@pytest.fixture
+def root(server: None, request: pytest.FixtureRequest) -> Any:
+    """Of no map yet; each test has its own."""
+    return located(f"s3://bucket/{request.node.name.split('[')[0]}")
+
+
+def names(root: Any) -> set[str]:
+    """Of the objects, without the two parts that are never the same."""
+    return {name for name in objects.files_below(root) if name not in (".lock", "rest.json")}
+
+
+def same_state(root: Any) -> dict[str, set[Any]]:
+    """What the drives of a map say; every other object is one that they name."""
+    with map_store.reading(root) as store:
+        return {drive: seeds(store.run(drive)) for drive in store.drives()}
+
+
+def test_a_map_is_there_as_it_is_in_a_folder(root: Any, tmp_path: Path) -> None:
+    drives = {"one": 1, "two/3 %": 2}
+    here, there = make_map(tmp_path / "map", drives), make_map(root, drives)
+    with map_store.reading(here) as a, map_store.reading(there) as b:
+        assert a.head() == b.head()
+        assert a.drives() == b.drives()
+        assert b.library(LIBRARY).joinpath("library.json").read_bytes() == (
+            a.library(LIBRARY).joinpath("library.json").read_bytes()
+        )
+        for drive in drives:
+            assert a.sizes(drive) == {**b.sizes(drive), "drive.json": a.sizes(drive)["drive.json"]}
+            assert a.rows("descriptors", drive) == b.rows("descriptors", drive) == PLACES
+            for name in b.sizes(drive):
+                assert (b.whole(drive) / name).read_bytes() == (a.run(drive) / name).read_bytes()
+    for name in map_store.TABLES:
+        system, place = root.place
+        found = ds.dataset(f"{place}/{name}", partitioning="hive", filesystem=system, format="parquet").to_table()
+        assert found.equals(ds.dataset(here / name, partitioning="hive", format="parquet").to_table())
+    told, known = describe_map(there), describe_map(here)
+    assert {**told, "map": "", "bytes": 0, "drives": []} == {**known, "map": "", "bytes": 0, "drives": []}
+
+
+def test_all_else_of_a_map_goes_with_it(root: Any) -> None:
+    make_map(root, {"one": 1, "two": 2})
+
+    def write(store: map_store.Store, text: str) -> None:
+        for name in ("joins/drive=one/joins.parquet", "joins/drive=two/joins.parquet", "joint.json"):
+            (store.root / name).parent.mkdir(parents=True, exist_ok=True)
+            (store.root / name).write_text(text)
+
+    with map_store.writing(root) as store:
+        write(store, "1")
+        put(store, "two", 2)
+        assert not (store.run("two") / "trajectory.tum").exists(), "what was sent does not fill the disk"
+        assert seeds(store.run("two")) == {2}
+        assert (store.whole("two") / "trajectory.tum").stat().st_size == store.sizes("two")["trajectory.tum"]
+    with map_store.writing(root) as store:
+        assert (store.root / "joins/drive=two/joins.parquet").read_text() == "1"
+        write(store, "2")
+    assert objects.get(root / "joins/drive=one/joins.parquet") == b"2"
+    with map_store.writing(root) as store:
+        map_store.remove(store, "one")
+    with map_store.writing(root) as store:
+        assert not (store.root / "joins/drive=one").exists()
+        assert (store.root / "joins/drive=two/joins.parquet").read_text() == "2"
+    assert not any("one" in name for name in names(root))
+    assert len([name for name in names(root) if name.startswith("rest/")]) == 2
+
+
+def test_a_writer_stopped_anywhere_leaves_the_old_drive_or_the_new(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before one of its requests; then nothing more comes from it, not even that it gives the lock back."""
+    make_map(root, {"one": 1})
+    ticks = count()
+    monkeypatch.setattr(bucket_lock, "_release", lambda _: None)
+    monkeypatch.setattr(bucket_lock, "_started", lambda _: str(next(ticks)))  # every holder's process has ended
+    before = len(names(root))
+    # 8 files come first, then the manifest, 5 tables, and away with what was replaced
+    for step in (9, 10, 15):
+        with map_store.writing(root) as store, pytest.MonkeyPatch.context() as patch:
+            left = [step]
+
+            def stepping(function: Any, left: list[int] = left) -> Any:
+                def asked(*arguments: Any) -> Any:
+                    left[0] -= 1
+                    if left[0] <= 0:
+                        raise OSError("killed")
+                    return function(*arguments)
+
+                return asked
+
+            for name in ("send", "put", "copy", "remove"):
+                patch.setattr(objects, name, stepping(getattr(objects, name)))
+            patch.setattr(sending, "_SENT_AT_ONCE", 1)
+            with pytest.raises(ResultError, match="killed"):
+                put(store, "one", 9)
+        [found] = same_state(root)["one"]
+        assert found == (1 if step <= 9 else 9)
+        if found == 9:
+            with map_store.writing(root):
+                pass  # what was left to do is done
+            generation = json.loads(objects.get(root / "runs/drive=one/drive.json") or b"")["generation"]
+            for table in map_store.TABLES:
+                whole = objects.get(root / f"runs/drive=one/{generation}/{table}.parquet")
+                assert objects.get(root / f"{table}/drive=one/{table}.parquet") == whole
+            named = {name for name in names(root) if not name.startswith("runs/drive=one/")}
+            of_drive = [name for name in names(root) if name.startswith(f"runs/drive=one/{generation}/")]
+            assert len(named) + len(of_drive) + 1 == before
+        if step == 10:
+            with map_store.writing(root) as store:
+                put(store, "one", 1)
+
+
+def test_what_nobody_names_goes_after_a_day(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_map(root, {"one": 1, "two": 2})
+    left = root / "runs" / "drive=one" / ("0" * 16) / "run.json"
+    objects.put(left, b"{}")
+    objects.remove(root / "runs" / "drive=two")
+    with map_store.writing(root):
+        pass
+    assert left.exists()
+    assert any("two" in name for name in names(root))
+    monkeypatch.setattr(sending, "_LEFT_OVER", -sending._LEFT_OVER)
+    with map_store.writing(root):
+        pass
+    assert not any("0" * 16 in name or "two" in name for name in names(root))
+    assert same_state(root) == {"one": {1}}
+
+
+def test_a_reader_never_sees_half_a_drive(root: Any) -> None:
+    make_map(root, {"one": 1})
+    over = threading.Event()
+
+    def replace_often() -> None:
+        with map_store.writing(root) as store:
+            for seed in range(2, 6):
+                put(store, "one", seed)
+        over.set()
+
+    writer, said = threading.Thread(target=replace_often), []
+    writer.start()
+    while not over.is_set():
+        try:
+            said.append(same_state(root)["one"])
+        except ResultError as error:
+            assert "replaced" in str(error), "which is said where a part was handed out before"
+    writer.join()
+    assert all(len(one) == 1 for one in said)
+    assert len({seed for one in said for seed in one}) > 1
+    assert same_state(root)["one"] == {5}
+    assert len([name for name in names(root) if name.startswith("runs/")]) == 9
+
+
+def test_a_reader_that_comes_late_takes_the_new_drive(root: Any) -> None:
+    make_map(root, {"one": 1, "two": 2})
+    with map_store.reading(root) as store:
+        store.file("two", "run.json")
+        with map_store.writing(root) as writer:
+            put(writer, "one", 5)
+            put(writer, "two", 5)
+        assert seeds(store.run("one")) == {5}
+        with pytest.raises(ResultError, match="replaced"):  # of which a part was handed out
+            store.table("keyframes", "two")
+        with map_store.writing(root) as writer:
+            map_store.remove(writer, "one")
+        store.forget("one")
+        with pytest.raises(ResultError, match="removed"):
+            store.run("one")
+
+
+def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One gets in; where it dies on another machine the next one waits for its lease, and the dead may not go on."""
+    make_map(root, {"one": 1})
+    entered, refused, both = list[int](), list[str](), threading.Barrier(4)
+
+    def enter(number: int) -> None:
+        both.wait()
+        try:
+            with map_store.writing(root):
+                entered.append(number)
+                both.wait()
+        except SettingsError as error:
+            refused.append(str(error))
+            both.wait()
+
+    threads = [threading.Thread(target=enter, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(entered), len(refused)) == (1, 3)
+    assert all("Another `vplog batch`" in text for text in refused)
+
+    monkeypatch.setattr(bucket_lock, "_release", lambda _: None)
+    with map_store.writing(root) as gone:  # it ends without giving its lock back
+        pass
+    monkeypatch.setattr(bucket_lock, "_machine", lambda: "another machine")
+    with pytest.raises(SettingsError, match=r"ends by itself within 1\d\d s"), map_store.writing(root):
+        pass
+    monkeypatch.setattr(bucket_lock, "LEASE_S", -1.0)
+    monkeypatch.setattr(bucket_lock, "RENEWALS", -20)
+    with map_store.writing(root) as store:
+        put(store, "two", 2)
+        lock = gone.mirror.lock  # pyright: ignore[reportOptionalMemberAccess]
+        assert lock is not None
+        bucket_lock._write(lock, lock.tag)
+        gone.staging.mkdir(parents=True)
+        with pytest.raises(ResultError, match="taken"):
+            put(gone, "two", 3)
+    assert same_state(root) == {"one": {1}, "two": {2}}
+
+
+def test_a_store_that_decides_nothing(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lock is a name that stays; nothing breaks even where two write the same drive at once."""
+    monkeypatch.setattr(bucket_lock, "_SETTLE_S", 0.0)
+    monkeypatch.setattr(objects, "decides", lambda _: False)
+    make_map(root, {"one": 1})
+    with map_store.writing(root) as store:
+        with pytest.raises(SettingsError, match="Another"), map_store.writing(root):
+            pass
+        lock = objects.get(root / ".lock")
+        objects.put(root / ".lock", b"{}")
+        with map_store.writing(root) as other:
+            put(store, "one", 2)
+            put(other, "one", 3)
+            put(store, "one", 4)
+            put(other, "two", 5)
+        assert lock is not None
+    assert same_state(root) == {"one": {4}, "two": {5}}
+    with map_store.writing(root) as store:
+        put_library(store)
+
+
+KILLED = """
+import os, signal, sys
+from tests.maps.runs import put
+from vplog.maps import objects, store
+from vplog.remote import located
+with store.writing(located(sys.argv[1])) as writer:
+    put(writer, "one", 2)
+    send, sent = objects.send, []
+    def some(*arguments):
+        sent.append(arguments)
+        if len(sent) == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return send(*arguments)
+    objects.send = some
+    put(writer, "two", 2)
+"""
+
+
+def test_a_killed_process_is_followed_at_once(root: Any, tmp_path: Path) -> None:
+    make_map(root, {"one": 1})
+    done = subprocess.run([sys.executable, "-c", KILLED, str(root)], check=False, env=dict(os.environ))
+    assert done.returncode == -9
+    assert same_state(root) == {"one": {2}}
+    with map_store.writing(root) as store:
+        put(store, "two", 3)
+    assert same_state(root) == {"one": {2}, "two": {3}}
+
+
+def test_what_is_no_map_is_one_line(root: Any, verb: Callable[..., Said]) -> None:
+    assert "is not a map" in verb("map", "info", root).error
+    objects.put(root / "thesis.txt", b"no map")
+    with pytest.raises(SettingsError, match=r"thesis\.txt"), map_store.writing(root):
+        pass
+    with pytest.raises(SettingsError, match="for reading"), map_store.writing(located("http://127.0.0.1:1/map")):
+        pass
+    with pytest.raises(SettingsError, match="Cannot write"), map_store.writing(located("s3://no-such-bucket/map")):
+        pass
+    place = root / "map"
+    make_map(place, {"one": 1})
+    manifest = place / "runs" / "drive=one" / "drive.json"
+    sound = json.loads(objects.get(manifest) or b"")
+    files = sound["files"]
+    for change in (
+        {"generation": "../../.."}, {"files": {"../../up": files["run.json"]}}, {"files": {"/up": files["run.json"]}},
+        {"files": {"run.json": {"bytes": "many", "sha256": ""}}}, {"replaces": "../runs"}, {"files": []},
+    ):  # fmt: skip
+        sending.put_json(manifest, {**sound, **change})
+        assert "not a manifest" in verb("map", "info", place).error
+    for about, why in (({"bytes": 3}, "longer than"), ({"sha256": "0" * 64}, "damaged")):
+        changed = {**files, "run.json": {**files["run.json"], **about}}
+        sending.put_json(manifest, {**sound, "files": changed})
+        assert why in verb("map", "info", place).error
+    sending.put_json(manifest, sound)
+    objects.remove(place / "runs" / "drive=one" / sound["generation"])
+    assert "has lost files" in verb("map", "info", place).error

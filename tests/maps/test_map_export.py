@@ -1,0 +1,127 @@
+"""The places of a map in one file: all, of one drive, in a box on earth; and where there is no place to write."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from vplog import geodesy, geometry
+from vplog.data import Gps
+from vplog.maps import store as map_store
+from vplog.results import tables
+from vplog.results.places_map import read_map
+
+from .runs import KIND, PLACES, make_map, put, put_library
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    Verb = Callable[..., Said]
+TURNED = geometry.pose(geometry.so3_exp(np.array([0.0, 0.0, 0.7])), np.array([5.0, -3.0, 2.0]))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Two drives on earth, the second 3 km east of the first, and one that is nowhere."""
+    far = TURNED @ geometry.pose(np.eye(3), np.array([-3000.0, 0.0, 0.0]))
+    with map_store.writing(tmp_path / "map") as store:
+        put_library(store)
+        put(store, "near", 1, world_from_enu=TURNED)
+        put(store, "far", 2, world_from_enu=far)
+        put(store, "nowhere", 3)
+    return tmp_path / "map"
+
+
+def places(path: Path) -> list[tuple[str, int]]:
+    table, column = read_map(path, KIND)
+    assert len(column) == len(table)
+    return list(zip(table["drive"].to_pylist(), table["keyframe"].to_pylist(), strict=True))
+
+
+def points(path: Path) -> Any:
+    return np.array([struct.unpack("<BIddd", one)[2:] for one in pq.read_table(path)["geometry"].to_pylist()])
+
+
+def test_all_or_some_drives(root: Path, verb: Verb, tmp_path: Path) -> None:
+    out = tmp_path / "out.parquet"
+    told = verb("map", "export", root, "-o", out, "--json").json
+    assert told["drives"] == ["far", "near", "nowhere"]
+    assert told["places"] == 3 * PLACES
+    assert places(out) == [(drive, row) for drive in told["drives"] for row in range(PLACES)]
+    runs = [root / "runs" / f"drive={drive}" for drive in told["drives"]]
+    verb("map", "export", *runs, "-o", tmp_path / "runs.parquet")
+    assert (tmp_path / "runs.parquet").read_bytes() == out.read_bytes()
+    told = verb("map", "export", root, "--drive", "nowhere", "--drive", "near", "-o", out, "--json").json
+    assert told["drives"] == ["near", "nowhere"]
+    assert {drive for drive, _ in places(out)} == {"near", "nowhere"}
+    _, column = read_map(out, KIND)
+    assert column.slice(0, PLACES).equals(tables.read_descriptors(runs[1] / "descriptors.parquet")[0].cast(KIND))
+
+
+def test_geoparquet_says_where_every_place_is(root: Path, verb: Verb, tmp_path: Path) -> None:
+    """By the way in, from degrees to metres, not the way out."""
+    out = tmp_path / "out.parquet"
+    said = verb("map", "export", root, "--format", "geoparquet", "-o", out)
+    assert "nowhere is left out" in said.err
+    assert f"{2 * PLACES} places of 2 drives" in said.out
+    where = points(out)
+    about = json.loads(pq.read_schema(out).metadata[b"geo"])["columns"]["geometry"]
+    assert about["bbox"] == [*where.min(0), *where.max(0)]
+    unknown = np.full((2 * PLACES + 1, 3, 3), np.nan)
+    rows = np.vstack([[11.0, 48.0, 500.0], where])
+    enu = geodesy.local_enu(Gps(np.arange(len(rows)), rows[:, 1], rows[:, 0], rows[:, 2], unknown)).enu_m[1:]
+    _, world = tables.read_keyframes(root / "runs" / "drive=near" / "keyframes.parquet")
+    near = np.array([drive == "near" for drive, _ in places(out)])
+    np.testing.assert_allclose(geometry.transform(TURNED, enu[near]), world[:, :3, 3], atol=1e-5)
+    assert np.all(enu[~near, 0] - enu[near, 0].mean() > 2900)
+    query = "select drive, count(*) from read_parquet(?) group by 1 order by 1"
+    assert duckdb.execute(query, [str(out)]).fetchall() == [("far", PLACES), ("near", PLACES)]
+
+
+def test_a_box_on_earth(root: Path, verb: Verb, tmp_path: Path) -> None:
+    """Exactly the places whose points are in it, its edges included, in either format."""
+    every, out = tmp_path / "every.parquet", tmp_path / "out.parquet"
+    verb("map", "export", root, "--format", "geoparquet", "-o", every)
+    where, names = points(every), places(every)
+    near = np.array([drive == "near" for drive, _ in names])
+    low, high = where[near].min(0), where[near].max(0)
+    middle = float(np.median(where[near, 0]))
+    for south, west, north, east in (
+        (-90.0, -180.0, 90.0, 180.0), (low[1], low[0], high[1], high[0]), (low[1], middle, high[1], high[0]),
+        (-90.0, middle, 90.0, -170.0),
+    ):  # fmt: skip
+        box = f"--box={south!r},{west!r},{north!r},{east!r}".replace("np.float64(", "").replace(")", "")
+        inside = (where[:, 1] >= south) & (where[:, 1] <= north)
+        inside &= (
+            (where[:, 0] >= west) & (where[:, 0] <= east)
+            if west <= east
+            else (where[:, 0] >= west) | (where[:, 0] <= east)
+        )
+        assert inside.any()
+        for kind in ("parquet", "geoparquet"):
+            told = verb("map", "export", root, box, "--format", kind, "-o", out, "--json").json
+            assert places(out) == [names[row] for row in np.flatnonzero(inside)]
+            assert told["left_out"] == ["nowhere"]
+    assert np.array_equal(points(out), where[inside])
+
+
+def test_what_cannot_be_exported_is_one_line(root: Path, verb: Verb, tmp_path: Path) -> None:
+    out = tmp_path / "out.parquet"
+    assert "Drives: far, near, nowhere" in verb("map", "export", root, "--drive", "none", "-o", out).error
+    assert "1 of 3 drives have no place on earth" in verb("map", "export", root, "--box=0,0,1,1", "-o", out).error
+    assert "alone" in verb("map", "export", root, root / "runs" / "drive=near", "-o", out).error
+    run = root / "runs" / "drive=near"
+    assert "--drive" in verb("map", "export", run, "--drive", "near", "-o", out).error
+    for box in ("1,2,3", "1,2,0,3", "a,b,c,d", "0,0,91,0", "0,-181,1,0"):
+        assert verb("map", "export", root, f"--box={box}", "-o", out).code == 2
+    assert "no finished drive" in verb("map", "export", make_map(tmp_path / "empty", {}), "-o", out).error
+    assert not out.exists()

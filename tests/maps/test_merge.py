@@ -1,0 +1,143 @@
+"""Drives taken from map to map and out of it; none with another library, none twice, none half."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import pyarrow.parquet as pq
+
+from vplog.maps import keys
+from vplog.maps import store as map_store
+from vplog.maps.merge import merge_maps
+from vplog.results import run_record
+
+from .runs import LIBRARY, OTHER_LIBRARY, make_map, put, seeds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import pytest
+    from conftest import Said
+
+    Verb = Callable[..., Said]
+
+
+def digests(root: Path, drive: str) -> dict[str, str]:
+    run = map_store.Store(root).run(drive)
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in run.iterdir()}
+
+
+def states(told: dict[str, Any]) -> list[tuple[str, str, str]]:
+    return [(one["drive"], one["as"], one["state"]) for one in told["drives"]]
+
+
+def test_drives_come_as_they_are_and_those_whose_name_is_taken_get_a_number(verb: Verb, tmp_path: Path) -> None:
+    a = make_map(tmp_path / "a", {"walk": 1, "ride": 2})
+    b = make_map(tmp_path / "b", {"walk": 3, "walk-2": 4, "walk-10": 5, "ride": 2})
+    both = tmp_path / "both"
+    told = verb("map", "merge", a, b, "-o", both, "--json").json
+    assert states(told) == [
+        ("ride", "ride", "taken"), ("walk", "walk", "taken"), ("ride", "ride", "there already"),
+        ("walk", "walk-2", "taken"), ("walk-2", "walk-3", "taken"), ("walk-10", "walk-10", "taken"),
+    ]  # fmt: skip
+    store = map_store.Store(both)
+    assert {drive: seeds(store.run(drive)) for drive in store.drives()} == {
+        "ride": {2}, "walk": {1}, "walk-10": {5}, "walk-2": {3}, "walk-3": {4},
+    }  # fmt: skip
+    assert store.head().library == LIBRARY
+    assert digests(both, "walk") == digests(a, "walk")
+    assert digests(both, "walk-10") == digests(b, "walk-10")
+    moved, own = digests(both, "walk-2"), digests(b, "walk")
+    assert {name for name in own if moved[name] != own[name]} == {"keyframes.parquet", "drive.json"}
+    for drive, record in store.drives().items():
+        assert set(pq.read_table(store.run(drive) / "keyframes.parquet")["drive"].to_pylist()) == {drive}
+        made_from = {name: record[name] for name in ("drive", "inputs", "library", "topics")}
+        assert record["key"] == keys.key_of(made_from), "which is that of a batch, so that it leaves the drive as it is"
+    assert "6 drives" not in verb("map", "info", both).out
+    again = verb("map", "merge", b, a, "-o", both, "--json").json
+    assert {state for _, _, state in states(again)} == {"there already"}
+    assert "0 of 6 drives taken" in verb("map", "merge", a, b, "-o", both).out
+
+
+def test_a_merge_that_was_stopped_goes_on_to_the_same_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = make_map(tmp_path / "a", {"walk": 1}), make_map(tmp_path / "b", {"walk": 2, "walk-2": 3, "walk-3": 4})
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    merge_maps([a, b], whole)
+    publish, left = map_store.publish, [0]
+
+    def stopping(*arguments: Any) -> None:
+        left[0] -= 1
+        if left[0] == 0:
+            raise KeyboardInterrupt
+        publish(*arguments)
+
+    monkeypatch.setattr(map_store, "publish", stopping)
+    for stop in (2, 2, 2, 2):
+        left[0] = stop
+        try:
+            merge_maps([a, b], part)
+        except KeyboardInterrupt:
+            assert len(map_store.Store(part).drives()) >= 1
+    drives = list(map_store.Store(whole).drives())
+    assert drives == list(map_store.Store(part).drives()) == ["walk", "walk-2", "walk-3", "walk-4"]
+    assert [digests(part, drive) for drive in drives] == [digests(whole, drive) for drive in drives]
+
+
+def test_another_library_is_refused_everywhere_and_nothing_is_written(verb: Verb, tmp_path: Path) -> None:
+    a, b = make_map(tmp_path / "a", {"one": 1}), make_map(tmp_path / "b", {"two": 2}, OTHER_LIBRARY)
+    said = verb("map", "merge", a, b, "-o", tmp_path / "both").error
+    assert f"library {OTHER_LIBRARY[:12]}" in said
+    assert f"vplog map redescribe {b} --library {a}/libraries/{LIBRARY}" in said
+    assert not (tmp_path / "both").exists()
+    assert "do not compare" in verb("map", "merge", b, "-o", a).error
+    assert list(map_store.Store(a).drives()) == ["one"]
+
+    with map_store.writing(a) as store:  # by hand, as nobody should
+        put(store, "strange", 3, OTHER_LIBRARY)
+    for arguments in (
+        ("merge", a, "-o", tmp_path / "c"), ("export", a, "-o", tmp_path / "c"), ("query", a, tmp_path / "any.mcap"),
+        ("redescribe", a, "--library", b / "libraries" / OTHER_LIBRARY, "-o", tmp_path / "c"),
+    ):  # fmt: skip
+        assert f"vplog map remove {a} strange" in verb("map", *arguments).error
+        assert not (tmp_path / "c").exists()
+    assert any("do not compare" in problem for problem in verb("map", "info", a, "--json").json["problems"])
+    verb("map", "remove", a, "strange")
+    assert verb("map", "info", a, "--json").json["problems"] == [
+        "1 of 1 drives were made with other settings than the last batch had, or by another version of vplog. "
+        "`vplog batch` with their logs makes them anew; the first is /logs/1/one.mcap."
+    ]
+
+
+def test_what_cannot_be_merged_is_one_line(verb: Verb, tmp_path: Path) -> None:
+    a = make_map(tmp_path / "a", {"one": 1})
+    assert "is not a map" in verb("map", "merge", a, tmp_path / "none", "-o", tmp_path / "c").error
+    assert "own" in verb("map", "merge", a, "-o", a).error or "target" in verb("map", "merge", a, "-o", a).error
+    assert "given twice" in verb("map", "merge", a, a, "-o", tmp_path / "c").error
+    assert not (tmp_path / "c").exists()
+    empty = make_map(tmp_path / "empty", {})
+    assert "no finished drive" in verb("map", "merge", empty, "-o", tmp_path / "c").error
+    verb("map", "merge", a, "-o", empty)
+    assert list(map_store.Store(empty).drives()) == ["one"]
+
+
+def test_removing_is_as_removing_the_folders(verb: Verb, tmp_path: Path) -> None:
+    a, b = (make_map(tmp_path / name, {"one": 1, "two": 2, "three": 3}) for name in "ab")
+    for root in (a, b):
+        for name in ("joins", ".cache"):
+            (root / name / "drive=one").mkdir(parents=True)
+            (root / name / "drive=one" / "file").write_text("of one")
+        run_record.write_run_json(root / "failures.json", {"bad": {"log": "/bad", "error": "why"}})
+    told = verb("map", "remove", a, "one", "three", "bad", "--json").json
+    assert told == {"map": str(a), "removed": ["one", "three", "bad"], "drives": ["two"]}
+    for drive in ("one", "three"):
+        for folder in [*b.glob(f"*/drive={drive}"), b / ".cache" / f"drive={drive}"]:
+            shutil.rmtree(folder, ignore_errors=True)
+    names = {path.relative_to(a) for path in a.rglob("*")}
+    assert names == {path.relative_to(b) for path in b.rglob("*")}
+    assert json.loads((a / "failures.json").read_text()) == {}
+    assert "Drives: two" in verb("map", "remove", a, "two", "none").error
+    assert list(map_store.Store(a).drives()) == ["two"], "all or nothing"

@@ -1,0 +1,125 @@
+"""The places of a map, or of single runs, in one file for other tools."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.errors import ResultError, SettingsError
+from vplog.maps import store as map_store
+from vplog.maps.earth import earth_of_run, inside
+from vplog.remote import local_copy
+from vplog.results import tables
+from vplog.results.geo import on_earth
+from vplog.results.places_map import names_of, read_places, write_map, write_places
+from vplog.retell import finished
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.data import Floats
+    from vplog.maps.earth import Box
+    from vplog.results.places_map import DrivePlaces
+    from vplog.results.shown import Earth
+
+    Progress = Callable[[str, int, int], None]
+
+
+_PLACES = ("keyframes.parquet", "descriptors.parquet")
+"""Of a run folder, where its places are and what they are."""
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The drives that may be written, each read alone."""
+
+    names: Sequence[str]
+    earth: Callable[[str], Earth | None]
+    """Where on earth a drive is."""
+    read: Callable[[str, Callable[[Path], Any], Sequence[str]], Any]
+    """What a function makes of some files of a drive's run folder."""
+    forget: Callable[[str], None]
+
+
+def export_map(
+    sources: Sequence[Path],
+    path: Path,
+    drives: Sequence[str] = (),
+    box: Box | None = None,
+    kind: str = "parquet",
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """Write the places of a map (all, those of some drives, those in a box on earth) or of runs; what was written.
+
+    One drive is in memory at a time. With a box or as GeoParquet a drive that has no place on earth is left out, and
+    named in the answer. Raises VplogError.
+    """
+    maps = [source for source in sources if (source / "map.json").exists()]
+    if maps and len(sources) > 1:
+        raise SettingsError(f"{maps[0]} is a map: export it alone, or put maps together first with `vplog map merge`.")
+    if maps:
+        with map_store.reading(maps[0]) as store:
+            _, known = map_store.one_library(store)
+            unknown = [drive for drive in drives if drive not in known]
+            if unknown:
+                raise SettingsError(f"{store} has no drive {unknown[0]!r}. Drives: {', '.join(known)}.")
+            names = [drive for drive in known if drive in drives or not drives]
+            return _write(path, _Source(names, store.earth, store.read, store.forget), box, kind, progress)
+    if drives:
+        raise SettingsError("--drive chooses among the drives of a map, and what is given are runs. Leave it out.")
+    with ExitStack() as stack:
+        folders = [stack.enter_context(local_copy(source)) for source in sources]
+        for folder in folders:
+            finished(folder)
+        if box is None and kind == "parquet":
+            return write_map(path, folders)
+        run = dict(zip(names_of(folders), folders, strict=True))
+        source = _Source(
+            list(run), lambda drive: earth_of_run(run[drive]), lambda drive, of, _: of(run[drive]), lambda _: None
+        )
+        return _write(path, source, box, kind, progress)
+
+
+def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Progress) -> dict[str, Any]:
+    if box is None and kind == "parquet":
+        return {**write_places(path, source.names, _places(source, {}, box, progress)), "left_out": []}
+    earths = {drive: source.earth(drive) for drive in source.names}
+    left_out = [drive for drive in source.names if earths[drive] is None]
+    placed = {drive: earth for drive, earth in earths.items() if earth is not None}
+    low, high, written = np.full(3, np.inf), np.full(3, -np.inf), {}
+    for drive, earth in placed.items():  # where they are comes first in a file, and takes the poses alone
+
+        def points(run: Path, earth: Earth = earth) -> Floats:
+            return on_earth(earth, tables.read_keyframes(run / "keyframes.parquet")[1])
+
+        where = source.read(drive, points, _PLACES[:1])
+        where = where if box is None else where[inside(where, box)]
+        if len(where):
+            written[drive] = earth
+            low, high = np.minimum(low, where.min(0)), np.maximum(high, where.max(0))
+    if not written:
+        nowhere = f" {len(left_out)} of {len(source.names)} drives have no place on earth." if left_out else ""
+        asked = "in the box" if box is not None else "to write"
+        raise ResultError(f"There is no place {asked}, so {path} is not written.{nowhere}")
+    bounds = (low, high) if kind == "geoparquet" else None
+    found = write_places(path, source.names, _places(source, written, box, progress), bounds)
+    return {**found, "drives": list(written), "left_out": left_out}
+
+
+def _places(source: _Source, earths: dict[str, Earth], box: Box | None, progress: Progress) -> Iterator[DrivePlaces]:
+    """The places of drives, one drive after the other; with their points where they are told where it is."""
+    drives = list(earths or source.names)
+    for number, drive in enumerate(drives):
+        places = source.read(drive, lambda run, drive=drive: read_places(run, drive), _PLACES)
+        if earths:
+            where = on_earth(earths[drive], places.world_from_body)
+            places = replace(places, where=where)
+            if box is not None:
+                places = places.of(np.flatnonzero(inside(where, box)))
+        yield places
+        source.forget(drive)
+        progress("export", number + 1, len(drives))

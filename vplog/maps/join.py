@@ -1,0 +1,220 @@
+"""Closures between the drives of a map, and one graph of those that they join; what is there already stays.
+
+A drive is looked for in all that came before it: first by its places, then, in the drives that hold most like them,
+by geometry. Drives come in order of their IDs within a batch, and after all that were there.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from vplog.between import likely_drives, shared_of
+from vplog.maps import pairs
+from vplog.maps.candidates import candidates_of, places_of
+from vplog.maps.roster import is_up_to_date, read_drives, settled_ties
+from vplog.maps.store import reading, writing
+from vplog.maps.tasks import each_done
+from vplog.maps.together import solve_groups
+from vplog.pipeline import Pipeline
+from vplog.timing import Watch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import Executor
+    from pathlib import Path
+
+    from vplog.loops.propose import Proposals
+    from vplog.maps.pairs import PairTask
+    from vplog.maps.roster import Drives
+    from vplog.maps.seen import Sight
+    from vplog.maps.store import Store
+    from vplog.places.shared import Shared
+    from vplog.stages import PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+class Wanted(NamedTuple):
+    """Candidates of one drive in another."""
+
+    later: int
+    earlier: int
+    proposals: Proposals
+    shared: Shared
+
+
+def join(
+    store: Store,
+    pipeline: Pipeline,
+    executor: Executor | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """Verify what was not yet looked at, solve what that touches, and say what joins.
+
+    The caller holds the map's lock. With an executor its processes verify, pair by pair, each with `threads`; they
+    must see the map and the logs under the same paths. Neither counts for the result. A pair that cannot be verified,
+    as where a log is gone, is left out with a reason, and tried again the next time. Raises VplogError where the map
+    as a whole cannot be read or written.
+    """
+    watch = Watch()
+    if store.mirror is not None:  # what joins drives goes to and from an object store as a whole
+        lean = pipeline.join.model_copy(update={"keep_features": False})
+        pipeline = pipeline.model_copy(update={"join": lean})
+    drives = read_drives(store)
+    new = [at for at in range(len(drives.members)) if not is_up_to_date(store, drives, at, pipeline)]
+    with watch.stage("search"):
+        wanted = _search(store, drives, new, pipeline, threads, progress)
+    with watch.stage("verify"):
+        computed, reasons = _verify(store, drives, new, wanted, pipeline, executor, threads, progress)
+        _remember(store, drives, new, wanted, reasons, pipeline)
+    with watch.stage("solve"):
+        ties = settled_ties(store, drives)
+        record = solve_groups(store, drives, ties, pipeline, progress)
+    left_out = [f"{later} in {earlier} was left out. {reason}" for (later, earlier), reason in reasons.items()]
+    for group in record["groups"]:
+        left_out += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
+        left_out += [
+            f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
+            for one in group["apart"]
+        ]
+    blind = [
+        member.drive
+        for member in drives.members
+        if (sight := pairs.known_sight(store, member, pipeline)) is not None and sight.camera["matrix"] is None
+    ]
+    if blind:
+        left_out.append(f"No calibration, so no closure with metres that could join them: {', '.join(blind)}.")
+    return {
+        "searched": [drives.members[at].drive for at in new],
+        "pairs": len(ties),
+        "pairs_computed": computed,
+        "components": [component for group in record["groups"] for component in group["components"]],
+        "alone": record["alone"],
+        "warnings": [*drives.apart.values(), *left_out],
+        "stages": watch.stages,
+    }
+
+
+def _search(
+    store: Store, drives: Drives, new: Sequence[int], pipeline: Pipeline, threads: int, progress: Progress
+) -> list[Wanted]:
+    """The candidates of new drives that are worth verifying."""
+    later = [at for at in new if at]  # the first has none before it
+    if not later:
+        return []
+    state = cast("PlaceState", pipeline.places.load(store.library(drives.library), threads))
+    wanted = []
+    for at, found in candidates_of(store, drives.members, later, state, pipeline, threads, progress).items():
+        own = places_of(store, drives.members[at], state)
+        for earlier in likely_drives(found, pipeline.join):
+            proposals = found.of(earlier)
+            shared = shared_of(proposals, state, own, places_of(store, drives.members[earlier], state))
+            wanted.append(Wanted(at, earlier, proposals, shared))
+    return wanted
+
+
+def _verify(
+    store: Store,
+    drives: Drives,
+    new: Sequence[int],
+    wanted: Sequence[Wanted],
+    pipeline: Pipeline,
+    executor: Executor | None,
+    threads: int,
+    progress: Progress,
+) -> tuple[int, dict[tuple[str, str], str]]:
+    """Store the ledgers that are not there yet; how many those were, and why others could not be made, by drives."""
+    sights, blind = _sights(store, drives, new, wanted, pipeline, executor, threads)
+    reasons: dict[tuple[str, str], str] = {}
+
+    def tasks() -> Iterator[PairTask]:
+        for at, one in enumerate(wanted):
+            later, earlier = drives.members[one.later], drives.members[one.earlier]
+            progress("verify between drives", at, len(wanted))
+            if why := blind.get(one.later, "") or blind.get(one.earlier, ""):
+                reasons[later.drive, earlier.drive] = why
+                continue
+            task = pairs.PairTask(
+                later, earlier, sights[one.later], sights[one.earlier], one.proposals, one.shared, pipeline,
+                drives.library, threads,
+            )  # fmt: skip
+            if not pairs.is_stored(store, task):
+                yield task
+
+    computed = 0
+    for task, data, why in each_done(pairs.compute_pair, tasks(), executor):
+        if data is None:
+            reasons[task.later.drive, task.earlier.drive] = why
+        else:
+            pairs.put_ledger(store, task, data)
+            computed += 1
+    progress("verify between drives", len(wanted), len(wanted))
+    return computed, reasons
+
+
+def _sights(
+    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[Wanted], pipeline: Pipeline,
+    executor: Executor | None, threads: int,
+) -> tuple[dict[int, Sight], dict[int, str]]:  # fmt: skip
+    """How the drives see that are verified, by number, and why that cannot be told of others.
+
+    That of new drives is looked at now, while their features are at hand.
+    """
+    paired = {at for one in wanted for at in (one.later, one.earlier)}
+    sights: dict[int, Sight] = {}
+    missing: list[int] = []
+    for at in sorted(paired | {at for at in new if drives.members[at].cache.is_dir()}):
+        known = pairs.known_sight(store, drives.members[at], pipeline)
+        if known is None:
+            missing.append(at)
+        else:
+            sights[at] = known
+    blind: dict[int, str] = {}
+    work = partial(pairs.compute_sight, pipeline=pipeline, threads=threads)
+    for at, (member, sight, why) in zip(
+        missing, each_done(work, [drives.members[at] for at in missing], executor), strict=True
+    ):
+        if sight is None:
+            blind[at] = why
+        else:
+            sights[at] = sight
+            pairs.put_sight(store, member, pipeline, sight)
+    return sights, blind
+
+
+def _remember(
+    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[Wanted],
+    reasons: dict[tuple[str, str], str], pipeline: Pipeline,
+) -> None:  # fmt: skip
+    """Write of each new drive what it was verified against."""
+    of_later: dict[int, list[Wanted]] = {at: [] for at in new}
+    for one in wanted:
+        of_later[one.later].append(one)
+    for at in new:
+        member, told = drives.members[at], []
+        for one in of_later[at]:
+            earlier = drives.members[one.earlier]
+            why = reasons.get((member.drive, earlier.drive), "")
+            ledger = None if why else pairs.read_ledger(store, member.drive, earlier.drive)
+            told.append({
+                "match": earlier.drive,
+                "match_key": earlier.key,
+                "candidates": 0 if ledger is None else len(ledger),
+                "verified": pairs.verified(ledger),
+                "ledger": "" if why else pairs.made_from(store, member.drive, earlier.drive),
+                **({"reason": why} if why else {}),
+            })  # fmt: skip
+        position = drives.joins[at].position
+        drives.joins[at] = pairs.Joins(position, member.key, pairs.search_key(member, pipeline), tuple(told))
+        pairs.put_joins(store, member.drive, drives.joins[at])
+
+
+def join_map(root: Path, threads: int = 1, progress: Progress = lambda *_: None) -> dict[str, Any]:
+    """`join` of a map as it is, with the settings of its last batch. Raises VplogError."""
+    with reading(root) as store:  # not a map: nothing is made
+        head = store.head()
+    pipeline = Pipeline.read(head.settings, f"{root}/map.json")
+    with writing(root) as store:
+        return {"map": str(root), **join(store, pipeline, None, threads, progress)}

@@ -1,0 +1,50 @@
+"""joint.json of a map: which joint graphs count."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import ResultError
+from vplog.results import run_record
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FORMAT = 1
+"""Version of this record. A reader refuses another one."""
+
+
+def read_joint(root: Path) -> dict[str, Any]:
+    """What joins the drives of a map; empty where nothing was joined yet. Raises ResultError where it is damaged.
+
+    `groups` are the drives that verified closures join, each with the `components` that came of it (`folder` in
+    MAP/joint, `drives`) and the pairs kept `apart`; `alone` are the drives in no component, `apart` says of some why.
+    """
+    path = root / "joint.json"
+    if not path.is_file():
+        return {}
+    record = run_record.read_run_json(path)
+    groups = record.get("groups")
+    sound = isinstance(groups, list) and all(
+        isinstance(group, dict) and isinstance(group.get("key"), str) and isinstance(group.get("components"), list)
+        for group in groups
+    )
+    if record.get("format") != FORMAT or not sound:
+        raise ResultError(f"{path} is of another version or damaged. Run `vplog map join {root}` to write it anew.")
+    return record
+
+
+def components_of(root: Path) -> list[dict[str, Any]]:
+    """The components that count: `folder` in MAP/joint and `drives`, in order of their first drives."""
+    return [component for group in read_joint(root).get("groups", []) for component in group["components"]]
+
+
+def write_joint(root: Path, record: dict[str, Any]) -> None:
+    """joint.json, unless it says that already."""
+    record, path = run_record.plain({"format": FORMAT, **record}), root / "joint.json"
+    try:
+        if path.is_file() and run_record.read_run_json(path) == record:
+            return
+    except ResultError:  # damaged
+        pass
+    run_record.write_run_json(path, record)

@@ -1,0 +1,49 @@
+"""The names in a map, and what its records must say."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from vplog.errors import ResultError
+from vplog.results import run_record
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FORMAT = 1
+"""Version of this layout. A reader refuses another one."""
+TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
+"""Data sets of a map: each is a file of this name in every run folder."""
+AT_HAND = (*(f"{name}.parquet" for name in TABLES), "run.json")
+"""Of a run folder on an object store, what those who work with drives have fetched: all but pictures and reports."""
+HASH = re.compile(r"[0-9a-f]{64}")
+"""How a library is called: the sha256 of all that descriptors depend on."""
+
+
+def folder_name(drive: str) -> str:
+    """What a partition of a data set is called; other characters than letters, digits and `_.-~` as in a URL."""
+    return f"drive={quote(drive, safe='')}"
+
+
+def drive_record(folder: Path) -> dict[str, Any]:
+    """drive.json of a run folder in a map. Raises ResultError."""
+    return sound_record(run_record.read_run_json(folder / "drive.json"), folder)
+
+
+def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """What drive.json of `folder` says, checked. Raises ResultError."""
+    wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
+    if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
+        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Remove the folder and run again.")
+    if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
+        raise ResultError(f"{folder} holds drive {record['drive']!r}. Remove the folder and run again.")
+    return record
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,135 @@
+"""Drives put into and taken out of a map's folder, each by one rename."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import shutil
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from vplog.errors import ResultError, SettingsError
+from vplog.maps.layout import TABLES, drive_record, folder_name, sha256_of
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.maps.store import Store
+
+_HERE, _EXCHANGE = -100, 2
+"""AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
+_REMOVED = "removed-"
+"""Begins the name of a folder in staging that is on its way out."""
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """The folder for one writer, made where it is not there; the lock goes with the process that holds it."""
+    if root.is_dir() and not (root / "map.json").exists():
+        others = [path.name for path in root.iterdir() if not path.name.startswith(".")]
+        if others:
+            raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        lock = (root / ".lock").open("a")
+    except OSError as error:
+        raise SettingsError(f"Cannot make the map {root}: {error.strerror}. Choose another folder with -o.") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SettingsError(
+                f"Another `vplog batch` is writing to {root}. Wait for it to end, or choose another folder with -o."
+            ) from None
+        except OSError as error:  # file systems without locks
+            raise SettingsError(f"Cannot lock {root}/.lock: {error.strerror}. Choose another folder with -o.") from None
+        yield
+
+
+def settle(store: Store) -> None:
+    """Put in what a killed writer had finished: a folder with drive.json, which is written last."""
+    for file in sorted(store.staging.glob("*/drive.json")):
+        if not file.parent.name.startswith(_REMOVED):
+            record = drive_record(file.parent)
+            if not store.run(record["drive"]).exists():
+                publish(store, record["drive"], file.parent)
+    shutil.rmtree(store.staging, ignore_errors=True)
+    store.staging.mkdir(parents=True, exist_ok=True)
+    for drive in store.drives():
+        link_tables(store, drive)
+
+
+def clear(store: Store) -> None:
+    """Away with what a writer was making."""
+    shutil.rmtree(store.staging, ignore_errors=True)
+
+
+def publish(store: Store, drive: str, made: Path) -> None:
+    """Make a finished run folder the drive's, in place of the one it may have, and link its tables.
+
+    A reader finds the old folder or the new one: they change places in one step where the system can (Linux, on all
+    its usual file systems), else there is neither for a moment.
+    """
+    run, replaced = store.run(drive), store.staging / f"replaced-{os.getpid()}"
+    try:
+        run.parent.mkdir(exist_ok=True)
+        shutil.rmtree(replaced, ignore_errors=True)
+        if not run.exists():
+            made.rename(run)
+        elif exchanged(made, run):
+            made.rename(replaced)
+        else:
+            run.rename(replaced)
+            (replaced / "drive.json").unlink(missing_ok=True)  # so that nobody takes it for a new one
+            made.rename(run)
+    except OSError as error:
+        raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
+    shutil.rmtree(replaced, ignore_errors=True)
+    link_tables(store, drive)
+
+
+def exchanged(one: Path, other: Path) -> bool:
+    """Let two folders change their names in one step; False where the system cannot."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    return rename is not None and rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0
+
+
+def link_tables(store: Store, drive: str) -> None:
+    """Each table of the run folder under its data set; a copy on file systems without hard links."""
+    for name in TABLES:
+        source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
+        if not source.is_file():
+            raise ResultError(f"{source} is not there. Remove {store.run(drive)} and run again.")
+        if path.exists() and (path.samefile(source) or _same_copy(source, path)):
+            continue
+        part = store.staging / f"{name}-{os.getpid()}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.unlink(missing_ok=True)
+            os.link(source, part)
+            part.replace(path)
+        except OSError:  # no hard links here; what else is wrong, the copy says
+            with replacing(path) as stream, source.open("rb") as whole:
+                shutil.copyfileobj(whole, stream)
+
+
+def _same_copy(source: Path, path: Path) -> bool:
+    """Whether a file that is no link holds the same, told by its bytes."""
+    return source.stat().st_size == path.stat().st_size and sha256_of(source) == sha256_of(path)
+
+
+def remove(store: Store, drive: str) -> None:
+    """Take a drive out: its run folder by one rename, then all else that bears its name."""
+    gone, named = store.staging / f"{_REMOVED}{os.getpid()}", folder_name(drive)
+    try:
+        shutil.rmtree(gone, ignore_errors=True)
+        if store.run(drive).exists():
+            store.run(drive).rename(gone)
+            shutil.rmtree(gone)
+        for folder in [*store.root.glob(f"*/{named}"), store.root / ".cache" / named]:
+            shutil.rmtree(folder, ignore_errors=not folder.exists())
+    except OSError as error:
+        raise ResultError(f"Cannot take {drive} out of {store.root}: {error.strerror}.") from None

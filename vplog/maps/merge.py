@@ -1,0 +1,127 @@
+"""Drives of maps, taken into another map that has the same library."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.maps import keys
+from vplog.maps import store as map_store
+from vplog.results import run_record
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+
+    from vplog.maps.store import Store
+
+    Progress = Callable[[str, int, int], None]
+
+
+def merge_maps(sources: Sequence[Path], target: Path, progress: Progress = lambda *_: None) -> dict[str, Any]:
+    """Take the drives of maps into `target`, which is made where it is not there; what became of each.
+
+    Maps in the order given, the drives of each in order of their IDs. One whose log is in the map already, by its
+    content, is left out; one whose ID is taken gets a number. Each is in whole or not at all, so a merge that was
+    stopped goes on. Nothing is written where the libraries differ. Raises VplogError.
+    """
+    if any(str(source.resolve()) == str(target.resolve()) for source in sources):
+        raise SettingsError(f"{target} is given as a source and as the target. Choose another map with -o.")
+    if len({str(source.resolve()) for source in sources}) < len(sources):
+        raise SettingsError("A map is given twice. Give each once.")
+    library = _check_libraries(sources, target)
+    fate: list[dict[str, Any]] = []
+    with map_store.writing(target) as store:
+        known = {_content(record): drive for drive, record in store.drives().items()}
+        for number, source in enumerate(sources):
+            with map_store.reading(source) as other:
+                _, drives = map_store.one_library(other)
+                _take_library(store, other, library)
+                for drive in in_order(drives):
+                    fate.append(_take(store, other, drives[drive], known, f"{os.getpid()}-{len(fate)}"))
+                    progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
+        return {"map": str(store), "library": library, "drives": fate}
+
+
+def _check_libraries(sources: Sequence[Path], target: Path) -> str:
+    """The one library of the maps. Raises LibraryError where their places do not compare."""
+    wanted, whose = None, str(target)
+    if (target / "map.json").exists():
+        with map_store.reading(target) as store:
+            wanted = map_store.one_library(store)[0] if store.drives() else store.head().library
+    for source in sources:
+        with map_store.reading(source) as other:
+            found, _ = map_store.one_library(other)
+        if wanted is None:
+            wanted, whose = found, str(source)
+        if found != wanted:
+            raise LibraryError(
+                f"{source} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do not "
+                f"compare. Describe it anew: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
+            )
+    return str(wanted)
+
+
+def _take_library(store: Store, other: Store, library: str) -> None:
+    """The library and the settings of the first map are those of a new one."""
+    if (store.root / "map.json").exists() and store.head().library is not None:
+        return
+    made = store.staging / "library"
+    shutil.rmtree(made, ignore_errors=True)
+    shutil.copytree(other.library(library), made)
+    map_store.add_library(store, made, library)
+    store.write_head(map_store.Head(library, other.head().settings))
+
+
+def _take(store: Store, other: Store, record: dict[str, Any], known: dict[str, str], staged: str) -> dict[str, Any]:
+    """One drive; what became of it. `known` are the IDs in the map by content, and gets this one."""
+    drive = record["drive"]
+    told = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
+    if (same := known.get(_content(record))) is not None:
+        return {**told, "as": same, "state": "there already"}
+    taken, made = keys.free_name(drive, record["log"], set(known.values())), store.staging / staged
+
+    def copied(_: Path) -> None:
+        shutil.rmtree(made, ignore_errors=True)
+        try:
+            shutil.copytree(other.whole(drive), made, copy_function=_linked)
+        except (OSError, shutil.Error) as error:
+            raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
+
+    other.read(drive, copied, ())
+    if taken != drive:
+        keys.name_keyframes(made / "keyframes.parquet", taken)
+        run_record.write_run_json(made / "drive.json", keys.renamed(record, taken))
+    map_store.publish(store, taken, made)
+    other.forget(drive)
+    known[_content(record)] = taken
+    return {**told, "as": taken, "state": "taken"}
+
+
+def _content(record: dict[str, Any]) -> str:
+    """What a drive is of: the content of its log and what of that was used; without that, all that is known of it."""
+    if record["inputs"]:
+        return run_record.canonical_json([record["inputs"], record.get("topics")])
+    return run_record.canonical_json({name: value for name, value in record.items() if name != "earth"})
+
+
+def in_order(drives: Iterable[str]) -> list[str]:
+    """As they were numbered: drive, drive-2, drive-10."""
+
+    def numbered(drive: str) -> tuple[str, int]:
+        named = re.fullmatch(r"(.+)-(\d{1,9})", drive)
+        return (named[1], int(named[2])) if named else (drive, 1)
+
+    return sorted(drives, key=numbered)
+
+
+def _linked(source: str, target: str) -> str:
+    """The same file under another name, or a copy: no writer of a map changes a file, each replaces it."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+    return target

@@ -1,0 +1,228 @@
+"""A map on an object store, through a local folder that has the names of a map and of its files what was asked for.
+
+    MAP/map.json, failures.json, libraries/HASH/...   as in a folder
+    MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
+    MAP/runs/drive=ID/drive.json                      the manifest: what a folder's drive.json says, the generation, and
+                                                      length and sha256 of each of its files; written when all are there
+    MAP/keyframes/drive=ID/keyframes.parquet          its tables as data sets, copied within the store
+    MAP/rest/GENERATION/..., MAP/rest.json            all else that a map's folder has, as what joins its drives
+
+An object store has no rename and no links, but an object appears whole or not at all. So a manifest is the one thing
+that changes, and what it names never does: a reader has the drive of the old manifest or that of the new one. What the
+old one named is removed afterwards, by the writer that replaced it, and a reader that comes too late for it reads the
+new manifest. No writer removes what it did not itself see replaced, so nothing breaks even where two write at once:
+the last manifest counts. A killed writer leaves objects that no manifest names; a later one removes them after a day.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import threading
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any, cast
+
+from vplog.errors import ResultError
+from vplog.maps import objects
+from vplog.maps.layout import HASH, folder_name, sound_record
+from vplog.remote import reason
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+    from pathlib import Path
+
+    from vplog.maps.bucket_lock import Lock
+    from vplog.remote import RemotePath
+
+_REQUESTS = 16
+"""At once: a store answers each in some 20 to 50 ms, whatever its size."""
+OWN = ("generation", "replaces", "files")
+"""What a manifest says beside the drive.json of a folder."""
+_LIBRARY_FILE_BYTES = 2**34
+"""Longest file of a library that is fetched: 16 GB, more than load_references takes."""
+_GENERATION = re.compile(r"[0-9a-f]{16}")
+
+
+class Mirror:
+    """The drives of a map on a store, and the local folder that they are read and made through."""
+
+    def __init__(self, remote: RemotePath, local: Path, lock: Lock | None = None) -> None:
+        """With a lock it may be written to. Raises ResultError where the store cannot be read."""
+        self.remote, self.local, self.lock = remote, local, lock
+        self.manifests: dict[str, dict[str, Any]] = {}
+        self.rest_manifest: dict[str, Any] = {}
+        self._fetched: set[str] = set()
+        self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        with told(remote):
+            for name in ("map.json", "failures.json"):
+                if (data := objects.get(remote / name)) is not None:
+                    (local / name).write_bytes(data)
+            folders = [name for name in objects.folders_in(remote / "runs") if name.startswith("drive=")]
+            with ThreadPoolExecutor(_REQUESTS) as pool:
+                for found in pool.map(self.read_manifest, folders):
+                    if found is not None:
+                        self.lay(found)
+
+    def fetch(self, drive: str, names: Iterable[str]) -> None:
+        """Have these files of a drive in the local folder, all of one generation. Raises ResultError."""
+        with self._locks[drive]:
+            for _ in range(3):
+                if drive not in self.manifests:
+                    return
+                try:
+                    self._fetch(drive, names)
+                    return
+                except FileNotFoundError:
+                    self._again(drive)
+            raise ResultError(f"{self.remote}: {drive} is replaced faster than it can be read. Try again later.")
+
+    def _fetch(self, drive: str, names: Iterable[str]) -> None:
+        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
+        for name in names:
+            self._bring(place / manifest["generation"] / name, self.run(drive) / name, manifest["files"].get(name))
+        self._fetched.add(drive)
+
+    def forget(self, drive: str) -> None:
+        """Free the disk of a drive's files; they are fetched anew where they are asked for again."""
+        with self._locks[drive]:
+            shutil.rmtree(self.run(drive), ignore_errors=True)
+            self._fetched.discard(drive)
+            if drive in self.manifests:
+                self.lay(self.manifests[drive])
+
+    def _again(self, drive: str) -> None:
+        """Read the manifest of a drive whose files are gone. Raises ResultError where some of them were handed out."""
+        place = self.remote / "runs" / folder_name(drive)
+        with told(self.remote):
+            found = self.read_manifest(place.name)
+        old = self.manifests.pop(drive)
+        shutil.rmtree(self.run(drive), ignore_errors=True)
+        if found is None:
+            raise ResultError(f"{drive} was removed from {self.remote} while it was read. Run again.")
+        if found["generation"] == old["generation"]:
+            raise ResultError(f"{place} has lost files that its drive.json names. Remove it (all below) and run again.")
+        if drive in self._fetched:
+            raise ResultError(f"{drive} was replaced in {self.remote} while it was read. Run again.")
+        self.lay(found)
+
+    def library(self, digest: str) -> None:
+        """Have a library in the local folder, if the map has it. Raises ResultError."""
+        target, place = self.local / "libraries" / digest, self.remote / "libraries" / digest
+        if target.exists() or not HASH.fullmatch(digest):
+            return
+        part = target.with_name(f".{digest}.part")
+        with told(self.remote):
+            names = sorted(objects.files_below(place))
+            if "library.json" not in names:  # it is sent last
+                return
+            for name in filter(_sound, names):
+                (part / name).parent.mkdir(parents=True, exist_ok=True)
+                objects.fetch(place / name, part / name, _LIBRARY_FILE_BYTES)
+        part.rename(target)
+
+    def rest(self, names: Collection[str] = ()) -> None:
+        """Have all else that the map has in the local folder, or what of it has these names. Raises ResultError."""
+        for _ in range(3):
+            with told(self.remote):
+                data = objects.get(self.remote / "rest.json")
+            if data is None:
+                return
+            manifest = sound_manifest(data, self.remote / "rest.json")
+            place = self.remote / "rest" / manifest["generation"]
+            files = {name: about for name, about in manifest["files"].items() if self._is_of_a_drive(name)}
+            wanted = {name: about for name, about in files.items() if name in names or not names}
+            try:
+                for name, about in wanted.items():
+                    self._bring(place / name, self.local / name, about)
+                self.rest_manifest = manifest
+                return
+            except FileNotFoundError:
+                for name in wanted:
+                    (self.local / name).unlink(missing_ok=True)
+        raise ResultError(f"{self.remote}/rest is replaced faster than it can be read. Try again later.")
+
+    def _is_of_a_drive(self, name: str) -> bool:
+        """Whether the drive whose partition a file is in, if it is in one, is in the map."""
+        known = {folder_name(drive) for drive in self.manifests}
+        return all(part in known for part in PurePosixPath(name).parts if part.startswith("drive="))
+
+    def _bring(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> None:
+        """An object, if the manifest names it and it is not here yet. Raises FileNotFoundError where it is gone."""
+        if about is None or target.exists():
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part = target.with_name(f".{target.name}.part")
+        try:
+            digest = objects.fetch(place, part, about["bytes"])
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise ResultError(f"Cannot read {place}: {reason(error)}.") from None
+        if digest != about["sha256"]:
+            raise ResultError(f"{place} is damaged: it does not have the sha256 that its manifest names. Run again.")
+        part.replace(target)
+
+    def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
+        """As it is now; None where there is none. Raises OSError, and ResultError where it is damaged."""
+        place = self.remote / "runs" / drive_folder
+        data = objects.get(place / "drive.json")
+        if data is None:
+            return None
+        return sound_record(sound_manifest(data, place / "drive.json"), cast("Path", place))
+
+    def lay(self, manifest: dict[str, Any]) -> None:
+        """The drive's folder with its drive.json."""
+        folder = self.run(manifest["drive"])
+        folder.mkdir(parents=True, exist_ok=True)
+        own = {key: manifest[key] for key in manifest if key not in OWN}
+        text = json.dumps(own, indent=2, ensure_ascii=False) + "\n"  # as write_run_json has it
+        (folder / "drive.json").write_text(text, encoding="utf-8")
+        self.manifests[manifest["drive"]] = manifest
+
+    def take(self, manifest: dict[str, Any], made: Path) -> None:
+        """The folder of a drive that was just sent."""
+        folder = self.run(manifest["drive"])
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        made.rename(folder)
+        self.manifests[manifest["drive"]] = manifest
+        self._fetched.add(manifest["drive"])
+
+    def run(self, drive: str) -> Path:
+        return self.local / "runs" / folder_name(drive)
+
+
+@contextmanager
+def told(remote: RemotePath) -> Iterator[None]:
+    """What a store refuses, as an error of ours."""
+    try:
+        yield
+    except OSError as error:
+        raise ResultError(f"Cannot read or write {remote}: {reason(error)}.") from None
+
+
+def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
+    """A manifest whose names stay within the map. Raises ResultError."""
+    try:
+        manifest = json.loads(data)
+        files = manifest["files"]
+        generations = [manifest["generation"], manifest["replaces"] or manifest["generation"]]
+        sound = all(_GENERATION.fullmatch(one) for one in generations) and all(
+            isinstance(one["bytes"], int) and isinstance(one.get("rows", 0), int) and _sound(name) and one["sha256"]
+            for name, one in files.items()
+        )
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        sound, manifest = False, {}
+    if not sound:
+        raise ResultError(f"{place} is not a manifest of vplog. Remove what is beside it and run again.")
+    return manifest
+
+
+def _sound(name: str) -> bool:
+    """Whether a name from a manifest stays below the folder that it is written to."""
+    parts = PurePosixPath(name).parts
+    return bool(parts) and not name.startswith("/") and ".." not in parts and "\\" not in name

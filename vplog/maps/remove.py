@@ -1,0 +1,39 @@
+"""Drives taken out of a map."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import SettingsError
+from vplog.maps import store as map_store
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+
+def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
+    """Take drives out of a map, each by one step; what is left. Failures of these names are forgotten too.
+
+    Raises SettingsError, before anything is touched, where a drive is not in the map.
+    """
+    with map_store.reading(root) as store:
+        store.head()
+        _check(store, drives)
+    with map_store.writing(root) as store:
+        failures, known = store.failures(), store.drives()
+        _check(store, drives)
+        for drive in drives:
+            if drive in known:
+                map_store.remove(store, drive)
+        kept = {drive: told for drive, told in failures.items() if drive not in drives}
+        if kept != failures:
+            store.write_failures(kept)
+        return {"map": str(store), "removed": list(dict.fromkeys(drives)), "drives": list(store.drives())}
+
+
+def _check(store: map_store.Store, drives: Sequence[str]) -> None:
+    known = [*store.drives(), *store.failures()]
+    for drive in drives:
+        if drive not in known:
+            raise SettingsError(f"{store} has no drive {drive!r}. Drives: {', '.join(known) or 'none'}.")

@@ -1,0 +1,103 @@
+"""A map made anew with another library, from the logs of its drives."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vplog import logs
+from vplog.batch import run_batch
+from vplog.errors import SettingsError
+from vplog.libraries import build_library
+from vplog.maps import store as map_store
+from vplog.maps.merge import in_order
+from vplog.pipeline import Pipeline
+from vplog.places.stored import read_library_record
+from vplog.remote import local_copy, located
+from vplog.results import run_record
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    Progress = Callable[[str, int, int], None]
+
+
+def redescribe_map(
+    root: Path,
+    library: Path,
+    target: Path,
+    jobs: int | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """The drives of a map in a new map `target`, described with another library: one on disk, or one of a log's frames.
+
+    Settings are those of the map, and of the library how places are described; topics those of each drive. Every drive
+    is run again, from what its stages kept where that is there; one whose log is gone is said and stops no other. A
+    command that was stopped goes on. Raises VplogError.
+    """
+    if str(root.resolve()) == str(target.resolve()):
+        raise SettingsError(f"{root} is given as its own target. Choose another map with -o.")
+    with map_store.reading(root) as store:
+        head = store.head()
+        _, drives = map_store.one_library(store)
+        topics = {drive: run_record.read_run_json(store.file(drive, "run.json")).get("topics") for drive in drives}
+        _bring_caches(store.root, target)
+    fate, missing = [], []
+    groups: dict[str, list[str]] = {}
+    for drive in in_order(drives):
+        if located(drives[drive]["log"]).exists():
+            groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
+        else:
+            missing.append(drive)
+    with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), threads, progress) as (folder, pipeline):
+        if read_library_record(folder)["hash"] == head.library:
+            raise SettingsError(f"{root} is described with {library} already. Give another library.")
+        for number, group in enumerate(groups.values()):
+            choice = logs.TopicChoice.read(topics[group[0]] or {}, f"{root}: {group[0]}/run.json")
+            paths = [located(drives[drive]["log"]) for drive in group]
+            last = number + 1 == len(groups)
+            found = run_batch(paths, target, pipeline, folder, choice, jobs, threads, progress, join=last)
+            fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
+        digest = read_library_record(folder)["hash"]
+    for drive in missing:
+        log = drives[drive]["log"]
+        why = f"Its log {log} is not there any more. Put it back, and give the same command again."
+        fate.append({"drive": drive, "was": drive, "log": log, "state": "failed", "error": why})
+    return {
+        "map": str(target),
+        "from": str(root),
+        "library": digest,
+        "failed": sum(one["state"] == "failed" for one in fate),
+        "drives": fate,
+    }
+
+
+@contextmanager
+def _made(library: Path, pipeline: Pipeline, threads: int, progress: Progress) -> Iterator[tuple[Path, Pipeline]]:
+    """The folder of the library, and the settings with its own of places."""
+    if (library / "library.json").exists():
+        with local_copy(library) as folder:
+            places = read_library_record(folder)["settings"]
+            settings = {**pipeline.model_dump(mode="json"), "places": places}
+            yield folder, Pipeline.read(settings, f"{library}/library.json")
+        return
+    with tempfile.TemporaryDirectory(prefix="vplog-library-") as made:
+        folder = Path(made) / "library"
+        build_library([library], folder, pipeline, logs.TopicChoice(), threads, progress)
+        yield folder, pipeline
+
+
+def _bring_caches(root: Path, target: Path) -> None:
+    """What the stages of the drives kept, under their new map too, where both are folders of one file system."""
+    kept = root / ".cache"
+    if not kept.is_dir() or "://" in str(target) or (target / ".cache").exists():
+        return
+    try:
+        shutil.copytree(kept, target / ".cache", copy_function=os.link)
+    except (OSError, shutil.Error):  # it only spares work
+        shutil.rmtree(target / ".cache", ignore_errors=True)
