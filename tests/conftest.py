@@ -78,6 +78,14 @@ def finished(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def joint(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a joint run of three drives, beside their logs. Tests read it and leave it as it is."""
+    from .joined import run_together
+
+    return run_together(drive, tmp_path_factory.mktemp("joint"))
+
+
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real data, which is not part of the project."""
     folder = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2] / "shared" / "data"))

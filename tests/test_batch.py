@@ -10,21 +10,25 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import duckdb
 import pytest
 
 from vplog.batch import run_batch
+from vplog.batch_worker import Outcome, Task
 from vplog.demo import SMALL, make_drive
+from vplog.engine import LocalEngine, OwnProcesses, computed
 from vplog.errors import LibraryError, SettingsError
+from vplog.logs import TopicChoice
 from vplog.maps import store as map_store
 from vplog.pipeline import build_library, load_pipeline
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
-    from typing import Any
 
     from conftest import Said
 
@@ -83,9 +87,10 @@ def test_duckdb_reads_every_table_by_drive(whole: Path) -> None:
 
 
 def test_a_map_grows_by_its_new_drives_alone(
-    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With two jobs, the library given, one drive after the other and a bad one between: the bytes of one batch."""
+    monkeypatch.setattr("vplog.batch._FREE_BYTES", 0)  # however full the disk is
     [library] = (whole / "libraries").iterdir()
     root, bad = tmp_path / "map", tmp_path / "bad.mcap"
     bad.write_bytes(b"no log at all")
@@ -100,7 +105,9 @@ def test_a_map_grows_by_its_new_drives_alone(
 
     after = files(root)
     new = {name for name in after if after[name] != before.get(name)}
-    assert new - {"failures.json"} == {name for name in after if "drive=drive-2/" in name}
+    assert {name for name in new if not name.startswith("joint")} - {"failures.json"} == {
+        name for name in after if "drive=drive-2/" in name
+    }
     assert set(before) <= set(after)
     failures = json.loads((root / "failures.json").read_text())
     assert list(failures) == ["bad", "gone"]
@@ -117,11 +124,13 @@ def test_what_is_missing_or_changed_is_done_again(
     before = files(whole)
     asked: list[str] = []
 
-    def refuse(task: Any) -> tuple[Any, float, str]:
+    def refuse(_: LocalEngine, task: Task, cores: int) -> Future[Outcome]:
         asked.append(task.drive)
-        return task, 1.0, "not now"
+        future: Future[Outcome] = Future()
+        future.set_result(Outcome("not now"))
+        return future
 
-    monkeypatch.setattr("vplog.batch.in_process", refuse)
+    monkeypatch.setattr(LocalEngine, "start", refuse)
     (whole / "edges" / "drive=drive" / "edges.parquet").unlink()
     assert run_batch(logs, whole, pipeline)["failed"] == 0
     assert asked == []
@@ -182,3 +191,82 @@ def test_a_killed_batch_leaves_finished_drives_and_goes_on(whole: Path, logs: li
     assert done.returncode == 0, done.stderr
     assert tables(root) == reference
     assert not (root / ".staging").exists()
+
+
+@dataclass
+class Fated:
+    """An engine whose drives end as they are told to, one outcome or error for each attempt."""
+
+    fates: dict[str, list[Outcome | Exception]]
+    begun: list[str] = field(default_factory=list)
+    cores: int = 4
+    widest: int = 4
+
+    def at_once(self, threads: int) -> int:
+        return self.cores // threads
+
+    def helpers(self, threads: int) -> Executor | None:
+        return None
+
+    @property
+    def executor(self) -> Executor:
+        raise AssertionError
+
+    def start(self, task: Task, cores: int) -> Future[Outcome]:
+        self.begun.append(task.drive)
+        future: Future[Outcome] = Future()
+        fate = self.fates[task.drive].pop(0)
+        future.set_exception(fate) if isinstance(fate, Exception) else future.set_result(fate)
+        return future
+
+    def take(self, task: Task, outcome: Outcome) -> None:
+        if outcome.worker == "gone":
+            raise BrokenExecutor("What it gave back was lost.")
+
+
+def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path: Path) -> None:
+    died, bad, good = BrokenExecutor("Its worker was killed."), Outcome("No such topic."), Outcome(worker="here")
+    engine = Fated({
+        "unlucky": [died, Outcome("Out of memory.", may_pass=True), good],
+        "bad": [bad],
+        "good": [good],
+        "lost": [Outcome(worker="gone"), good],
+        "hopeless": [died, died, died],
+        "odd": [ValueError("what\nis this")],
+    })  # fmt: skip
+    topics, pipeline = TopicChoice(), load_pipeline("default")
+    tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
+    ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in computed(engine, tasks, 2, 2)}
+    assert ended == {
+        "unlucky": ("", 3),
+        "bad": ("No such topic.", 1),
+        "good": ("", 1),
+        "lost": ("", 2),
+        "hopeless": ("Its worker was killed.", 3),
+        "odd": ("Internal error: ValueError: what is this.", 1),
+    }
+    assert set(engine.begun[:6]) == set(engine.fates), "each has its turn before one is tried again"
+
+
+def test_a_process_that_dies_takes_no_other_along() -> None:
+    with OwnProcesses(2) as executor:
+        dying, living = executor.submit(signal.raise_signal, signal.SIGKILL), executor.submit(os.getpid)
+        with pytest.raises(BrokenExecutor, match="killed"):
+            dying.result()
+        assert living.result() != executor.submit(os.getpid).result() != os.getpid()
+    slept: list[Future[None]] = []
+    with pytest.raises(KeyboardInterrupt), OwnProcesses(1) as executor:
+        slept += [executor.submit(time.sleep, 600) for _ in range(3)]
+        raise KeyboardInterrupt
+    assert all(future.done() for future in slept)
+
+
+def test_engines_that_are_not_there_are_said(logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = load_pipeline("default", QUICK)
+    with pytest.raises(SettingsError, match="Engines: local, ray"):
+        run_batch(logs, tmp_path / "map", pipeline, engine="slurm")
+    with pytest.raises(SettingsError, match="Add --engine ray"):
+        run_batch(logs, tmp_path / "map", pipeline, address="10.0.0.1:6379")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SettingsError, match=r"pip install 'vplog\[ray\]'"):
+        run_batch(logs, tmp_path / "map", pipeline, engine="ray")

@@ -15,6 +15,7 @@ from tests.benchmarks.discovery import discovery
 from tests.benchmarks.images import Images
 from tests.benchmarks.measure import Figure, Turns
 from tests.benchmarks.mining import describing, mining
+from tests.benchmarks.scale import scale
 from tests.benchmarks.search import BEST, growth, is_exact, make_index, make_places, make_queries, search
 from tests.places.pictures import texture
 from vplog.features.sift import SiftSettings
@@ -56,6 +57,15 @@ def test_search_and_growth() -> None:
     assert len(figures) == 4
     assert all(figure.facts["exact"] for figure in figures)
     assert [figure.facts["places"] for figure in growth((500, 1000), BobbSettings(), queries=2)] == [500, 1000]
+
+
+def test_scale(tmp_path: Path) -> None:
+    """On a map of two drives, made once."""
+    for graphs in (False, True):
+        figures = list(scale(3000, tmp_path, queries=4, threads=2, graphs=graphs))
+        assert len(figures) == 3 + 2 * graphs
+        assert figures[0].facts["drives"] == 2
+        assert figures[1].facts["exact"] is True
 
 
 @pytest.mark.parametrize("pairing", ["both", "best", "same"])

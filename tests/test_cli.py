@@ -281,7 +281,7 @@ def test_a_log_that_cannot_be_run_is_one_line(
     log = make(tmp_path, drive.log)
     error = verb("run", log, "-o", tmp_path / "run", *QUICK).error
     assert why in error
-    assert not (tmp_path / "run" / ".features").exists()
+    assert not (tmp_path / "run" / ".cache").exists()
     if (tmp_path / "run" / "run.json").exists():
         assert record_of(tmp_path / "run")["finished"] is False
 
@@ -371,7 +371,6 @@ def test_a_library_that_cannot_be_used_is_one_line(
     changed = ("--set", "places.references=3") if damage == "other settings" else ()
     error = verb("run", drive.log, "-o", tmp_path / "run", "--library", library, *QUICK, *changed).error
     assert str(library) in error
-    assert not (tmp_path / "run" / ".features").exists()
     if "table" not in damage:
         assert not (tmp_path / "run").exists(), "told before the run began"
 
@@ -504,14 +503,19 @@ def test_standing_still_all_the_time_is_said(verb: Verb, drive: Drive, tmp_path:
 
 
 def begun(drive: Drive, out: Path) -> subprocess.Popen[str]:
-    """A run that has begun to store features."""
-
-    def heed_interrupts() -> None:  # a shell that starts the tests in the background has them ignored
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-    process = started("run", drive.log, "-o", out, *QUICK, "--threads", 1, preexec_fn=heed_interrupts)
-    scratch = out / ".features"
-    while not (scratch.exists() and scratch.stat().st_size):
+    """A run that has begun to keep what it comes to."""
+    code = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that starts the tests in the background ignores it
+from vplog import cli, parts
+parts.PART_KEYFRAMES = 4  # the first is soon there
+cli.main()
+"""
+    told = ["run", str(drive.log), "-o", str(out), *QUICK, "--threads", "1"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *told], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while not list(out.glob(".cache/*.stage")):
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
     return process
@@ -525,7 +529,8 @@ def test_interrupted_in_the_middle(drive: Drive, tmp_path: Path) -> None:
     assert err.startswith("vplog: interrupted")
     assert len(err.splitlines()) == 1, err
     assert record_of(tmp_path / "run")["finished"] is False
-    assert [path.name for path in (tmp_path / "run").iterdir()] == ["run.json"]
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {".cache", "run.json"}
+    assert not list((tmp_path / "run").rglob("*.part"))
 
 
 def test_killed_in_the_middle_and_run_again(verb: Verb, drive: Drive, tmp_path: Path) -> None:
@@ -534,7 +539,7 @@ def test_killed_in_the_middle_and_run_again(verb: Verb, drive: Drive, tmp_path: 
     process.communicate(timeout=60)
     assert "did not finish" in verb("evaluate", tmp_path / "run", "--truth", drive.truth).error
     assert run_quick(verb, drive.log, tmp_path / "run")["finished"] is True
-    assert not [path.name for path in (tmp_path / "run").rglob(".*")]
+    assert [path.name for path in (tmp_path / "run").rglob(".*")] == [".cache"]
     assert verb("evaluate", tmp_path / "run", "--truth", drive.truth, "--json").json["ate_after"]["count"] > 0
 
 
@@ -550,7 +555,7 @@ def test_a_full_disk_is_one_line(drive: Drive, tmp_path: Path, limit: int) -> No
     assert (process.returncode, out) == (1, "")
     assert err.startswith("vplog: error: Cannot")
     assert len(err.splitlines()) == 1, err
-    assert not (tmp_path / "run" / ".features").exists()
+    assert not list((tmp_path / "run").rglob("*.part"))
     if (tmp_path / "run" / "run.json").exists():
         assert record_of(tmp_path / "run")["finished"] is False
 

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import shutil
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs, record
-from vplog.batch_worker import Task, in_process
-from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
+from vplog.batch_library import map_library
+from vplog.batch_worker import Task, made_by
+from vplog.engine import RETRIES, computed, opened
+from vplog.errors import ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.pipeline import build_library, check_library
-from vplog.references import PAPER_SIZE
+from vplog.maps.join import join as join_drives
+from vplog.maps.layout import folder_name
+from vplog.remote import RemotePath
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from vplog.batch_worker import Outcome
+    from vplog.engine import Engine
     from vplog.logs import TopicChoice
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
 
     Progress = Callable[[str, int, int], None]
+
+_FREE_BYTES = 10**10
+"""Of the map's disk that stay free of what would only be quicker to have: what a drive of several hours needs while it
+is computed, at 0.3 MB a keyframe."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +47,14 @@ class Drive:
     log: str
     state: str
     """`computed`, `unchanged` or `failed`."""
+    attempts: int = 0
+    """How often it was begun; 0 where nothing was to be done, or could be."""
     seconds: float = 0.0
-    """Wall time of computing it, process and all; 0 where it was not computed."""
+    """Wall time of the last attempt, in the worker; 0 where there was none, or where the worker died."""
+    worker: str = ""
+    """Machine and process of that attempt."""
+    peak_memory_mb: float = 0.0
+    """Largest resident memory of that process, in MB (10^6 bytes)."""
     error: str = ""
     """One line, of a drive that failed."""
 
@@ -50,24 +65,37 @@ def run_batch(
     pipeline: Pipeline,
     library: Path | None = None,
     topics: TopicChoice | None = None,
-    jobs: int = 1,
+    jobs: int | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    *,
+    engine: str = "local",
+    address: str | None = None,
+    retries: int = RETRIES,
+    join: bool = True,
+    keep_cache: bool = False,
 ) -> dict[str, Any]:
     """Drives in, a map in `root` out: what of it is missing or made from something else is computed, `jobs` at once.
 
-    `threads` are shared by the jobs; results do not depend on either. Without `library` the map's own is used, or one
-    is built from the first logs. A drive that fails is recorded and stops no other; every log's fate is in the answer.
+    On this machine `threads` are shared by the jobs, of which there is one unless told. The engine `ray` takes the
+    cluster at `address`, or one of this machine with so many threads; without `jobs` as many drives as it has cores
+    for. Results depend on none of this. Without `library` the map's own is used, or one is built from the first logs.
+    A drive whose worker dies is tried again, `retries` times; one that fails is recorded and stops no other; every
+    log's fate is in the answer. At the end closures `join` what the map then has (vplog/maps/join.py). With
+    `keep_cache` what the stages came to stays in MAP/.cache, so that other settings do not need the images again.
     Raises VplogError where the map as a whole cannot be written or does not fit the library or the settings.
     """
     topics = topics or logs.TopicChoice()
     began = time.perf_counter()
-    given = [str(path.resolve()) for path in paths]
+    given = [_place(path) for path in paths]
     twice = [log for log, count in Counter(given).items() if count > 1]
     if twice:
         raise SettingsError(f"{twice[0]} is given twice. Give each log once.")
-    with map_store.writing(root) as store:
-        digest = _library(store, paths, library, pipeline, topics, threads, progress)
+    with (
+        map_store.writing(root) as store,
+        opened(engine, address, jobs, threads, store.staging) as workers,
+    ):
+        digest = map_library(store, paths, library, pipeline, topics, threads, progress)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
         inputs, errors = _hashed(paths, topics, threads)
@@ -84,35 +112,66 @@ def run_batch(
                 done[drive] = Drive(drive, log, "failed", error=errors[log])
             else:
                 made = store.staging / f"{os.getpid()}-{len(tasks)}"
-                tasks.append(Task(drive, log, made, store.library(digest), pipeline, topics, 1, about))
-        each = max(threads // max(min(jobs, len(tasks)), 1), 1)
+                place = (made, store.library(digest))
+                tasks.append(Task(drive, log, *place, pipeline, topics, 1, about, _cache(store, drive)))
+        each = _threads_each(workers, jobs, len(tasks))
+        at_once = jobs or workers.at_once(each)
         failures = {drive: told for drive, told in store.failures().items() if drive not in set(drives)}
-        with ThreadPoolExecutor(jobs) as pool:  # a thread per job, which waits for the process of its drive
-            waiting = [pool.submit(in_process, replace(task, threads=each)) for task in tasks]
-            try:
-                for future in as_completed(waiting):
-                    found = _put_in(store, *future.result())
-                    done[found.drive] = found
-                    progress("drives", len(done), len(paths))
-            except BaseException:
-                for future in waiting:
-                    future.cancel()
-                for child in multiprocessing.active_children():
-                    child.terminate()
-                raise
-        failures |= {one.drive: {"log": one.log, "error": one.error} for one in done.values() if one.state == "failed"}
-        if failures or (root / "failures.json").exists():
+        progress("drives", len(done), len(paths))
+        tasks = [replace(task, threads=each, keep_cache=join or keep_cache) for task in tasks]
+        for ended in computed(workers, tasks, jobs, retries):
+            found = _put_in(store, *ended)
+            if found.state == "computed" and not ((join or keep_cache) and _has_room(store)):
+                shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
+            done[found.drive] = found
+            progress("drives", len(done), len(paths))
+        failures |= {
+            one.drive: {"log": one.log, "error": one.error, "attempts": one.attempts}
+            for one in done.values()
+            if one.state == "failed"
+        }
+        if failures or (store.root / "failures.json").exists():
             store.write_failures(failures)
+        joined = None
+        if join:
+            joined = join_drives(store, pipeline, workers.helpers(threads), threads, progress)
+        for drive in () if keep_cache else store.drives():
+            shutil.rmtree(_cache(store, drive), ignore_errors=True)
+        with suppress(OSError):  # not empty: what failed goes on there another time
+            _cache(store, "").parent.rmdir()
     fate = [done[drive] for drive in drives]
     return {
         "map": str(root),
         "library": digest,
-        "jobs": jobs,
+        "engine": engine,
+        "jobs": at_once,
         "threads_per_job": each,
         "seconds": round(time.perf_counter() - began, 3),
         "failed": sum(one.state == "failed" for one in fate),
-        "drives": [vars(one) for one in fate],
+        "drives": [asdict(one) for one in fate],
+        "joined": joined,
     }
+
+
+def _cache(store: Store, drive: str) -> Path:
+    """Where a drive's stages are kept until it is in the map."""
+    return store.root / ".cache" / folder_name(drive)
+
+
+def _has_room(store: Store) -> bool:
+    """Whether features of finished drives may stay until these are joined; they can be computed again."""
+    return shutil.disk_usage(store.root).free > _FREE_BYTES
+
+
+def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
+    """Of each drive: its share of the cores, as far as one machine has them. Without `jobs` no drive waits for one."""
+    at_once = min(jobs or max(workers.at_once(1), 1), max(drives, 1))
+    return min(max(workers.cores // at_once, 1), workers.widest)
+
+
+def _place(path: Path) -> str:
+    """Where a log is, from any folder; by the name given, whatever that is a link to."""
+    return str(path) if isinstance(path, RemotePath) else str(path.absolute())
 
 
 def _name(path: Path) -> str:
@@ -120,60 +179,6 @@ def _name(path: Path) -> str:
     if path.is_dir():
         return path.name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
-
-
-def _library(
-    store: Store, paths: Sequence[Path], given: Path | None, pipeline: Pipeline, topics: TopicChoice, threads: int,
-    progress: Progress,
-) -> str:  # fmt: skip
-    """The hash of the map's library, which is put into the map where it has none yet.
-
-    Raises LibraryError where another one is given, or where the settings describe places otherwise.
-    """
-    settings = pipeline.model_dump(mode="json")
-    if not (store.root / "map.json").exists():
-        store.write_head(map_store.Head(None, settings))
-    known = store.head().library
-    if known is not None and not store.library(known).is_dir():
-        raise LibraryError(f"{store.root} has lost its library {known[:12]}. Make the map anew in another folder.")
-    made = store.staging / "library"
-    if given is not None:
-        check_library(given, pipeline)
-        digest = pipeline.places.load(given, threads).hash
-        if known not in (None, digest):
-            raise LibraryError(
-                f"{given} has hash {digest[:12]}, and the places of {store.root} are described with library "
-                f"{known[:12]}: they would not compare. Leave --library out, or make another map."
-            )
-        if known is None:
-            shutil.copytree(given, made)
-    elif known is None:
-        digest = build_library(_that_can_be_read(paths, topics), made, pipeline, topics, threads, progress).hash
-    else:
-        check_library(store.library(known), pipeline)
-        digest = known
-    if known is None:
-        map_store.add_library(store, made, digest)
-    return digest
-
-
-def _that_can_be_read(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
-    """The first logs, as many as a library has references, without those that tell no frames: their own run says why.
-
-    Raises LogError of the first where none has any.
-    """
-    sound, first = [], None
-    for path in paths:
-        try:
-            if len(logs.open(path, topics).stamps()):
-                sound.append(path)
-        except VplogError as error:
-            first = first or error
-        if len(sound) == PAPER_SIZE:
-            break
-    if not sound:
-        raise first or LibraryError("None of the logs has a frame, so there is nothing to build a library from.")
-    return sound
 
 
 def _hashed(paths: Sequence[Path], topics: TopicChoice, threads: int) -> tuple[list[Any], dict[str, str]]:
@@ -189,9 +194,7 @@ def _hashed(paths: Sequence[Path], topics: TopicChoice, threads: int) -> tuple[l
 
     with ThreadPoolExecutor(threads) as pool:
         answers = list(pool.map(hashes, paths))
-    errors = {
-        str(path.resolve()): answer for path, answer in zip(paths, answers, strict=True) if isinstance(answer, str)
-    }
+    errors = {_place(path): answer for path, answer in zip(paths, answers, strict=True) if isinstance(answer, str)}
     return [{} if isinstance(answer, str) else answer for answer in answers], errors
 
 
@@ -204,13 +207,13 @@ def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, A
         "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file"}),
         "settings": keys.key_of(pipeline.model_dump(mode="json")),
         "library": library,
-        "code": keys.code_hash(),
-        "versions": record.head(pipeline, Path(), 1)["versions"],
+        **made_by(),
     }
 
 
-def _put_in(store: Store, task: Task, seconds: float, error: str) -> Drive:
+def _put_in(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
     """Rename a finished drive in."""
+    error = outcome.error
     if not error:
         try:
             map_store.publish(store, task.drive, task.folder)
@@ -218,4 +221,5 @@ def _put_in(store: Store, task: Task, seconds: float, error: str) -> Drive:
             error = str(problem)
     if error:
         shutil.rmtree(task.folder, ignore_errors=True)
-    return Drive(task.drive, task.log, "failed" if error else "computed", seconds, error)
+    told = (outcome.seconds, outcome.worker, outcome.peak_memory_mb, error)
+    return Drive(task.drive, task.log, "failed" if error else "computed", attempts, *told)

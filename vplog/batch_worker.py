@@ -1,28 +1,25 @@
-"""One drive of a batch, computed in a process of its own."""
+"""One drive of a batch, computed by a worker: what it is told, and what it tells."""
 
 from __future__ import annotations
 
-import json
-import multiprocessing
 import os
-import signal
-import threading
+import platform
 import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vplog import record
 from vplog.errors import VplogError
+from vplog.maps import keys
+from vplog.pipeline import Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.remote import located
-from vplog.results import run_record, tables
+from vplog.results import run_record
+from vplog.timing import peak_memory_mb
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.logs import TopicChoice
-    from vplog.pipeline import Pipeline
 
 
 @dataclass(frozen=True)
@@ -39,56 +36,57 @@ class Task:
     threads: int
     about: dict[str, Any]
     """drive.json: what the drive is made from."""
+    cache: Path | None = None
+    """Where what an attempt had done stays when it ends before its time; None to keep nothing."""
+    keep_cache: bool = False
+    """Whether that is wanted of a drive that is finished, too."""
 
 
-def in_process(task: Task) -> tuple[Task, float, str]:
-    """Compute a drive in a process of its own: memory is given back, and one that dies takes no other along."""
-    began, error = time.perf_counter(), ""
-    context = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(1, context, _end_with_parent) as pool:
-            error = pool.submit(compute_drive, task).result()
-    except BrokenProcessPool:
-        error = "Its process was killed, as for want of memory. Use fewer --jobs, and run again."
-    return task, round(time.perf_counter() - began, 3), error
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt at a drive ended."""
+
+    error: str = ""
+    """One line; none where all went well."""
+    may_pass: bool = False
+    """Whether the cause of the error may be gone at another attempt."""
+    seconds: float = 0.0
+    """Wall time in the worker."""
+    worker: str = ""
+    """Machine and process; none of a worker that died."""
+    peak_memory_mb: float = 0.0
+    """Largest resident memory of the worker, in MB (10^6 bytes); 0 where unknown."""
 
 
-def _end_with_parent() -> None:
-    """A worker whose batch was killed must not go on beside the next one."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    threading.Thread(target=watch, daemon=True).start()
+def made_by() -> dict[str, Any]:
+    """Code and packages of this machine, as drive.json has them: a drive is computed where they are the batch's."""
+    return {"code": keys.code_hash(), "versions": record.head(Pipeline(), Path(), 1)["versions"]}
 
 
-def compute_drive(task: Task) -> str:
+def compute_drive(task: Task) -> Outcome:
     """Make the run folder of a drive, drive.json last; why not, in one line, where that fails."""
+    began, error, may_pass, peak = time.perf_counter(), "", False, 0.0
     try:
         log = located(task.log)
-        done = run_alone(log, task.folder, task.pipeline, task.library, task.topics, task.threads)
+        done = run_alone(
+            log, task.folder, task.pipeline, task.library, task.topics, task.threads, cache=task.cache,
+            use_cache=task.cache is not None,
+        )  # fmt: skip
+        peak = done.record["totals"]["peak_memory_mb"]
         if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):
-            return f"{task.log} changed while it was read. Run again."
-        if done.keyframes.drive != task.drive:
-            _rename(task.folder / "keyframes.parquet", task.drive)
-        run_record.write_run_json(task.folder / "drive.json", task.about)
-    except VplogError as error:
-        return str(error)
+            error = f"{task.log} changed while it was read. Run again."
+        else:
+            if done.keyframes.drive != task.drive:
+                keys.name_keyframes(task.folder / "keyframes.parquet", task.drive)
+            run_record.write_run_json(task.folder / "drive.json", task.about)
+    except VplogError as problem:
+        error = str(problem)
     except MemoryError:
-        return "Out of memory. Use fewer --jobs."
-    except OSError as error:
-        return f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}."
-    except Exception as error:  # a fault of ours in one drive must not stop the others
-        return f"Internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}. `vplog run` shows more."
-    return ""
-
-
-def _rename(path: Path, drive: str) -> None:
-    """Give the keyframes the drive's name in the map, where another log has that of its own."""
-    header = tables.read_metadata(path)
-    keyframes, world_from_body = tables.read_keyframes(path)
-    about = tables.TableMetadata(json.loads(header["vplog.settings"]), header["vplog.library"])
-    tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about)
+        error, may_pass = "Out of memory. Use fewer --jobs.", True
+    except OSError as problem:
+        error = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}."
+    except Exception as problem:  # a fault of ours in one drive must not stop the others
+        text = " ".join(str(problem).split())[:200]
+        error = f"Internal error: {type(problem).__name__}: {text}. `vplog run` shows more."
+    seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
+    return Outcome(error, may_pass, seconds, worker, max(peak, round(peak_memory_mb(), 1)))

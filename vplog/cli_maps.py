@@ -2,37 +2,104 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import at_least_one, local, pipeline_of, place, topics_of
-from vplog.cli_print import Progress, print_answers, print_batch, print_json, print_map
+from vplog.cli_options import at_least, at_least_one, pipeline_of, place, topics_of
+from vplog.cli_print import (
+    Progress,
+    print_answers,
+    print_batch,
+    print_export,
+    print_joined,
+    print_json,
+    print_map,
+    print_merge,
+    print_redescribed,
+    say,
+)
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable
 
 
 def export_map(arguments: argparse.Namespace) -> None:
-    """The places of one run or many, in one Parquet file."""
-    from vplog.export import export_map as write_map
+    """The places of a map or of runs in one Parquet file: all, those of some drives, or those in a box on earth."""
+    from vplog.maps.export import export_map as write_map
 
-    found = write_map(arguments.runs, arguments.output)
+    with Progress(arguments) as progress:
+        found = write_map(
+            arguments.sources, arguments.output, arguments.drive, arguments.box, arguments.format, progress
+        )
     if arguments.json:
         print_json(found)
     else:
-        print(f"{found['map']}: {found['places']} places of {len(found['drives'])} drives")
+        print_export(found)
+
+
+def merge_maps(arguments: argparse.Namespace) -> None:
+    """Take the drives of maps into another map that has the same library."""
+    from vplog.maps.merge import merge_maps as merge
+
+    with Progress(arguments) as progress:
+        found = merge(arguments.maps, arguments.target, progress)
+    if arguments.json:
+        print_json(found)
+    else:
+        print_merge(found)
+
+
+def join_map(arguments: argparse.Namespace) -> None:
+    """Find closures between the drives of a map and solve those that they join, as a batch does at its end."""
+    from vplog.maps.join import join_map as join
+
+    with Progress(arguments) as progress:
+        found = join(arguments.map, arguments.threads, progress)
+    if arguments.json:
+        print_json(found)
+    else:
+        print_joined(found)
+
+
+def remove_drives(arguments: argparse.Namespace) -> None:
+    """Take drives out of a map, as removing their folders does."""
+    from vplog.maps.remove import remove_drives as remove
+
+    found = remove(arguments.map, arguments.drives)
+    if arguments.json:
+        print_json(found)
+    else:
+        print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
+
+
+def redescribe_map(arguments: argparse.Namespace) -> None:
+    """The drives of a map in another map, described with another library; their logs are read again."""
+    from vplog.errors import ResultError
+    from vplog.redescribe import redescribe_map as redescribe
+
+    with Progress(arguments) as progress:
+        found = redescribe(
+            arguments.map, arguments.library, arguments.target, arguments.jobs, arguments.threads, progress
+        )
+    if arguments.json:
+        print_json(found)
+    else:
+        print_redescribed(found)
+    if found["failed"]:
+        raise ResultError(f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}.")
 
 
 def batch(arguments: argparse.Namespace) -> None:
-    """Many recorded drives to one map that grows, each drive in a process of its own."""
+    """Many recorded drives to one map that grows, each drive in a process of its own, here or over a Ray cluster."""
     from vplog.batch import run_batch
     from vplog.errors import ResultError
 
     with Progress(arguments) as progress:
         found = run_batch(
             arguments.logs, arguments.map, pipeline_of(arguments), arguments.library, topics_of(arguments),
-            arguments.jobs, arguments.threads, progress,
+            arguments.jobs, arguments.threads, progress, engine=arguments.engine, address=arguments.address,
+            retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
         )  # fmt: skip
     if arguments.json:
         print_json(found)
@@ -56,18 +123,38 @@ def info_map(arguments: argparse.Namespace) -> None:
 
 
 def query_map(arguments: argparse.Namespace) -> None:
-    """The places of a map that are most like each view of a log."""
+    """The places of a map that are most like each view of a log, searched here or by the workers of a Ray cluster."""
+    from vplog.engine import opened
     from vplog.maps.query import query_map as find_places
 
-    with Progress(arguments) as progress:
-        found = find_places(
-            arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence, arguments.output,
-            arguments.threads, progress,
-        )  # fmt: skip
+    with opened(arguments.engine, arguments.address, None, arguments.threads) as engine:
+        workers = engine.executor if arguments.engine == "ray" else None
+        with Progress(arguments) as progress:
+            found = find_places(
+                arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
+                arguments.output, arguments.threads, progress, workers,
+            )  # fmt: skip
     if arguments.json:
         print_json(found)
     else:
         print_answers(found)
+
+
+def index_map(arguments: argparse.Namespace) -> None:
+    """Bring the index of a map up to its drives, as the next query would: it is what queries search."""
+    from vplog.maps.query import index_map as update
+
+    with Progress(arguments) as progress:
+        found = update(arguments.map, arguments.threads, progress)
+    if arguments.json:
+        print_json(found)
+    else:
+        print(
+            f"{found['map']}: {found['places']} places of {len(found['drives'])} drives in {len(found['segments'])} "
+            f"files, {found['bytes'] / 1e6:.1f} MB"
+        )
+        for warning in found["warnings"]:
+            say(f"warning: {warning}")
 
 
 def add_maps(
@@ -79,28 +166,89 @@ def add_maps(
     maps = add("map", info_map).add_subparsers(required=True, metavar="VERB")
     sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
     sub.set_defaults(verb=info_map)
-    sub.add_argument("map", type=local, metavar="MAP")
+    sub.add_argument("map", type=place, metavar="MAP")
     text = "where a log's views are in a map"
     sub = maps.add_parser("query", help=text, description=query_map.__doc__, parents=[common, topics, threads])
     sub.set_defaults(verb=query_map)
-    sub.add_argument("map", type=local, metavar="MAP")
+    sub.add_argument("map", type=place, metavar="MAP")
     sub.add_argument("log", type=place, metavar="LOG")
     sub.add_argument("--top", type=at_least_one, default=10, metavar="K", help="places for each view (default: 10)")
     sub.add_argument(
         "--sequence", type=at_least_one, metavar="L", help="views in a window, odd; 1: none (default: as the map's)"
     )
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.parquet", help="write the answers")
-    text = "the places of one run or many, in one file"
+    text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
+    sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
+    sub.add_argument("--address", metavar="HOST:PORT", help="Ray cluster (default: one of this machine's cores)")
+    text = "make what queries search"
+    sub = maps.add_parser("index", help=text, description=index_map.__doc__, parents=[common, threads])
+    sub.set_defaults(verb=index_map)
+    sub.add_argument("map", type=place, metavar="MAP")
+    _add_export(maps, common)
+    text = "take the drives of maps into another map"
+    sub = maps.add_parser("merge", help=text, description=merge_maps.__doc__, parents=[common])
+    sub.set_defaults(verb=merge_maps)
+    sub.add_argument("maps", type=place, nargs="+", metavar="MAP")
+    sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP", help="map that they go to")
+    text = "what joins the drives of a map"
+    sub = maps.add_parser("join", help=text, description=join_map.__doc__, parents=[common, threads])
+    sub.set_defaults(verb=join_map)
+    sub.add_argument("map", type=place, metavar="MAP")
+    sub = maps.add_parser("remove", help="take drives out", description=remove_drives.__doc__, parents=[common])
+    sub.set_defaults(verb=remove_drives)
+    sub.add_argument("map", type=place, metavar="MAP")
+    sub.add_argument("drives", nargs="+", metavar="DRIVE", help="as `map info` names them")
+    text = "a map anew with another library"
+    sub = maps.add_parser("redescribe", help=text, description=redescribe_map.__doc__, parents=[common, threads])
+    sub.set_defaults(verb=redescribe_map)
+    sub.add_argument("map", type=place, metavar="MAP")
+    text = "the library, or a log to make one from"
+    sub.add_argument("--library", type=place, required=True, metavar="LIB|LOG", help=text)
+    sub.add_argument("--jobs", type=at_least_one, metavar="N", help="drives at once (default: 1)")
+    sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP2", help="the new map")
+
+
+def _add_export(maps: argparse._SubParsersAction[argparse.ArgumentParser], common: argparse.ArgumentParser) -> None:
+    text = "the places of a map or of runs, in one file"
     sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
     sub.set_defaults(verb=export_map)
-    sub.add_argument("runs", type=place, nargs="+", metavar="RUN")
+    sub.add_argument("sources", type=place, nargs="+", metavar="MAP|RUN")
+    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="of a map; may be given again")
+    sub.add_argument(
+        "--box", type=_box, metavar="LAT0,LON0,LAT1,LON1",
+        help="places in it alone, in degrees; LON0 beyond LON1 crosses the antimeridian (write --box=-33.9,...)",
+    )  # fmt: skip
+    sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.parquet", help="file to write")
+
+
+def _box(text: str) -> tuple[float, float, float, float]:
+    try:
+        south, west, north, east = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError("must be four numbers, LAT0,LON0,LAT1,LON1") from None
+    if not -90 <= south <= north <= 90:
+        raise argparse.ArgumentTypeError("must have LAT0 <= LAT1 within -90..90")
+    if not (-180 <= west <= 180 and -180 <= east <= 180):
+        raise argparse.ArgumentTypeError("must have LON0 and LON1 within -180..180")
+    return south, west, north, east
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="a drive each")
-    sub.add_argument("-o", "--map", type=local, required=True, metavar="MAP", help="folder of the map")
-    sub.add_argument("--jobs", type=at_least_one, default=1, metavar="N", help="drives at once (default: 1)")
+    sub.add_argument("-o", "--map", type=place, required=True, metavar="MAP", help="folder or s3:// of the map")
+    text = "drives at once (default: 1; over Ray as many as the cluster has cores for)"
+    sub.add_argument("--jobs", type=at_least_one, metavar="N", help=text)
+    text = "processes of this machine, or tasks of a Ray cluster (default: local)"
+    sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
+    text = "the Ray cluster, as `ray start` says it, or auto (default: one of this machine for the time of the batch)"
+    sub.add_argument("--address", metavar="HOST:PORT", help=text)
+    text = "more attempts at a drive whose worker was killed (default: 2)"
+    sub.add_argument("--retries", type=at_least(0), default=2, metavar="N", help=text)
+    text = "do not look for closures between the drives at the end"
+    sub.add_argument("--no-join", dest="join", action="store_false", help=text)
+    text = "keep what the stages came to, about 0.3 MB a keyframe: other settings then need the images no more"
+    sub.add_argument("--keep-cache", action="store_true", help=text)
     sub.add_argument(
         "--library", type=place, metavar="LIB", help="reference library (default: the map's, or one of the logs)"
     )

@@ -135,21 +135,32 @@ def print_optimised(found: dict[str, Any]) -> None:
     print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
+_BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
+"""What the table of a batch tells of each drive, with its decimals."""
+
+
 def print_batch(found: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
     table = Table("drive", "state", box=None, pad_edge=False)
-    table.add_column("seconds", justify="right")
+    for title in ("attempts", "seconds", "peak MB"):
+        table.add_column(title, justify="right")
+    table.add_column("worker")
     table.add_column("error", overflow="fold")
     for drive in found["drives"]:
-        seconds = f"{drive['seconds']:.1f}" if drive["seconds"] else ""
-        table.add_row(escape(drive["drive"]), drive["state"], seconds, escape(drive["error"]))
+        counts = [str(drive["attempts"] or "")]
+        counts += [f"{drive[name]:.{digits}f}" if drive[name] else "" for name, digits in _BATCH_COSTS]
+        table.add_row(escape(drive["drive"]), drive["state"], *counts, escape(drive["worker"]), escape(drive["error"]))
     console(sys.stdout).print(table)
     print(
         f"{found['map']}: {len(found['drives'])} drives, {found['failed']} failed, {found['seconds']:.1f} s, "
         f"{found['jobs']} at once, {found['threads_per_job']} threads each"
     )
+    for component in (found["joined"] or {}).get("components", []):
+        print(f"together  {', '.join(component['drives'])}")
+    for warning in (found["joined"] or {}).get("warnings", []):
+        say(f"warning: {warning}")
 
 
 def print_map(found: dict[str, Any]) -> None:
@@ -162,6 +173,10 @@ def print_map(found: dict[str, Any]) -> None:
         f"{found['map']}: {len(found['drives'])} drives, {found['places']} places{each}, {found['bytes'] / 1e6:.1f} MB"
     )
     print(f"library   {known['hash'] or 'none yet'}, {known['references'] or 0} references")
+    print(f"on earth  {found['on_earth']} of {len(found['drives'])} drives")
+    if found["components"] is not None:
+        joined = sum(len(one["drives"]) for one in found["components"])
+        print(f"joined    {joined} drives in {len(found['components'])} frames of several")
     table = Table("drive", box=None, pad_edge=False)
     for title in ("keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"):
         table.add_column(title, justify="right")
@@ -174,6 +189,37 @@ def print_map(found: dict[str, Any]) -> None:
         say(f"failed: {drive}: {failure['error']}")
     for problem in found["problems"]:
         say(f"warning: {problem}")
+
+
+def print_export(found: dict[str, Any]) -> None:
+    for drive in found.get("left_out", ()):
+        say(f"warning: {drive} is left out: it has no place on earth, as its log has no three satellite fixes.")
+    print(f"{found['map']}: {found['places']} places of {len(found['drives'])} drives")
+
+
+def print_joined(found: dict[str, Any]) -> None:
+    print(f"{found['map']}: {found['pairs']} pairs of drives looked at, {found['pairs_computed']} of them now")
+    for component in found["components"]:
+        print(f"together   {', '.join(component['drives'])}, in joint/{component['folder']}")
+    if found["alone"]:
+        print(f"alone      {', '.join(found['alone'])}")
+    for warning in found["warnings"]:
+        say(f"warning: {warning}")
+
+
+def print_merge(found: dict[str, Any]) -> None:
+    for one in found["drives"]:
+        other = "" if one["as"] == one["drive"] else f" as {one['as']}"
+        print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
+    taken = sum(one["state"] == "taken" for one in found["drives"])
+    print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken. `vplog batch` finds what joins them.")
+
+
+def print_redescribed(found: dict[str, Any]) -> None:
+    for one in found["drives"]:
+        other = "" if one["was"] == one["drive"] else f", was {one['was']}"
+        print(f"{one['state']:10}{one['drive']}{other}{': ' if one['error'] else ''}{one['error']}")
+    print(f"{found['map']}: {len(found['drives']) - found['failed']} drives, library {found['library']}")
 
 
 def print_answers(found: dict[str, Any]) -> None:

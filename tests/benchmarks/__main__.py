@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks [mining describe discovery search growth graphs reading] [--json]`, from the top.
+"""`python -m tests.benchmarks [WHAT...] [--json]`, from the top; `--help` lists what there is.
 
 Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
 """
@@ -10,17 +10,22 @@ import json
 import os
 import platform
 import sys
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.pipeline import load_pipeline, pipeline_folder
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 
+from .batch import PARTS, batch
 from .discovery import discovery
 from .graphs import graphs
 from .images import drives
+from .large_graphs import large
 from .mining import describing, mining
 from .reading import LARGE_GB, SMALL_GB, reading
+from .scale import scale
 from .search import free_memory_gb, growth, search
 
 if TYPE_CHECKING:
@@ -41,6 +46,8 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
+LONG = {"large", "batch"}
+"""What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
 
@@ -62,19 +69,26 @@ def main() -> int:
 
 
 def _arguments() -> argparse.Namespace:
-    kinds = ("mining", "describe", "discovery", "search", "growth", "graphs", "reading")
+    kinds = ("mining", "describe", "discovery", "search", "growth", "scale", "graphs", "reading", "large", "batch")
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
-    parser.add_argument("what", nargs="*", metavar="WHAT", help=f"of {', '.join(kinds)}; all where none is named")
+    named = f"of {', '.join(kinds)}; all but large and batch where none is named"
+    parser.add_argument("what", nargs="*", metavar="WHAT", help=named)
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")
     parser.add_argument("--images", type=int, default=20, help="images of each drive")
     parser.add_argument("--seeds", type=int, default=3, help="of the false closures put into pose graphs")
+    parser.add_argument("--poses", type=int, nargs="+", default=[100_000, 1_000_000], help="of the large pose graphs")
     parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
+    parser.add_argument("--folder", type=Path, help="keep the map of `scale` here (default: made anew, then removed)")
+    parser.add_argument("--vectors", action="store_true", help="`scale` beside graphs of codes and vectors, too")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=[], help="parts of `batch`")
+    parser.add_argument("--kills", type=int, default=10, help="of a batch, at random moments")
+    parser.add_argument("--set", nargs="+", default=[], metavar="A.B=C", help="settings of the drives of `batch`")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.what) - set(kinds))
     if unknown:
         parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(kinds)}")
-    arguments.what = arguments.what or list(kinds)
+    arguments.what = arguments.what or [kind for kind in kinds if kind not in LONG]
     return arguments
 
 
@@ -96,10 +110,23 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "growth" in what:
         possible = [size for size in SIZES if size < SIZES[-1] or free_memory_gb() >= LARGEST_NEEDS_GB]
         yield from growth(tuple(possible), BobbSettings(), 20)
+    if "scale" in what:
+        with tempfile.TemporaryDirectory() as made:
+            folder = arguments.folder or Path(made)
+            yield from scale(arguments.places, folder, 20, os.cpu_count() or 1, arguments.vectors)
     if "reading" in what:
         yield from reading(rounds, *READING_BARS, (SMALL_GB, LARGE_GB))
     if "graphs" in what:
         yield from graphs(arguments.seeds, rounds)
+    if what & LONG:
+        yield from _long(arguments)
+
+
+def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
+    if "large" in arguments.what:
+        yield from large(arguments.poses)
+    if "batch" in arguments.what:
+        yield from batch(arguments.only, arguments.kills, arguments.set)
 
 
 def _pipelines() -> Iterator[tuple[str, Pipeline]]:

@@ -1,0 +1,233 @@
+"""Batches of the real drives: the same bytes by every engine and after every kill, and what they take."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .measure import Figure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+PARTS = ("engines", "kill", "add", "cluster")
+"""What `--only` may name."""
+NAMES = ("gardens_day_left.mcap", "gardens_day_right.mcap", "gardens_night_right.mcap", "kitti00", "seven_scenes.bag")
+"""In the folder VPLOG_DATA / drives."""
+ADD_BAR = 1.2
+"""Time of a drive added to a finished map, to that of its own run."""
+CLUSTER_DRIVES = 20
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What every command of the benchmark has in common."""
+
+    logs: list[Path]
+    library: Path
+    folder: Path
+    options: list[str]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A command that has ended."""
+
+    told: dict[str, Any]
+    seconds: float
+    cpu_seconds: float
+    """Of it and all its processes that it waited for."""
+
+
+def batch(only: Sequence[str], kills: int, assignments: Sequence[str]) -> Iterator[Figure]:
+    """Figures of the parts named, of all where none is; nothing where there are no real drives."""
+    data = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[3] / "shared" / "data")) / "drives"
+    logs = [data / name for name in NAMES if (data / name).exists()]
+    if len(logs) < 2:
+        return
+    options = [option for one in assignments for option in ("--set", one)]
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "library"
+        command("library", *logs, "-o", library, *options)
+        setting = Setting(logs, library, Path(folder), options)
+        whole = Path(folder) / "jobs-1"
+        alone = make(setting, whole, logs, "--jobs", 1)
+        wanted = only or PARTS
+        if "engines" in wanted:
+            yield from engines(setting, whole, alone)
+        if "kill" in wanted:
+            yield killed(setting, whole, alone.seconds, kills)
+        if "add" in wanted:
+            yield from added(setting)
+        if "cluster" in wanted:
+            yield on_a_cluster(setting)
+
+
+def command(*arguments: object) -> Ended:
+    """A vplog verb with --json in a process of its own. Raises where it fails."""
+    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    line = [sys.executable, "-m", "vplog", *map(str, arguments), "--json"]
+    done = subprocess.run(line, stdout=subprocess.PIPE, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Ended(json.loads(done.stdout), round(time.perf_counter() - began, 1), round(cpu, 1))
+
+
+def make(setting: Setting, root: Path, logs: Sequence[Path], *more: object) -> Ended:
+    return command("batch", *logs, "-o", root, "--library", setting.library, *setting.options, *more)
+
+
+def files(root: Path, ending: str = "") -> dict[str, tuple[int, str]]:
+    """Inode and sha256 of every file with this ending that is not hidden, by name."""
+    return {
+        path.relative_to(root).as_posix(): (path.stat().st_ino, hashlib.sha256(path.read_bytes()).hexdigest())
+        for path in sorted(root.rglob(f"*{ending}"))
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)
+    }
+
+
+def differing(root: Path, whole: Path) -> list[str]:
+    """Names of the tables that only one of two maps has, or that are not the same in both."""
+    ours, theirs = ({name: text for name, (_, text) in files(at, ".parquet").items()} for at in (root, whole))
+    return sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
+
+
+def peaks(told: dict[str, Any]) -> dict[str, float]:
+    return {drive["drive"]: drive["peak_memory_mb"] for drive in told["drives"]}
+
+
+def engines(setting: Setting, whole: Path, alone: Ended) -> Iterator[Figure]:
+    """Tables that differ from those of one job."""
+    tables = len(files(whole, ".parquet"))
+    told = {"seconds": alone.seconds, "cpu_seconds": alone.cpu_seconds, "tables": tables, "peak_mb": peaks(alone.told)}
+    yield Figure("batch: --jobs 1", alone.seconds, None, True, told)
+    ways = {"--jobs 4": ("--jobs", 4), "--engine ray": ("--engine", "ray")}
+    for name, way in ways.items():
+        root = setting.folder / name.replace(" ", "")
+        done = make(setting, root, setting.logs, *way)
+        other = differing(root, whole)
+        facts = {"seconds": done.seconds, "to --jobs 1": round(done.seconds / alone.seconds, 3)}
+        facts |= {"peak_mb": peaks(done.told), "differing": other}
+        yield Figure(f"batch: {name}, tables that differ from --jobs 1", len(other), 0, True, facts)
+        shutil.rmtree(root)
+
+
+def killed(setting: Setting, whole: Path, seconds: float, kills: int) -> Figure:
+    """Kill -9 at moments from a seed, each before the whole would be done at the speed so far; then to the end."""
+    root, moments, chance = setting.folder / "killed", [], random.Random(kills)
+    line = [sys.executable, "-m", "vplog", "batch", *setting.logs, "-o", root, "--library", setting.library]
+    text = [str(part) for part in (*line, "--jobs", 2, *setting.options)]
+    for left in range(kills, 0, -1):
+        moment = chance.uniform(0, 2 * seconds / (left + 1) if left > 1 else seconds)
+        with subprocess.Popen(text, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+            try:
+                process.wait(moment)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGKILL)
+        state = "ended" if process.returncode == 0 else f"{len(list(root.glob('runs/*')))} drives in"
+        moments.append(f"{moment:.1f} s: {state}")
+    done = make(setting, root, setting.logs, "--jobs", 2)
+    other = differing(root, whole)
+    facts = {"kills": moments, "last_seconds": done.seconds, "differing": other}
+    shutil.rmtree(root)
+    return Figure(f"batch: tables that differ after {kills} kills", len(other), 0, True, facts)
+
+
+def added(setting: Setting) -> Iterator[Figure]:
+    """The last walk of the Gardens, or else the last drive, added to a map of the others; and run by itself."""
+    new = next((log for log in setting.logs if log.name == NAMES[2]), setting.logs[-1])
+    others = [log for log in setting.logs if log != new]
+    root, run = setting.folder / "grown", setting.folder / "run"
+    make(setting, root, others, "--jobs", 1)
+    before = files(root)
+    own = command("run", new, "-o", run, "--library", setting.library, *setting.options)
+    without = setting.folder / "grown-apart"
+    shutil.copytree(root, without)
+    apart = make(setting, without, [*others, new], "--jobs", 1, "--no-join")
+    grown = make(setting, root, [*others, new], "--jobs", 1)
+    after = files(root)
+    changed = sorted(name for name in before if name in after and before[name] != after[name])
+    gone = sorted(before.keys() - after.keys())
+    made = sorted(after.keys() - before.keys())
+    apart_from_it = [name for name in made if f"drive={new.stem}/" not in name]
+    facts = {"changed": changed, "gone": gone, "new_in_other_folders": apart_from_it, "new": len(made)}
+    yield Figure("batch: files of other drives that an added one changes", len(others_of(changed, new)), 0, True, facts)
+    facts = {"run_seconds": own.seconds, "run_cpu": own.cpu_seconds, "seconds": apart.seconds, "cpu": apart.cpu_seconds}
+    yield Figure("batch: a drive added, to its own run", apart.seconds / own.seconds, ADD_BAR, True, facts)
+    facts = {"seconds": grown.seconds, "cpu": grown.cpu_seconds, "joined": grown.told["joined"]["pairs"]}
+    yield Figure("batch: the same with closures between the drives", grown.seconds / own.seconds, None, True, facts)
+    for folder in (root, run, without):
+        shutil.rmtree(folder)
+
+
+def others_of(changed: Sequence[str], new: Path) -> list[str]:
+    """Of changed files those in the folders of other drives."""
+    return [name for name in changed if "drive=" in name and f"drive={new.stem}/" not in name]
+
+
+def on_a_cluster(setting: Setting) -> Figure:
+    """The drives under many names on two nodes that are processes of this machine, one worker killed at work."""
+    links, root = setting.folder / "links", setting.folder / "cluster"
+    links.mkdir()
+    for number in range(CLUSTER_DRIVES):
+        log = setting.logs[number % len(setting.logs)]
+        (links / f"drive{number:02d}{log.suffix}").symlink_to(log.resolve())
+    with two_nodes(setting.folder) as (address, place):
+        ended: list[int] = []
+        watch = threading.Thread(target=_kill_one, args=(place, ended), daemon=True)
+        watch.start()
+        done = make(setting, root, sorted(links.iterdir()), "--engine", "ray", "--address", address, "--no-join")
+        watch.join()
+    drives = done.told["drives"]
+    again = {one["drive"]: one["attempts"] for one in drives if one["attempts"] > 1}
+    facts = {"seconds": done.seconds, "tried again": again, "largest_peak_mb": max(peaks(done.told).values())}
+    facts["nodes"] = sorted({one["worker"].split(":")[0] for one in drives})
+    missing = sum(one["state"] != "computed" for one in drives)
+    shutil.rmtree(root)
+    return Figure(f"batch: drives of {CLUSTER_DRIVES} that a cluster lacks, a worker killed", missing, 0, True, facts)
+
+
+@contextmanager
+def two_nodes(folder: Path) -> Iterator[tuple[str, Path]]:
+    """A Ray cluster with half of the cores for each node; its address, and the temporary folder of its workers."""
+    from ray.cluster_utils import Cluster
+
+    place = folder / "nodes"
+    place.mkdir()
+    with tempfile.TemporaryDirectory(prefix="vray-", dir="/tmp", ignore_cleanup_errors=True) as short:
+        before = os.environ.get("RAY_TMPDIR")
+        os.environ["RAY_TMPDIR"] = short  # sockets need a short path
+        try:
+            cluster = Cluster()
+            for _ in range(2):
+                cores = max((os.cpu_count() or 2) // 2, 1)
+                cluster.add_node(num_cpus=cores, include_dashboard=False, env_vars={"TMPDIR": str(place)})
+            yield str(cluster.address), place
+            cluster.shutdown()
+        finally:
+            os.environ.pop("RAY_TMPDIR") if before is None else os.environ.update(RAY_TMPDIR=before)
+
+
+def _kill_one(place: Path, ended: list[int]) -> None:
+    """The first worker that is at work on a drive, some seconds later."""
+    while not ended:
+        for account in place.glob("vplog-*/run-*/run/run.json"):
+            time.sleep(3)
+            ended.append(int(account.parts[-3].split("-")[1]))
+            os.kill(ended[0], signal.SIGKILL)
+            return
+        time.sleep(0.05)

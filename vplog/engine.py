@@ -1,0 +1,198 @@
+"""Where the drives of a batch are computed: on this machine, each in a process of its own, or over a Ray cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from vplog.batch_worker import Outcome, Task, compute_drive
+from vplog.errors import SettingsError, VplogError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import Executor
+    from pathlib import Path
+
+    T = TypeVar("T")
+
+ENGINES = ("local", "ray")
+RETRIES = 2
+"""More attempts at a drive whose worker died: one that dies three times will most likely die again."""
+_TERMINATE_EVERY_S = 0.1
+"""A process that was just about to start is not there yet the first time."""
+
+
+class Engine(Protocol):
+    """An executor, and how the folder of a drive comes out of it."""
+
+    @property
+    def executor(self) -> Executor:
+        """submit(function, *arguments) runs a function of a module elsewhere. Its future raises BrokenExecutor, with
+        one line, where process or machine died, so that the same may end well another time."""
+        ...
+
+    @property
+    def cores(self) -> int:
+        """Of all machines together."""
+        ...
+
+    @property
+    def widest(self) -> int:
+        """Cores of the largest machine: one drive runs on one."""
+        ...
+
+    def at_once(self, threads: int) -> int:
+        """Drives with so many threads each that keep it busy."""
+        ...
+
+    def start(self, task: Task, cores: int) -> Future[Outcome]:
+        """Begin a drive, which may use so many cores."""
+        ...
+
+    def helpers(self, threads: int) -> Executor | None:
+        """For tasks of so many threads that read and write the map; None where they are done here as fast."""
+        ...
+
+    def take(self, task: Task, outcome: Outcome) -> None:
+        """Have the finished run folder in `task.folder`. Raises BrokenExecutor where it is lost, ResultError."""
+        ...
+
+
+@contextmanager
+def opened(
+    name: str, address: str | None, jobs: int | None, threads: int, folder: Path | None = None
+) -> Iterator[Engine]:
+    """The engine of this name, for a writer of a map with this folder; what it started ends with the block.
+
+    Raises SettingsError where there is none.
+    """
+    if name not in ENGINES:
+        raise SettingsError(f"No engine {name!r}. Engines: {', '.join(ENGINES)}.")
+    if name == "ray":
+        from vplog.engine_ray import ray_engine
+
+        with ray_engine(address, threads, folder) as engine:
+            yield engine
+        return
+    if address is not None:
+        raise SettingsError(f"--address {address} is that of a Ray cluster. Add --engine ray.")
+    with OwnProcesses(jobs or 1) as executor:
+        yield LocalEngine(executor, threads)
+
+
+def computed(
+    engine: Engine, tasks: Sequence[Task], jobs: int | None, retries: int
+) -> Iterator[tuple[Task, Outcome, int]]:
+    """Every drive when it is finished or given up, how, and at which attempt; `jobs` of them at once, where given.
+
+    One that died is tried again when the others have had their turn: whatever it lacked may be there then.
+    """
+    waiting = deque((task, 1) for task in tasks)
+    running: dict[Future[Outcome], tuple[Task, int]] = {}
+    while waiting or running:
+        # without `jobs` one stands in line behind each, so that no core waits for this loop
+        while waiting and len(running) < (jobs or 2 * engine.at_once(waiting[0][0].threads)):
+            task, attempt = waiting.popleft()
+            share = engine.cores // (len(waiting) + len(running) + 1)
+            running[engine.start(task, max(share, task.threads))] = task, attempt
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            task, attempt = running.pop(future)
+            outcome = _brought(engine, task, future)
+            if outcome.may_pass and attempt <= retries:
+                waiting.append((task, attempt + 1))
+            else:
+                yield task, outcome, attempt
+
+
+def _brought(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
+    """What became of an attempt, its run folder at hand."""
+    try:
+        outcome = future.result()
+        if not outcome.error:
+            engine.take(task, outcome)
+    except BrokenExecutor as error:
+        return Outcome(str(error), may_pass=True)
+    except VplogError as error:
+        return Outcome(str(error))
+    except Exception as error:  # what a worker cannot even begin with
+        return Outcome(f"Internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}.")
+    return outcome
+
+
+class OwnProcesses(ThreadPoolExecutor):
+    """Runs each task in a process of its own: its memory is given back, and one that dies takes no other along."""
+
+    def __init__(self, jobs: int) -> None:
+        super().__init__(jobs)
+        self._unfinished: set[Future[Any]] = set()
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        future = super().submit(_in_process, fn, args, kwargs)
+        self._unfinished.add(future)
+        future.add_done_callback(self._unfinished.discard)
+        return future
+
+    def __exit__(self, kind: Any, error: Any, at: Any) -> bool | None:
+        """Wait for all, or end them where the block failed."""
+        if kind is not None:
+            self.shutdown(wait=False, cancel_futures=True)
+            while wait(list(self._unfinished), _TERMINATE_EVERY_S).not_done:
+                for child in multiprocessing.active_children():
+                    child.terminate()
+        return super().__exit__(kind, error, at)
+
+
+class LocalEngine:
+    """This machine."""
+
+    def __init__(self, executor: Executor, threads: int) -> None:
+        self.executor, self.cores, self.widest = executor, threads, threads
+
+    def at_once(self, threads: int) -> int:
+        return 1
+
+    def start(self, task: Task, cores: int) -> Future[Outcome]:
+        return self.executor.submit(compute_drive, task)
+
+    def helpers(self, threads: int) -> Executor | None:
+        """This process has the threads itself."""
+        return None
+
+    def take(self, task: Task, outcome: Outcome) -> None:
+        """It is there already."""
+
+
+def _in_process(function: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
+    """Call it in a new process."""
+    context = multiprocessing.get_context("spawn")
+    # Ctrl-C reaches every process of a terminal; a worker inherits the mask and is ended by this process instead.
+    # The tracker that Python starts with the first worker would take the mask off again.
+    resource_tracker.ensure_running()
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with ProcessPoolExecutor(1, context, _end_with_parent) as pool:
+            return pool.submit(function, *args, **kwargs).result()
+    except BrokenProcessPool:
+        raise BrokenExecutor(
+            "Its process was killed, as for want of memory. Use fewer --jobs, and run again."
+        ) from None
+
+
+def _end_with_parent() -> None:
+    """A worker whose batch was killed must not go on beside the next one."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
