@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog import cli, logs
+from vplog import cli, cli_options, logs
 from vplog.info import command, in_words, preflight
 from vplog.info_page import page
 from vplog.keyframes import KeyframeSettings, select_keyframes
@@ -103,7 +103,7 @@ def test_the_command_runs_with_what_was_asked_for(drive: Path, tmp_path: Path) -
     topics = TopicChoice(image="/cam/image/compressed", depth="", calibration_file=file)
     words = shlex.split(command(drive, topics))
     arguments = cli._parser().parse_args(words[1:])
-    assert cli._topics(arguments) == topics
+    assert cli_options.topics_of(arguments) == topics
     assert arguments.logs == [drive]
 
 
