@@ -35,14 +35,14 @@ def map_library(
         store.write_head(map_store.Head(None, settings))
     known = store.head().library
     if known is not None and not store.library(known).is_dir():
-        raise LibraryError(f"{store.root} has lost its library {known[:12]}. Make the map anew in another folder.")
+        raise LibraryError(f"{store} has lost its library {known[:12]}. Make the map anew in another folder.")
     made = store.staging / "library"
     if given is not None:
         check_library(given, pipeline)
         digest = pipeline.places.load(given, threads).hash
         if known not in (None, digest):
             raise LibraryError(
-                f"{given} has hash {digest[:12]}, and the places of {store.root} are described with library "
+                f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
                 f"{known[:12]}: they would not compare. Leave --library out, or make another map."
             )
         if known is None:
