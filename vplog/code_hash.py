@@ -60,7 +60,7 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
             if (entered := _file(parent)) is not None:
                 files[parent] = entered
         files[module] = path
-        for name in _imports(path):
+        for name in _imports(path, path.stat().st_mtime_ns):
             top = name.split(".", maxsplit=1)[0]
             if top == "vplog":
                 waiting.append(name if _file(name) is not None else name.rpartition(".")[0])
@@ -75,8 +75,9 @@ def _file(module: str) -> Path | None:
     return next((file for file in (at / "__init__.py", at.with_suffix(".py")) if file.is_file()), None)
 
 
-def _imports(path: Path) -> list[str]:
-    """Full names of all that a file imports when it runs, wherever in it."""
+@cache
+def _imports(path: Path, _changed_ns: int) -> list[str]:
+    """Full names of all that a file imports when it runs, wherever in it. Stages share most of their files."""
     found = []
     for node in _running(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
