@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from vplog import logs, record
 from vplog.batch_library import map_library
 from vplog.batch_worker import Task, made_by
-from vplog.engine import RETRIES, computed, opened
+from vplog.engine import RETRIES, LocalEngine, computed, opened
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
@@ -77,7 +77,7 @@ def run_batch(
 ) -> dict[str, Any]:
     """Drives in, a map in `root` out: what of it is missing or made from something else is computed, `jobs` at once.
 
-    On this machine `threads` are shared by the jobs, of which there is one unless told. The engine `ray` takes the
+    On this machine every job has so many `threads`, and there is one job unless told. The engine `ray` takes the
     cluster at `address`, or one of this machine with so many threads; without `jobs` as many drives as it has cores
     for. Results depend on none of this. Without `library` the map's own is used, or one is built from the first logs.
     A drive whose worker dies is tried again, `retries` times; one that fails is recorded and stops no other; every
@@ -164,7 +164,10 @@ def _has_room(store: Store) -> bool:
 
 
 def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
-    """Of each drive: its share of the cores, as far as one machine has them. Without `jobs` no drive waits for one."""
+    """Of each drive. On this machine all, which the system shares out: drives are not equally long, and the last has
+    the cores for itself. Else its share of the cores, as far as one machine has them; without `jobs` none waits."""
+    if isinstance(workers, LocalEngine):
+        return workers.cores
     at_once = min(jobs or max(workers.at_once(1), 1), max(drives, 1))
     return min(max(workers.cores // at_once, 1), workers.widest)
 
