@@ -22,9 +22,10 @@ from vplog.batch_worker import Outcome, Task
 from vplog.demo import SMALL, make_drive
 from vplog.engine import LocalEngine, OwnProcesses, computed
 from vplog.errors import LibraryError, SettingsError
+from vplog.libraries import build_library
 from vplog.logs import TopicChoice
 from vplog.maps import store as map_store
-from vplog.pipeline import build_library, load_pipeline
+from vplog.pipeline import load_pipeline
 
 if TYPE_CHECKING:
     from collections.abc import Callable

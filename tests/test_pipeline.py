@@ -22,7 +22,8 @@ from mcap.reader import make_reader
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.evaluation import evaluate
-from vplog.pipeline import build_library, load_pipeline, pipeline_schema, run
+from vplog.libraries import build_library
+from vplog.pipeline import load_pipeline, pipeline_schema, run
 from vplog.results import tables
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from vplog import logs
 from vplog.errors import SettingsError
-from vplog.pipeline import build_library, load_pipeline, run
+from vplog.libraries import build_library
+from vplog.pipeline import load_pipeline, run
 from vplog.places.stored import load_references
 from vplog.references import LEAST_SIZE, PAPER_SIZE, LibrarySettings, choose, evenly
 

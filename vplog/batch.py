@@ -12,11 +12,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog import logs, record
+from vplog import logs
 from vplog.batch_library import map_library
 from vplog.batch_worker import Task, made_by
 from vplog.engine import RETRIES, LocalEngine, computed, opened
 from vplog.errors import ResultError, SettingsError
+from vplog.inputs import hash_inputs
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.join import join as join_drives
@@ -190,7 +191,7 @@ def _hashed(paths: Sequence[Path], topics: TopicChoice, threads: int) -> tuple[l
 
     def hashes(path: Path) -> dict[str, str] | str:
         try:
-            found = [record.hash_inputs(one) for one in (path, *beside)]
+            found = [hash_inputs(one) for one in (path, *beside)]
         except OSError as error:
             return f"Cannot read {error.filename or path}: {error.strerror or error}."
         return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}

@@ -124,7 +124,7 @@ def info(arguments: argparse.Namespace) -> None:
 
 def library(arguments: argparse.Namespace) -> None:
     """Build a reference library of random frames."""
-    from vplog.pipeline import build_library
+    from vplog.libraries import build_library
 
     pipeline = pipeline_of(arguments)
     with Progress(arguments) as progress:

@@ -15,8 +15,8 @@ from vplog.features.store import FeatureStore
 from vplog.graph import joint as graph_joint
 from vplog.graph.correct import correct_trajectory
 from vplog.joint_graph import between_of, judged_by, own_drive
+from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of
-from vplog.pipeline import build_library, check_library
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables, tum
 from vplog.timing import Watch

@@ -25,7 +25,7 @@ from vplog.graph.solve import GncSettings, OptimiserSettings
 from vplog.inputs import files_of
 from vplog.keyframes import KeyframeSettings, select_keyframes
 from vplog.ledger import verify_in_parts
-from vplog.libraries import about_references, build_library, check_library, cover, coverage_codec, own_images
+from vplog.libraries import about_references, check_library, cover, coverage_codec, own_images
 from vplog.loops.propose import Proposals, ProposeSettings
 from vplog.loops.stereo import StereoSettings
 from vplog.loops.verify import VerifySettings
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]
-
-__all__ = ["Pipeline", "Run", "build_library", "check_library", "load_pipeline", "name_shared", "run"]
 
 
 _UNCALIBRATED = (

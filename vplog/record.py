@@ -15,7 +15,6 @@ from vplog import logs
 from vplog.data import Verdict
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.inputs import files_of
-from vplog.inputs import hash_inputs as hash_inputs  # noqa: PLC0414 - others know it by this name
 from vplog.remote import located
 from vplog.results import run_record
 

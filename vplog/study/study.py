@@ -19,6 +19,7 @@ from vplog import logs, record
 from vplog.compare import check_truth, same_drive
 from vplog.errors import ResultError, SettingsError, TruthError
 from vplog.evaluate.place_truth import TruthChoice, open_truth
+from vplog.inputs import hash_inputs
 from vplog.methods import read_methods
 from vplog.references import PAPER_SIZE
 from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
@@ -86,7 +87,7 @@ def study(
             of_pair = truth_of_pair(truth, query, other, len(drives))
             known[query, other] = open_truth(of_pair, opened[query], opened[other])
             warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)
-        hashes = [_hash(record.hash_inputs(path)) for path in drives]
+        hashes = [_hash(hash_inputs(path)) for path in drives]
         common = {
             "features": pipeline.features.model_dump(mode="json"),
             "topics": None if topics is None else topics.model_dump(mode="json"),
@@ -248,7 +249,7 @@ def _hash(tree: Any) -> str:
 def _truth_hash(truth: TruthChoice) -> str:
     """Of the choice, and of the files it names."""
     files = [Path(file) for file in {truth.source, *truth.source.split(",")} if Path(file).is_file()]
-    return _hash([asdict(truth), [record.hash_inputs(file) for file in sorted(files)]])
+    return _hash([asdict(truth), [hash_inputs(file) for file in sorted(files)]])
 
 
 def _code_hash(without: set[str]) -> str:
