@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import struct
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -151,9 +152,11 @@ def _unpack(data: bytes) -> dict[str, np.ndarray]:
     arrays = {}
     for name, kind, shape in json.loads(data[_LENGTH.size : at]):
         dtype = np.dtype(str(kind))
-        if dtype.kind not in _NUMBERS or min(shape, default=0) < 0:
+        if dtype.kind not in _NUMBERS or any(type(size) is not int or size < 0 for size in shape):
             raise ValueError(f"column {name} is none of numbers")
-        count = int(np.prod(shape, dtype=object))
+        count = math.prod(shape)
+        if count * dtype.itemsize > len(data) - at:
+            raise ValueError(f"column {name} is longer than the file")
         arrays[str(name)] = np.frombuffer(data, dtype, count, at).reshape(shape).copy()
         at += count * dtype.itemsize
     if at != len(data):
