@@ -45,7 +45,7 @@ LAYERS = (
     {"explain_picture"},
     {"explain"},
     {"cli_print", "cli_options"},
-    {"cli_maps"},
+    {"cli_maps", "cli_results", "cli_study"},
     {"cli"},
     {"__main__"},
 )
@@ -117,7 +117,7 @@ def speech(file: Path) -> list[str]:
 
 def test_only_the_command_line_prints_and_exits() -> None:
     spoken = {name_of(file) for file in FILES if speech(file)}
-    assert spoken == {"cli.py", "cli_maps.py", "cli_print.py"}
+    assert spoken == {"cli.py", "cli_maps.py", "cli_print.py", "cli_results.py"}
 
 
 @pytest.mark.parametrize("file", FILES, ids=name_of)

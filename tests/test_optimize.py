@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.benchmarks.graphs import city, spoiled
-from vplog import cli, geometry
+from vplog import cli, cli_results, geometry
 from vplog.errors import GraphError, ResultError
 from vplog.graph.consistency import is_loop, odometry_chain
 from vplog.graph.solve import OptimiserSettings
@@ -31,7 +31,7 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", cli._SOLVERS)
+@pytest.mark.parametrize("kind", cli_results._SOLVERS)
 def test_every_method_solves_and_nothing_is_lost(path: Path, tmp_path: Path, kind: str) -> None:
     done = optimize(path, tmp_path / "out.g2o", kind)
     before, after = read_g2o(path), read_g2o(tmp_path / "out.g2o")
@@ -53,7 +53,7 @@ def test_every_method_solves_and_nothing_is_lost(path: Path, tmp_path: Path, kin
 
 
 def test_the_methods_of_the_command_line_are_those_of_the_seam() -> None:
-    assert set(cli._SOLVERS) == {settings().kind for settings in get_args(get_args(OptimiserSettings)[0])}
+    assert set(cli_results._SOLVERS) == {settings().kind for settings in get_args(get_args(OptimiserSettings)[0])}
 
 
 def test_closures_that_bend_the_odometry_are_not_believed(path: Path, tmp_path: Path) -> None:

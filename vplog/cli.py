@@ -13,35 +13,20 @@ from typing import TYPE_CHECKING, NoReturn
 
 import vplog
 from vplog.cli_maps import add_maps
-from vplog.cli_options import at_least, at_least_one, pipeline_of, place, positive, topic_options, topics_of
-from vplog.cli_print import (
-    Progress,
-    print_comparison,
-    print_evaluation,
-    print_explanation,
-    print_info,
-    print_joint,
-    print_json,
-    print_optimised,
-    print_run,
-    print_study,
-    say,
-)
+from vplog.cli_options import at_least_one, pipeline_of, place, topic_options, topics_of
+from vplog.cli_print import Progress, print_evaluation, print_info, print_joint, print_json, print_run, say
+from vplog.cli_results import add_results
+from vplog.cli_study import add_studies
 from vplog.errors import VplogError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from vplog.evaluate.place_truth import TruthChoice
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
 
     Verb = Callable[[argparse.Namespace], None]
 
-_SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
-"""The kinds of graph/solve.py, here too since that imports numpy."""
-_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
-"""Those of export.py, here too since that imports numpy."""
 _DEMO_NEXT = (
     "Look at it: a browser opens report.html, Foxglove or rerun result.mcap, evo reads trajectory.tum, DuckDB the "
     ".parquet files."
@@ -188,124 +173,6 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
     return asked.logs, asked.pipeline, asked.library, asked.topics
 
 
-def evaluate(arguments: argparse.Namespace) -> None:
-    """A run against ground truth."""
-    from vplog.evaluation import evaluate as evaluate_run
-
-    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments))
-    if arguments.json:
-        print_json(found)
-    else:
-        print_evaluation(found)
-
-
-def compare(arguments: argparse.Namespace) -> None:
-    """Place recognisers side by side on two drives, or on one that comes back."""
-    from vplog.compare import compare as compare_methods
-    from vplog.methods import split_methods
-
-    with Progress(arguments) as progress:
-        done = compare_methods(
-            arguments.query,
-            arguments.map,
-            split_methods(arguments.methods),
-            _truth(arguments),
-            pipeline_of(arguments),
-            library=arguments.library,
-            library_size=arguments.library_size,
-            library_seed=arguments.library_seed,
-            min_gap=arguments.min_gap,
-            sequence=arguments.sequence,
-            out=arguments.output,
-            topics=topics_of(arguments),
-            threads=arguments.threads,
-            progress=progress,
-        )
-    if arguments.json:
-        print_json(done.record)
-    else:
-        print_comparison(done.record)
-
-
-def study(arguments: argparse.Namespace) -> None:
-    """The experiments of the paper on two or more drives of one route, or on one that comes back."""
-    from vplog.methods import split_methods
-    from vplog.study.study import METHODS
-    from vplog.study.study import study as run_study
-
-    with Progress(arguments) as progress:
-        found = run_study(
-            arguments.logs,
-            _truth(arguments),
-            pipeline_of(arguments),
-            arguments.output,
-            methods=METHODS if arguments.methods is None else split_methods(arguments.methods),
-            sizes=arguments.sizes,
-            seeds=arguments.seeds,
-            library_size=arguments.library_size,
-            min_gap=arguments.min_gap,
-            only=arguments.only,
-            topics=topics_of(arguments),
-            threads=arguments.threads,
-            progress=progress,
-        )
-    if arguments.json:
-        print_json(found)
-    else:
-        print_study(arguments.output, found)
-
-
-def explain(arguments: argparse.Namespace) -> None:
-    """One candidate closure of a run in words, and a picture of both frames."""
-    from vplog.explain import between, numbered, worst
-    from vplog.explain import explain as explain_closure
-
-    if arguments.worst:
-        choose = worst
-    else:
-        choose = numbered(*arguments.closure) if len(arguments.closure) == 1 else between(*arguments.closure)
-    told = explain_closure(arguments.run, choose, arguments.output, arguments.log, arguments.no_picture)
-    if arguments.json:
-        print_json(told)
-    else:
-        print_explanation(told)
-
-
-def optimize(arguments: argparse.Namespace) -> None:
-    """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
-    from vplog.optimize import optimize as optimize_graph
-
-    done = optimize_graph(arguments.graph, arguments.output, arguments.method)
-    if arguments.json:
-        print_json(done.record)
-    else:
-        print_optimised(done.record)
-
-
-def report(arguments: argparse.Namespace) -> None:
-    """Write the report of a finished run anew, against a truth where one is given."""
-    from vplog.retell import report as write_report
-
-    found = write_report(
-        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads
-    )
-    if arguments.json:
-        print_json(found)
-    else:
-        print(found["report"])
-
-
-def export(arguments: argparse.Namespace) -> None:
-    """A finished run in the format of another tool."""
-    from vplog.export import export as export_run
-
-    found = export_run(arguments.run, arguments.format, arguments.output)
-    if arguments.json:
-        print_json(found)
-    else:
-        print("\n".join(found["written"]))
-
-
 def config(arguments: argparse.Namespace) -> None:
     """Every setting of a pipeline, as YAML that a pipeline file may hold."""
     import yaml
@@ -363,12 +230,6 @@ def demo(arguments: argparse.Namespace) -> None:
     print_evaluation(found)
 
 
-def _truth(arguments: argparse.Namespace) -> TruthChoice:
-    from vplog.evaluate.place_truth import TruthChoice
-
-    return TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="vplog", description=vplog.__doc__)
     parser.add_argument("--version", action="version", version=f"vplog {vplog.__version__}")
@@ -384,7 +245,6 @@ def _parser() -> argparse.ArgumentParser:
     settings = argparse.ArgumentParser(add_help=False)
     settings.add_argument("--pipeline", default="default", metavar="P", help="shipped name or .yaml file")
     settings.add_argument("--set", action="append", default=[], metavar="A.B=C", help="change one setting; repeatable")
-    truth = _truth_options()
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
     def add(name: str, verb: Verb, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -405,20 +265,8 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("run", run, topics, threads, settings)
     _add_run(sub)
     output(sub, "run folder")
-    sub = add("evaluate", evaluate, topics)
-    sub.add_argument("run", type=place, metavar="RUN")
-    sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
-    sub = add("compare", compare, topics, threads, settings, truth)
-    _add_comparison(sub)
-    sub = add("study", study, topics, threads, settings, truth)
-    _add_study(sub)
-    output(sub, "folder for study.json and the figures")
-    _add_explain(add("explain", explain))
-    sub = add("optimize", optimize)
-    sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
-    output(sub, "the graph at its solved poses, as g2o")
-    sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="how false closures are met (default: gnc)")
-    _add_results(add, topics, threads)
+    add_results(add, topics, threads)
+    add_studies(add, topics, threads, settings)
     add_maps(add, common, topics, threads, settings)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
@@ -428,38 +276,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("config", config, settings)
     return parser
-
-
-def _add_results(
-    add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
-) -> None:
-    sub = add("report", report, topics, threads)
-    sub.add_argument("run", type=place, metavar="RUN")
-    sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
-    sub.add_argument("--log", type=place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
-    sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="page (default: RUN/report.html)")
-    sub = add("export", export)
-    sub.add_argument("run", type=place, metavar="RUN")
-    sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
-
-
-def _truth_options() -> argparse.ArgumentParser:
-    sub = argparse.ArgumentParser(add_help=False)
-    sub.add_argument(
-        "--truth",
-        required=True,
-        metavar="FILE.csv|index|FILE.tum[,MAPFILE.tum]|poses|gps",
-        help="pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS",
-    )
-    sub.add_argument("--tolerance", type=at_least(0), metavar="N", help="index: frames either side (default: 0)")
-    sub.add_argument("--distance-m", type=positive, metavar="M", help="poses, gps: same place within (default: 6)")
-    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: and turned by less (default: 45)")
-    sub.add_argument(
-        "--min-gap", type=at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
-    )
-    sub.add_argument("--library-size", type=at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
-    return sub
 
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
@@ -477,54 +293,3 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--no-cache", dest="cache", action="store_false", help="keep nothing in OUT for a run with other settings"
     )
-
-
-def _add_comparison(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("query", type=place, metavar="QUERY", help="drive whose frames are looked for")
-    sub.add_argument("map", type=place, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
-    sub.add_argument(
-        "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
-    )
-    sub.add_argument("--sequence", type=at_least_one, metavar="L", help="also match sequences of L frames")
-    sub.add_argument("--library", type=place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
-    sub.add_argument("--library-seed", type=at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
-    sub.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for compare.json, scores and curves")
-
-
-def _add_study(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
-    sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
-    sub.add_argument(
-        "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="of libraries (default: 10,20,50,100)"
-    )
-    sub.add_argument("--seeds", type=at_least_one, default=3, metavar="N", help="libraries a figure (default: 3)")
-    sub.add_argument(
-        "--only", type=lambda text: text.split(","), metavar="E,E",
-        help="pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)",
-    )  # fmt: skip
-
-
-def _add_explain(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("run", type=place, metavar="RUN")
-    which = sub.add_mutually_exclusive_group(required=True)
-    which.add_argument(
-        "--closure", type=_closure, metavar="K|QUERY:MATCH",
-        help="row of closures.parquet, or its two keyframes, by row or by stamp in ns",
-    )  # fmt: skip
-    which.add_argument("--worst", action="store_true", help="the closure that the solved trajectory is furthest from")
-    sub.add_argument(
-        "-o", "--output", type=Path, metavar="PICTURE.png", help="picture, .png or .svg (default: RUN/closure-K.png)"
-    )
-    sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
-    sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
-
-
-def _closure(text: str) -> tuple[int, ...]:
-    parts = text.split(":")
-    if len(parts) > 2:
-        raise argparse.ArgumentTypeError("must be K or QUERY:MATCH")
-    return tuple(int(part) for part in parts)
-
-
-def _counts(text: str) -> tuple[int, ...]:
-    return tuple(at_least_one(part) for part in text.split(","))

@@ -1,0 +1,126 @@
+"""The verbs of what is finished: of a run, and of a pose graph from anywhere."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vplog.cli_options import place, topics_of
+from vplog.cli_print import print_evaluation, print_explanation, print_json, print_optimised
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
+"""The kinds of graph/solve.py, here too since that imports numpy."""
+_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+"""Those of export.py, here too since that imports numpy."""
+
+
+def evaluate(arguments: argparse.Namespace) -> None:
+    """A run against ground truth."""
+    from vplog.evaluation import evaluate as evaluate_run
+
+    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments))
+    if arguments.json:
+        print_json(found)
+    else:
+        print_evaluation(found)
+
+
+def explain(arguments: argparse.Namespace) -> None:
+    """One candidate closure of a run in words, and a picture of both frames."""
+    from vplog.explain import between, numbered, worst
+    from vplog.explain import explain as explain_closure
+
+    if arguments.worst:
+        choose = worst
+    else:
+        choose = numbered(*arguments.closure) if len(arguments.closure) == 1 else between(*arguments.closure)
+    told = explain_closure(arguments.run, choose, arguments.output, arguments.log, arguments.no_picture)
+    if arguments.json:
+        print_json(told)
+    else:
+        print_explanation(told)
+
+
+def optimize(arguments: argparse.Namespace) -> None:
+    """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
+    from vplog.optimize import optimize as optimize_graph
+
+    done = optimize_graph(arguments.graph, arguments.output, arguments.method)
+    if arguments.json:
+        print_json(done.record)
+    else:
+        print_optimised(done.record)
+
+
+def report(arguments: argparse.Namespace) -> None:
+    """Write the report of a finished run anew, against a truth where one is given."""
+    from vplog.retell import report as write_report
+
+    found = write_report(
+        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads
+    )
+    if arguments.json:
+        print_json(found)
+    else:
+        print(found["report"])
+
+
+def export(arguments: argparse.Namespace) -> None:
+    """A finished run in the format of another tool."""
+    from vplog.export import export as export_run
+
+    found = export_run(arguments.run, arguments.format, arguments.output)
+    if arguments.json:
+        print_json(found)
+    else:
+        print("\n".join(found["written"]))
+
+
+def add_results(
+    add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
+) -> None:
+    sub = add("evaluate", evaluate, topics)
+    sub.add_argument("run", type=place, metavar="RUN")
+    sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    _add_explain(add("explain", explain))
+    sub = add("report", report, topics, threads)
+    sub.add_argument("run", type=place, metavar="RUN")
+    sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    sub.add_argument("--log", type=place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
+    sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="page (default: RUN/report.html)")
+    sub = add("export", export)
+    sub.add_argument("run", type=place, metavar="RUN")
+    sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
+    sub = add("optimize", optimize)
+    sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
+    sub.add_argument(
+        "-o", "--output", type=place, required=True, metavar="OUT", help="the graph at its solved poses, as g2o"
+    )
+    sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="how false closures are met (default: gnc)")
+
+
+def _add_explain(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("run", type=place, metavar="RUN")
+    which = sub.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        "--closure", type=_closure, metavar="K|QUERY:MATCH",
+        help="row of closures.parquet, or its two keyframes, by row or by stamp in ns",
+    )  # fmt: skip
+    which.add_argument("--worst", action="store_true", help="the closure that the solved trajectory is furthest from")
+    sub.add_argument(
+        "-o", "--output", type=Path, metavar="PICTURE.png", help="picture, .png or .svg (default: RUN/closure-K.png)"
+    )
+    sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
+    sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
+
+
+def _closure(text: str) -> tuple[int, ...]:
+    parts = text.split(":")
+    if len(parts) > 2:
+        raise argparse.ArgumentTypeError("must be K or QUERY:MATCH")
+    return tuple(int(part) for part in parts)
