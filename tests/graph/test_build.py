@@ -8,7 +8,7 @@ import pytest
 from vplog import geometry
 from vplog.data import EdgeKind, Verdict
 from vplog.errors import GraphError
-from vplog.graph.build import build_graph, checked
+from vplog.graph.build import build_graph, checked, parts
 from vplog.graph.gnc import GncSettings
 
 from .drive import ledger, ring, with_entry, without_loops
@@ -95,3 +95,38 @@ def test_indefinite_information_is_repaired_with_a_warning() -> None:
 def test_a_graph_without_poses_is_refused() -> None:
     with pytest.raises(GraphError, match="1 keyframes"):
         build_graph(replace(DRIVE.keyframes, stamp_ns=DRIVE.keyframes.stamp_ns[:1]), np.zeros((0, 6, 6)), None)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_parts_are_what_can_be_reached(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    n = int(random.integers(1, 40))
+    a, b = random.integers(0, n, (2, int(random.integers(0, n))))
+    reached = np.eye(n, dtype=bool)
+    reached[a, b] = reached[b, a] = True
+    for middle in range(n):  # Warshall 1962
+        reached |= reached[:, middle, None] & reached[middle]
+    first = reached.argmax(1)
+    np.testing.assert_array_equal(parts(n, a, b), np.searchsorted(np.unique(first), first))
+
+
+def test_information_is_repaired_only_where_it_has_to_be() -> None:
+    """The bound that spares the eigenvalues of most edges never spares one that is poor."""
+    random = np.random.default_rng(0)
+    edges = len(DRIVE.graph.a)
+    turn = np.linalg.qr(random.normal(size=(edges, 6, 6)))[0]
+    values = 10.0 ** random.uniform(-3, 3, (edges, 6))
+    poor = random.random(edges) < 0.3
+    values[poor, 0] = -1e-3 * values[poor].max(1)
+    information = turn * values[:, None] @ np.swapaxes(turn, 1, 2)
+    information[~np.isfinite(information)] = 0.0
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    good = (diagonal > 0).all(1)
+    information[~good], poor = np.eye(6), poor & good
+    fixed, _ = checked(replace(DRIVE.graph, information=information))
+    changed = (fixed.information != information).any((1, 2))
+    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    least = np.linalg.eigvalsh(information / scale[:, :, None] / scale[:, None, :])[:, 0]
+    np.testing.assert_array_equal(changed, least < 1e-12)
+    assert changed.sum() == poor.sum() > 3
+    assert (np.linalg.eigvalsh(fixed.information)[:, 0] > 0).all()

@@ -9,7 +9,14 @@ from scipy import stats
 
 from vplog import geometry
 from vplog.data import EdgeKind
-from vplog.graph.consistency import chi2_quantile, keep_odometry_if_worse, residual_before, residual_sigma
+from vplog.graph import descent
+from vplog.graph.consistency import (
+    chi2_quantile,
+    keep_odometry_if_worse,
+    odometry_chain,
+    residual_before,
+    residual_sigma,
+)
 from vplog.graph.factors import Factors
 from vplog.graph.solve import GncSettings, LmSettings
 
@@ -96,3 +103,17 @@ def test_a_sound_solution_is_left_alone(seed: int) -> None:
 @pytest.mark.parametrize("probability", [0.9, 0.99, 0.9999, 0.999999])
 def test_quantiles_agree_with_scipy(dof: int, probability: float) -> None:
     assert chi2_quantile(probability, dof) == pytest.approx(stats.chi2(dof).ppf(probability), rel=1e-8)
+
+
+def test_large_graphs_are_measured_as_small_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = ring(60, 8, false=3)
+    kind = [EdgeKind.LOOP if edge == 30 else one for edge, one in enumerate(drive.graph.kind)]  # a gap
+    graph, loops = replace(drive.graph, kind=kind), np.array([62, 59, 66])
+    chain, leads = odometry_chain(graph)
+    every, some = residual_sigma(graph, drive.true), residual_sigma(graph, drive.true, loops)
+    monkeypatch.setattr(descent, "LARGE_POSES", 10)
+    found = odometry_chain(graph)
+    np.testing.assert_allclose(found[0], chain, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(found[1], leads)
+    np.testing.assert_allclose(residual_sigma(graph, drive.true), every, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(residual_sigma(graph, drive.true, loops), some, rtol=1e-9, atol=1e-9)

@@ -11,8 +11,9 @@ import pytest
 from tests.benchmarks.graphs import city, spoiled
 from tests.benchmarks.large_graphs import drives
 from vplog import geometry
+from vplog.data import EdgeKind
 from vplog.errors import GraphError
-from vplog.graph import descent
+from vplog.graph import dense, descent, inverse_fronts, normal, workers
 from vplog.graph.cholesky import Blocks, Cholesky
 from vplog.graph.consistency import is_loop, residual_sigma
 from vplog.graph.elimination import Elimination
@@ -47,10 +48,10 @@ def random_matrix(nodes: int, chords: int, size: int, seed: int) -> tuple[Blocks
     np.add.at(diagonal, a, np.swapaxes(by_a, 1, 2) @ by_a)
     np.add.at(diagonal, b, np.swapaxes(by_b, 1, 2) @ by_b)
     other = np.swapaxes(by_a, 1, 2) @ by_b
-    return Blocks(diagonal, a, b, other), dense(Blocks(diagonal, a, b, other))
+    return Blocks(diagonal, a, b, other), whole_of(Blocks(diagonal, a, b, other))
 
 
-def dense(matrix: Blocks) -> np.ndarray:
+def whole_of(matrix: Blocks) -> np.ndarray:
     nodes, size, _ = matrix.diagonal.shape
     whole = np.zeros((nodes, nodes, size, size))
     whole[range(nodes), range(nodes)] = matrix.diagonal
@@ -85,6 +86,71 @@ def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords
     assert Cholesky.of(shape, matrix).values.tobytes() == factor.values.tobytes()
 
 
+def test_all_supernodes_are_in_one_run_or_above_all_of_them() -> None:
+    matrix, _ = random_matrix(400, 150, 3, 0)
+    shape = Elimination.of(400, matrix.a, matrix.b)
+    subtrees = shape.subtrees
+    runs = [list(range(*run)) for run in subtrees.runs]
+    assert sorted([node for run in runs for node in run] + subtrees.top) == list(range(len(shape.parent)))
+    for run, roots, after in zip(runs, subtrees.roots, subtrees.after, strict=True):
+        leaving = [node for node in run if shape.parent[node] not in run]
+        assert leaving == roots.tolist()
+        assert set(shape.parent[leaving].tolist()) <= {*subtrees.top, -1}
+        rows = np.concatenate([shape.rows[shape.start[node] : shape.start[node + 1]] for node in run])
+        np.testing.assert_array_equal(np.unique(rows[rows >= shape.first[run[-1] + 1]]), after)
+    for node, children in zip(subtrees.top, subtrees.children, strict=True):
+        np.testing.assert_array_equal(np.flatnonzero(shape.parent == node), children)
+
+
+def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (dense, inverse_fronts):
+        monkeypatch.setattr(module, "SHARED", 40)  # so that fronts of this size are shared
+    monkeypatch.setattr(normal, "_LEAST_SHARE", 16)
+    # closures all over it, so that its fronts are large
+    random, graph, more = np.random.default_rng(0), GRAPHS["drives"], 400
+    a, b = random.integers(0, 599, more), random.integers(1, 300, more)
+    like = random.integers(0, len(graph.a), more)
+    graph = replace(
+        graph,
+        a=np.concatenate([graph.a, a]).astype(np.int32),
+        b=np.concatenate([graph.b, (a + b) % 600]).astype(np.int32),
+        a_from_b=np.concatenate([graph.a_from_b, graph.a_from_b[like]]),
+        information=np.concatenate([graph.information, graph.information[like]]),
+        kind=graph.kind + [EdgeKind.LOOP] * more,
+    )
+    poses, weight = geometry.between(graph.world_from_body[:1], graph.world_from_body), np.ones(len(graph.a))
+
+    def found() -> bytes:
+        matrix, slope, error = normal_equations(graph, weight, poses)
+        matrix.diagonal[0] += 1e6 * np.eye(6)
+        factor = Cholesky.of(Elimination.of(len(poses), graph.a, graph.b), matrix)
+        assert np.diff(factor.shape.first).max() * 6 > 40
+        arrays = (matrix.diagonal, matrix.other, slope, factor.values, factor.solve(slope[:, :, None]))
+        return (
+            b"".join(one.tobytes() for one in (*arrays, *inverse_blocks(factor, graph.a, graph.b)))
+            + str(error).encode()
+        )
+
+    with workers.limited(1):
+        alone = found()
+    for threads in (2, 5):
+        with workers.limited(threads):
+            assert found() == alone
+
+
+def test_matrices_of_several_parts_are_solved() -> None:
+    matrix, _ = random_matrix(120, 40, 3, 0)
+    inside = (matrix.a // 30 == matrix.b // 30) & (matrix.a >= 30)  # 30 nodes alone, and three parts
+    parts = Blocks(matrix.diagonal, matrix.a[inside], matrix.b[inside], matrix.other[inside])
+    factor = Cholesky.of(Elimination.of(120, parts.a, parts.b), parts)
+    right = np.random.default_rng(0).normal(size=(120, 3, 1))
+    np.testing.assert_allclose(whole_of(parts) @ factor.solve(right).reshape(-1, 1), right.reshape(-1, 1), atol=1e-9)
+    inverse = np.linalg.inv(whole_of(parts)).reshape(120, 3, 120, 3).transpose(0, 2, 1, 3)
+    some = slice(0, None, 7)
+    _, found, _ = inverse_blocks(factor, parts.a[some], parts.b[some])
+    np.testing.assert_allclose(found, inverse[parts.a[some], parts.b[some]], atol=1e-10 * np.abs(inverse).max())
+
+
 @pytest.mark.parametrize("wrong", [-1.0, 0.0, np.nan])
 def test_a_matrix_that_is_not_positive_definite_is_refused(wrong: float) -> None:
     matrix, _ = random_matrix(30, 5, 3, 0)
@@ -111,7 +177,7 @@ def test_normal_equations_are_those_of_gtsam(graph: PoseGraph) -> None:
     expected, right = linear.hessian()
     order = [2, 0, 1] if graph.dimension == 2 else axes
     expected = expected.reshape(-1, size, len(poses), size)[:, order][:, :, :, order].reshape(len(poses) * size, -1)
-    whole, right = dense(matrix), right.reshape(-1, size)[:, order]
+    whole, right = whole_of(matrix), right.reshape(-1, size)[:, order]
     np.testing.assert_allclose(
         whole[size:, size:], expected[size:, size:], rtol=0, atol=EXACT[graph.dimension] * np.abs(whole).max()
     )

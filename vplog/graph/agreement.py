@@ -40,7 +40,7 @@ class Agreement:
     """Log of the volume that false closures are spread over, in m and rad."""
 
 
-def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
+def agreement(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> Agreement:
     """Fit the mixture to the closures `loops` (K,) of the graph, by greatest likelihood.
 
     A true closure is off the odometry by N(0, s^2 C + t^2 R), C what the chain of odometry from a to b adds up to, R
@@ -48,9 +48,9 @@ def agreement(graph: PoseGraph, loops: Ints) -> Agreement:
     the share of true ones, are what makes all closures together most likely: expectation maximisation, as Lee,
     Fraundorfer and Pollefeys (IROS 2013) sort closures. With the scales found, not said, noise that is said far too
     large does not hide false closures, and noise said too small does not throw out true ones. As false ones are spread
-    over the whole box, nine in ten of them do not pull the scales.
+    over the whole box, nine in ten of them do not pull the scales. `chain` is the graph's where it is at hand.
     """
-    chain = OdometryChain.of(graph)
+    chain = chain or OdometryChain.of(graph)
     room = _log_volume(chain.poses[:, :3, 3], graph.dimension)
     known = chain.part[graph.a[loops]] == chain.part[graph.b[loops]]
     probability = np.ones(len(loops))

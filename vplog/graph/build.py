@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numba
 import numpy as np
 
 from vplog import geometry
@@ -24,6 +25,8 @@ _FURTHEST_M = 1e8
 """m; frames of drives (UTM, ECEF) stay below 1e7, and from 1e8 on the last bit of a double is coarser than 10 nm."""
 _LEAST_SHARE = 1e-10
 """Least eigenvalue of an information matrix as a share of its largest: GTSAM factorises them, so none may be zero."""
+_CLEARLY = 0.01
+"""Least eigenvalue of a unit diagonal, as a simple bound tells it, that leaves nothing to look at."""
 _NOISE = 1e-9
 """Negative eigenvalues up to this share of the largest are rounding of whoever wrote the matrix."""
 
@@ -111,22 +114,27 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, diagonal.max(1, keepdims=True)))
     scale = scale[:, :, None] * scale[:, None, :]
-    values, vectors = np.linalg.eigh((information + np.swapaxes(information, 1, 2)) / 2 / scale)
+    likes = (information + np.swapaxes(information, 1, 2)) / 2 / scale
+    # a row's diagonal entry that outweighs its others bounds the eigenvalues from below (Gershgorin 1931)
+    lead = (2.0 * np.diagonal(likes, axis1=1, axis2=2) - np.abs(likes).sum(2)).min(1)
+    unsure = np.flatnonzero(lead < _CLEARLY)
+    values, vectors = np.linalg.eigh(likes[unsure])
     least = _LEAST_SHARE * values[:, -1]
     poor = values[:, 0] < least
     if not poor.any():
         return graph, []
     negative = np.flatnonzero(values[:, 0] < -_NOISE * values[:, -1])
-    fixed = (vectors * np.maximum(values, least[:, None])[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale
+    fixed = (vectors * np.maximum(values, least[:, None])[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale[unsure]
     axes = np.array(AXES[graph.dimension])
     repaired = graph.information.copy()
-    repaired[np.flatnonzero(poor)[:, None, None], axes[:, None], axes] = fixed[poor]
+    repaired[unsure[poor][:, None, None], axes[:, None], axes] = fixed[poor]
     warnings = []
     if len(negative):
-        edge = negative[0]
+        edge = unsure[negative[0]]
         warnings.append(
             f"The information of {len(negative)} edges is not positive (first: edge {edge}, {graph.a[edge]} to "
-            f"{graph.b[edge]}, eigenvalue {values[edge, 0]:.3g} of a unit diagonal); the negative part was cut off."
+            f"{graph.b[edge]}, eigenvalue {values[negative[0], 0]:.3g} of a unit diagonal); the negative part was cut "
+            "off."
         )
     return replace(graph, information=repaired), warnings
 
@@ -178,17 +186,28 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
 
 def parts(n: int, a: Int32s | Ints, b: Int32s | Ints) -> Ints:
     """Number (N,) of the connected part that each of n poses belongs to by the edges a, b, in order of first poses."""
-    if len(np.unique(np.minimum(a, b)[np.abs(a - b) == 1])) == n - 1:  # a chain through all, as drives are
-        return np.zeros(n, np.int64)
-    root = list(range(n))
+    return _parts(n, np.asarray(a, np.int64), np.asarray(b, np.int64))
 
-    def find(node: int) -> int:
-        while root[node] != node:
-            root[node] = root[root[node]]  # path halving
-            node = root[node]
-        return node
 
-    for left, right in zip(a.tolist(), b.tolist(), strict=True):
-        left, right = sorted((find(left), find(right)))  # noqa: PLW2901 (their roots, the first pose of each)
-        root[right] = left
-    return np.unique([find(node) for node in range(n)], return_inverse=True)[1].astype(np.int64)
+@numba.njit(cache=True, nogil=True)
+def _parts(n: int, a: Ints, b: Ints) -> Ints:
+    root = np.arange(n)
+    for edge in range(len(a)):
+        one, two = _root(root, a[edge]), _root(root, b[edge])
+        root[max(one, two)] = min(one, two)  # the first pose of each part
+    number, count = np.empty(n, np.int64), 0
+    for node in range(n):
+        if root[node] == node:
+            number[node] = count
+            count += 1
+        else:
+            number[node] = number[root[node]]
+    return number
+
+
+@numba.njit(cache=True, nogil=True)
+def _root(root: Ints, node: int) -> int:
+    while root[node] != node:
+        root[node] = root[root[node]]  # path halving
+        node = root[node]
+    return node

@@ -7,14 +7,17 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import numba
 import numpy as np
 
 from vplog import geometry
 from vplog.data import EdgeKind
 from vplog.errors import GraphError
 from vplog.graph.build import AXES, informed
+from vplog.graph.descent import is_large
 from vplog.graph.factors import Factors
 from vplog.graph.marginals import edge_covariances
+from vplog.graph.normal import half_chi2_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,6 +35,9 @@ def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None
 
     sqrt(e^T information e). A planar motion has the same logarithm in the plane as in space, so one formula serves.
     """
+    if is_large(world_from_body):
+        half = half_chi2_of(graph, np.ones(len(graph.a)), world_from_body, edges)
+        return np.sqrt(np.maximum(2.0 * half, 0.0))
     part = slice(None) if edges is None else edges
     a, b = world_from_body[graph.a[part]], world_from_body[graph.b[part]]
     if graph.dimension == 2:
@@ -75,18 +81,19 @@ def is_loop(graph: PoseGraph) -> Bools:
     return np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind], bool)
 
 
-def residual_before(graph: PoseGraph) -> Floats:
+def residual_before(graph: PoseGraph, chain: OdometryChain | None = None) -> Floats:
     """Mahalanobis distance (E,) of each loop to the odometry alone; 0 for odometry edges.
 
     The noise is the loop's plus what the odometry accumulates from a to b: covariances add along the chain when each
     is moved to one frame by the adjoint, to first order, so a running sum answers every loop at once (Barfoot and
-    Furgale 2014, eq. 55, second order). NaN where odometry edges do not lead from a to b.
+    Furgale 2014, eq. 55, second order). NaN where odometry edges do not lead from a to b. `chain` is the graph's where
+    it is at hand.
     """
     result = np.zeros(len(graph.a))
     loops = np.flatnonzero([kind == EdgeKind.LOOP for kind in graph.kind])
     if len(loops) == 0:
         return result
-    result[loops] = OdometryChain.of(graph).distance(loops, graph)
+    result[loops] = (chain or OdometryChain.of(graph)).distance(loops, graph)
     return result
 
 
@@ -164,9 +171,25 @@ def odometry_chain(graph: PoseGraph) -> tuple[Floats, Ints]:
     poses = np.array(graph.world_from_body)
     if graph.dimension == 2:
         return _planar_chain(poses, step, leads), leads
+    if is_large(poses):
+        _spatial_chain(poses, step, leads)
+        return poses, leads
     for node in np.flatnonzero(leads >= 0):
         poses[node] = poses[node - 1] @ step[node]
     return poses, leads
+
+
+@numba.njit(cache=True, nogil=True)
+def _spatial_chain(poses: Floats, step: Floats, leads: Ints) -> None:
+    """Each pose from the one before it and its step, all (N, 4, 4), in place, where an edge leads to it."""
+    for node in range(1, len(poses)):
+        if leads[node] >= 0:
+            for i in range(3):
+                for j in range(4):
+                    total = poses[node - 1, i, 3] if j == 3 else 0.0
+                    for k in range(3):
+                        total += poses[node - 1, i, k] * step[node, k, j]
+                    poses[node, i, j] = total
 
 
 def _planar_chain(poses: Floats, step: Floats, leads: Ints) -> Floats:
@@ -191,10 +214,10 @@ def _planar_chain(poses: Floats, step: Floats, leads: Ints) -> Floats:
     return result
 
 
-def far_from_odometry(graph: PoseGraph, probability: float) -> Bools:
+def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain | None = None) -> Bools:
     """Loops (E,) whose distance to the odometry alone is beyond what noise reaches with this probability."""
     bound = chi2_quantile(probability, degrees_of_freedom(graph))
-    return np.asarray(np.nan_to_num(residual_before(graph)) ** 2 > bound)
+    return np.asarray(np.nan_to_num(residual_before(graph, chain)) ** 2 > bound)
 
 
 def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:

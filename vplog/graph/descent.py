@@ -11,6 +11,7 @@ from vplog.errors import GraphError
 from vplog.graph.cholesky import OPEN, Blocks, Cholesky
 from vplog.graph.factors import GAUGE_SIGMA, Fit, anchored, least_squares
 from vplog.graph.normal import half_chi2_of, normal_equations
+from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -24,6 +25,9 @@ _DAMPING = 1e-5
 _DAMPING_CHANGE = 10.0
 _MOST_DAMPING = 1e5
 """Where it gives up, as GTSAM."""
+
+_ROWS = 1 << 14
+"""Poses that a thread moves at once, some megabytes."""
 
 
 def descend(factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float) -> Fit:
@@ -58,7 +62,7 @@ def descend_large(factors: Factors, weight: Floats, start: Floats, max_iteration
             continue
         steps += 1
         moved = _moved(poses, step, graph.dimension)
-        gain = error - half_chi2_of(graph, weight, moved)
+        gain = error - float(half_chi2_of(graph, weight, moved).sum())
         # a step gains at most as much less than the one before as that did: the next is not worth its time
         coming = gain * gain / last if 0 < gain < last else abs(gain)
         converged = bool(min(abs(gain), coming) <= tolerance * max(error, 1.0))
@@ -68,7 +72,7 @@ def descend_large(factors: Factors, weight: Floats, start: Floats, max_iteration
         last, error = gain, error - gain
         if gain >= 0:
             poses = moved
-        if not converged:
+        if not converged and steps < max_iterations:
             damping = damping / _DAMPING_CHANGE if damping > _DAMPING else 0.0
             matrix, slope, error = normal_equations(graph, weight, poses)
     if damping > _MOST_DAMPING:
@@ -98,7 +102,11 @@ def _root(factors: Factors, weight: Floats, matrix: Blocks, damping: float) -> C
 def _moved(poses: Floats, step: Floats, dimension: int) -> Floats:
     """The poses (N, 4, 4), each moved in its own frame by a twist (N, d)."""
     if dimension == 3:
-        return poses @ geometry.exp(step)
+        with Workers() as workers:
+            rows = [slice(first, first + _ROWS) for first in range(0, len(poses), _ROWS)]
+            return np.concatenate(
+                workers.each(lambda part: poses[part] @ geometry.exp(step[part]), [(r,) for r in rows])
+            )
     result = np.array(poses)
     cos, sin = np.cos(step[:, 0]), np.sin(step[:, 0])
     c, s = poses[:, 0, 0], poses[:, 1, 0]

@@ -7,11 +7,14 @@ the matrix for each node.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import gtsam
 import numba
 import numpy as np
+
+from vplog.graph.subtrees import Subtrees
 
 if TYPE_CHECKING:
     from vplog.data import Int32s, Ints
@@ -58,6 +61,11 @@ class Elimination:
         rows = _structure(n, first, neighbours, columns, parents, start)
         keys = np.sort(np.repeat(np.arange(len(size)) * n, size) + rows)  # by supernode, then row
         return cls(place, columns, parents, start, keys % n)
+
+    @cached_property
+    def subtrees(self) -> Subtrees:
+        """What of it can be worked on side by side."""
+        return Subtrees.of(self)
 
 
 def _dissected(n: int, a: Ints, b: Ints) -> Ints:

@@ -27,13 +27,14 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
-from vplog.graph.descent import descend
+from vplog.graph.descent import descend, is_large
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_kept
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.scrutiny import Scrutiny
 from vplog.graph.truncated import truncated_weights
+from vplog.graph.workers import Workers
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -42,6 +43,16 @@ if TYPE_CHECKING:
     from vplog.data import Floats, Ints, PoseGraph, Solution
 
     Bools = NDArray[np.bool_]
+
+_AT_ONCE = 3
+"""Stages that a large graph takes as one, of one least squares step. Drives of 12 000 poses keep the same closures as
+stage by stage, of 100 000 poses all but one of 5948, with half of the factorisations."""
+_FIRST_STEPS = 5
+"""Least squares steps of a large graph before its stages at most. 100 000 poses take 3; where false closures are left
+that bend a million, 20 and more do not settle them, and the stages need no settled start."""
+_BRANCHES = 200
+"""Of the search for the largest set of each two pieces of a large graph: a greedy one and some more. Where some hundred
+closures join two drives, one in a hundred pairs of which disagrees by chance, an exact search does not end."""
 
 
 class GncSettings(Settings):
@@ -77,13 +88,16 @@ class GncSettings(Settings):
         if len(loops) == 0:
             start = initial_poses(factors, weight)
             return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, "")
-        agreed = agreement(graph, loops)
-        gated = far_from_odometry(graph, self.gate_probability)[loops]
-        weight[loops] = (agreed.probability > 0.5) & ~gated & self._join(graph, loops)
+        chain = OdometryChain.of(graph)
+        agreed = agreement(graph, loops, chain)
+        gated = far_from_odometry(graph, self.gate_probability, chain)[loops]
+        weight[loops] = (agreed.probability > 0.5) & ~gated & self._join(graph, loops, chain)
         apart = int((weight[loops] == 0).sum() - gated.sum())
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
         weight, poses, stages = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
-        scrutiny = Scrutiny(factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations)
+        scrutiny = Scrutiny(
+            factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
+        )
         state = scrutiny(weight, poses)
         kept = int(state.weight[loops].sum())
         taken = "1 stage" if stages == 1 else f"{stages} stages"
@@ -93,19 +107,23 @@ class GncSettings(Settings):
         )
         return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
-    def _join(self, graph: PoseGraph, loops: Ints) -> Bools:
+    def _join(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest set that agrees."""
-        chain = OdometryChain.of(graph)
         part = chain.part
         one, two = part[graph.a[loops]], part[graph.b[loops]]
         across = one != two
         consistency = PcmSettings(pair_probability=self.inlier_probability)
+        if is_large(chain.poses):
+            consistency = consistency.model_copy(update={"clique_steps": _BRANCHES})
         good = ~across
         # closures between other pieces say nothing about each other, so each two pieces are judged by themselves
         pairs = np.minimum(one, two) * (int(part.max()) + 1) + np.maximum(one, two)
-        for pair in np.unique(pairs[across]).tolist():
-            kept, _ = consistency.consistent(graph, loops[across & (pairs == pair)], chain)
-            good[np.searchsorted(loops, kept)] = True
+        by_pair = np.flatnonzero(across)[np.argsort(pairs[across], kind="stable")]
+        first = np.flatnonzero(np.diff(pairs[by_pair], prepend=-1))
+        with Workers() as workers:
+            tasks = [(graph, loops[rows], chain) for rows in np.split(by_pair, first)[1:]]
+            for kept, _ in workers.each(consistency.consistent, tasks):
+                good[np.searchsorted(loops, kept)] = True
         return good
 
     def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats, int]:
@@ -114,7 +132,10 @@ class GncSettings(Settings):
         judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
         if len(judged) == 0:
             return weight, poses, 0
-        poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
+        first, steps, growth = self.max_iterations, self.steps, self.growth
+        if is_large(poses):
+            first, steps, growth = min(first, _FIRST_STEPS), 1, growth**_AT_ONCE
+        poses = descend(factors, weight, poses, first, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         stage = 0
@@ -122,7 +143,7 @@ class GncSettings(Settings):
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
-            poses = descend(factors, weight, poses, self.steps, self.stage_tolerance).world_from_body
+            poses = descend(factors, weight, poses, steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
-            mu *= self.growth
+            mu *= growth
         return np.where(weight > 0.5, 1.0, 0.0), poses, stage

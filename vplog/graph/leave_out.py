@@ -117,13 +117,13 @@ def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Float
     return error, jacobian[:, axes][:, :, axes]
 
 
-def groups(graph: PoseGraph, loops: Ints) -> list[Ints]:
+def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> list[Ints]:
     """Places among `loops` (K,) of which the closures support each other, as positions within `loops`.
 
     Two closures are of one place where the odometry between their ends adds less noise than they have themselves, and
-    so on from neighbour to neighbour.
+    so on from neighbour to neighbour. `chain` is the graph's where it is at hand.
     """
-    chain = OdometryChain.of(graph)
+    chain = chain or OdometryChain.of(graph)
     own: Floats = np.asarray(
         np.median(np.diagonal(np.linalg.inv(informed(graph)[loops]), axis1=1, axis2=2), axis=0), np.float64
     )
@@ -151,7 +151,9 @@ def groups(graph: PoseGraph, loops: Ints) -> list[Ints]:
     return [order[part] for part in np.split(by_group, np.cumsum(np.bincount(label))[:-1])]
 
 
-def group_costs(graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, places: list[Ints]) -> Floats:
+def group_costs(
+    graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, places: list[Ints], chain: OdometryChain | None = None
+) -> Floats:
     """At most how much chi-square falls without each place (G,), about.
 
     The members pull as one at their middle one. Against them stands the way round by another place or by the odometry,
@@ -159,7 +161,7 @@ def group_costs(graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, pla
     little as a rule, so a large figure is a reason to look closely. What the members pull against each other is added.
     """
     axes = AXES[graph.dimension]
-    chain = OdometryChain.of(graph)
+    chain = chain or OdometryChain.of(graph)
     information = informed(graph)
     middle = np.array([loops[place[len(place) // 2]] for place in places])
     member = np.concatenate(places)

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from math import atan2, cos, sin, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 
-from vplog.graph.build import informed
 from vplog.graph.cholesky import Blocks
+from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Int32s, PoseGraph
+    from collections.abc import Callable
+
+    from vplog.data import Floats, Int32s, Ints, PoseGraph
+
+
+_LEAST_SHARE = 1024
+"""Poses or edges that a thread takes at least, half a millisecond."""
+_BY_THREAD = 4
+"""Shares for each thread, so that none waits long for another that was held up."""
 
 
 def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[Blocks, Floats, float]:
@@ -25,46 +33,98 @@ def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[B
     size = 3 if graph.dimension == 2 else 6
     n, edges = len(poses), len(graph.a)
     diagonal, slope = np.zeros((n, size, size)), np.zeros((n, size))
-    other = np.empty((edges, size, size))
-    terms = _planar if graph.dimension == 2 else _spatial
-    information = np.ascontiguousarray(informed(graph), np.float64)
-    error = terms(
-        graph.a, graph.b, np.ascontiguousarray(graph.a_from_b), information, weight, np.ascontiguousarray(poses),
-        diagonal, other, slope,
-    )  # fmt: skip
-    return Blocks(diagonal, graph.a, graph.b, other), slope, error
+    other, half = np.empty((edges, size, size)), np.empty(edges)
+    terms, given = _terms(graph, weight, poses)
+    with Workers() as workers:
+        # each thread adds to its own poses alone, edge by edge in their order; an edge between two threads' is for both
+        ranges = workers.ranges(0, n, _LEAST_SHARE, _BY_THREAD)
+        begin, listed = _by_range(np.array([low for low, _ in ranges] + [n]), graph.a, graph.b)
+        workers.each(
+            terms,
+            [
+                (listed[begin[at] : begin[at + 1]], low, high, *given, half, diagonal, other, slope)
+                for at, (low, high) in enumerate(ranges)
+            ],
+        )
+    return Blocks(diagonal, graph.a, graph.b, other), slope, float(half.sum())
 
 
-def half_chi2_of(graph: PoseGraph, weight: Floats, poses: Floats) -> float:
-    """Half the weighted chi-square, at `poses`."""
-    terms = _planar if graph.dimension == 2 else _spatial
-    none = np.empty((0, 0, 0))
-    information = np.ascontiguousarray(informed(graph), np.float64)
-    return terms(
-        graph.a, graph.b, np.ascontiguousarray(graph.a_from_b), information, weight, np.ascontiguousarray(poses),
-        none, none, np.empty((0, 0)),
-    )  # fmt: skip
+def half_chi2_of(graph: PoseGraph, weight: Floats, poses: Floats, edges: Ints | None = None) -> Floats:
+    """Half the weighted chi-square of each edge (E,), or of those named, at `poses`."""
+    terms, given = _terms(graph, weight, poses)
+    half, none = np.zeros(len(graph.a)), np.empty((0, 0, 0))
+    wanted = np.arange(len(half)) if edges is None else np.asarray(edges, np.int64)
+    with Workers() as workers:
+        parts = workers.ranges(0, len(wanted), _LEAST_SHARE, _BY_THREAD)
+        tasks = [(wanted[low:high], 0, len(poses), *given, half, none, none, np.empty((0, 0))) for low, high in parts]
+        workers.each(terms, tasks)
+    return half if edges is None else half[edges]
+
+
+def _terms(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    """What adds up the edges of the graph, and what it needs to know of them."""
+    planar = graph.dimension == 2
+    information = graph.information[:, 2:5, 2:5] if planar else graph.information  # yaw, x, y
+    given = (graph.a_from_b, information, weight, poses)
+    given = tuple(np.ascontiguousarray(one, np.float64) for one in given)
+    return _planar if planar else _spatial, (graph.a, graph.b, *given)
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_range(ends: Ints, a: Int32s, b: Int32s) -> tuple[Ints, Ints]:
+    """The edges that have an end in each of R ranges of poses, ends[r] to ends[r + 1], in their order.
+
+    Where each range begins (R + 1,), and edges.
+    """
+    of = np.empty(ends[-1], np.int64)
+    for part in range(len(ends) - 1):
+        of[ends[part] : ends[part + 1]] = part
+    begin = np.zeros(len(ends) + 1, np.int64)
+    for edge in range(len(a)):
+        begin[of[a[edge]] + 2] += 1
+        if of[a[edge]] != of[b[edge]]:
+            begin[of[b[edge]] + 2] += 1
+    for part in range(len(ends)):
+        begin[part + 1] += begin[part]
+    listed = np.empty(begin[-1], np.int64)
+    for edge in range(len(a)):
+        one, two = of[a[edge]], of[b[edge]]
+        listed[begin[one + 1]] = edge
+        begin[one + 1] += 1
+        if one != two:
+            listed[begin[two + 1]] = edge
+            begin[two + 1] += 1
+    return begin[:-1].copy(), listed
 
 
 @numba.njit(cache=True, nogil=True)
 def _planar(
+    edges: Ints,
+    low: int,
+    high: int,
     a: Int32s,
     b: Int32s,
     measured: Floats,
     information: Floats,
     weight: Floats,
     poses: Floats,
+    half: Floats,
     diagonal: Floats,
     other: Floats,
     slope: Floats,
-) -> float:
-    """Add what each edge says; nothing but half the chi-square where `diagonal` is empty."""
-    total = 0.0
+) -> None:
+    """Add what these edges say about poses low:high; nothing but half the chi-square where `diagonal` is empty.
+
+    What belongs to an edge and not to a pose is told by whoever has its first end.
+    """
     error, move, bend, turned, say = np.empty(3), np.zeros((3, 3)), np.eye(3), np.empty((3, 3)), np.empty((3, 3))
-    for edge in range(len(a)):
+    for at in range(len(edges)):
+        edge = int(edges[at])
         if weight[edge] == 0.0:
-            if len(diagonal):
-                other[edge] = 0.0
+            if low <= a[edge] < high:
+                half[edge] = 0.0
+                if len(diagonal):
+                    other[edge] = 0.0
             continue
         one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
         # b seen from a, and that seen from where b was measured
@@ -75,13 +135,13 @@ def _planar(
         ex, ey = x - seen[0, 3], y - seen[1, 3]
         ex, ey = seen[0, 0] * ex + seen[1, 0] * ey, seen[0, 1] * ex + seen[1, 1] * ey
         turn = atan2(seen[0, 0] * s - seen[1, 0] * c, seen[0, 0] * c + seen[1, 0] * s)
-        half = turn / 2.0
-        straight = 1.0 - half**2 / 3.0 - half**4 / 45.0 - 2.0 * half**6 / 945.0  # h cot h where h is small
+        h = turn / 2.0
+        straight = 1.0 - h**2 / 3.0 - h**4 / 45.0 - 2.0 * h**6 / 945.0  # h cot h where h is small
         curve = 1.0 / 12.0 + turn * turn / 720.0
-        if abs(half) >= 1e-2:
-            straight = half * cos(half) / sin(half)
+        if abs(h) >= 1e-2:
+            straight = h * cos(h) / sin(h)
             curve = (1.0 - straight) / (turn * turn)
-        error[0], error[1], error[2] = turn, straight * ex + half * ey, straight * ey - half * ex
+        error[0], error[1], error[2] = turn, straight * ex + h * ey, straight * ey - h * ex
         # Ad(b_from_a), negative; b_from_a turns by -turn of b and shifts by (-c x - s y, s x - c y)
         move[0, 0] = -1.0
         move[1, 0], move[2, 0] = -(s * x - c * y), -(c * x + s * y)
@@ -90,37 +150,46 @@ def _planar(
         bend[1, 0] = error[2] / 2.0 + curve * turn * error[1]
         bend[2, 0] = -error[1] / 2.0 + curve * turn * error[2]
         bend[1, 1] = bend[2, 2] = 1.0 - curve * turn * turn
-        bend[1, 2], bend[2, 1] = -half, half
+        bend[1, 2], bend[2, 1] = -h, h
         _product(bend, move, turned)
-        total += _add(
-            edge, a[edge], b[edge], error, turned, bend, information, weight[edge], diagonal, other, slope, say
-        )
-    return total
+        _add(
+            edge, a[edge], b[edge], low, high, error, turned, bend, information, weight[edge], half, diagonal, other,
+            slope, say,
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def _spatial(
+    edges: Ints,
+    low: int,
+    high: int,
     a: Int32s,
     b: Int32s,
     measured: Floats,
     information: Floats,
     weight: Floats,
     poses: Floats,
+    half: Floats,
     diagonal: Floats,
     other: Floats,
     slope: Floats,
-) -> float:
-    """Add what each edge says; nothing but half the chi-square where `diagonal` is empty."""
-    total = 0.0
+) -> None:
+    """Add what these edges say about poses low:high; nothing but half the chi-square where `diagonal` is empty.
+
+    What belongs to an edge and not to a pose is told by whoever has its first end.
+    """
     error, move, bend, moved, say = (
         np.empty(6), np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     )  # fmt: skip
     ad, square, fourth = np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     turned, rest, x, shift = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    for edge in range(len(a)):
+    for at in range(len(edges)):
+        edge = int(edges[at])
         if weight[edge] == 0.0:
-            if len(diagonal):
-                other[edge] = 0.0
+            if low <= a[edge] < high:
+                half[edge] = 0.0
+                if len(diagonal):
+                    other[edge] = 0.0
             continue
         one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
         for i in range(3):  # b seen from a
@@ -148,10 +217,10 @@ def _spatial(
             )
         _bend(error, bend, ad, square, fourth)
         _product(bend, move, moved)
-        total += _add(
-            edge, a[edge], b[edge], error, moved, bend, information, weight[edge], diagonal, other, slope, say
-        )
-    return total
+        _add(
+            edge, a[edge], b[edge], low, high, error, moved, bend, information, weight[edge], half, diagonal, other,
+            slope, say,
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
@@ -228,32 +297,38 @@ def _bend(error: Floats, bend: Floats, ad: Floats, square: Floats, fourth: Float
 
 
 @numba.njit(cache=True, nogil=True)
-def _add(
+def _add(  # noqa: PLR0912 (one loop nest, compiled)
     edge: int,
     a: int,
     b: int,
+    low: int,
+    high: int,
     error: Floats,
     by_a: Floats,
     by_b: Floats,
     information: Floats,
     weight: float,
+    half: Floats,
     diagonal: Floats,
     other: Floats,
     slope: Floats,
     say: Floats,
-) -> float:
+) -> None:
     """Half the chi-square of one edge, which moves with its ends as `by_a` and `by_b` (d, d) say; its share of the
-    normal equations is added."""
+    normal equations of poses low:high is added."""
     size = len(error)
     believed = information[edge]
-    half = 0.0
-    for i in range(size):
-        for j in range(size):
-            half += 0.5 * weight * error[i] * believed[i, j] * error[j]
+    if low <= a < high:
+        half[edge] = 0.0
+        for i in range(size):
+            for j in range(size):
+                half[edge] += 0.5 * weight * error[i] * believed[i, j] * error[j]
     if len(diagonal) == 0:
-        return half
+        return
     for end in range(2):
         node, by = (a, by_a) if end == 0 else (b, by_b)
+        if not low <= node < high:
+            continue
         for i in range(size):  # J^T of the edge times its information
             for j in range(size):
                 say[i, j] = 0.0
@@ -269,4 +344,3 @@ def _add(
                     other[edge, i, j] = 0.0
                     for k in range(size):
                         other[edge, i, j] += say[i, k] * by_b[k, j]
-    return half

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
     Bools = NDArray[np.bool_]
 
+_PAIRS = 1 << 12
+"""Pairs of closures that are compared at once: some megabytes."""
+
 
 class PcmSettings(Settings):
     """Largest set of pairwise consistent closures, then least squares."""
@@ -102,15 +105,19 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChai
     noise = np.where(back, after @ noise @ np.swapaxes(after, 1, 2), noise)
     piece = np.stack([chain.part[a], chain.part[b]], axis=1)
     result = np.ones((len(loops), len(loops)), bool)
-    for this in range(len(loops) - 1):
-        other = np.flatnonzero((piece[this + 1 :] == piece[this]).all(1)) + this + 1
+    one, two = np.triu_indices(len(loops), 1)
+    alike = (piece[one] == piece[two]).all(1)
+    one, two = one[alike], two[alike]
+    for first in range(0, len(one), _PAIRS):
+        this, other = one[first : first + _PAIRS], two[first : first + _PAIRS]
         error = geometry.log(geometry.between(displaced[this], displaced[other]))[:, axes]
         walk_a, walk_b = (
             np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None]
             * (chain.total[end[other]] - chain.total[end[this]])
             for end in (a, b)
         )
-        covariance = noise[this] + noise[other] + walk_b + after[this] @ walk_a @ after[this].T
+        turned = np.swapaxes(after[this], 1, 2)
+        covariance = noise[this] + noise[other] + walk_b + after[this] @ walk_a @ turned
         chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
         result[this, other] = result[other, this] = chi2 <= bound
     return result

@@ -16,6 +16,7 @@ from vplog.graph.marginals import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
+    from vplog.graph.consistency import OdometryChain
     from vplog.graph.factors import Factors
     from vplog.graph.leave_out import Tension
 
@@ -53,6 +54,7 @@ class Scrutiny:
     log_room: float
     """Log of the volume over which false ones are spread, in m and rad."""
     max_iterations: int
+    chain: OdometryChain
 
     def __call__(self, weight: Floats, poses: Floats) -> State:
         """Put away what costs the rest too much, take back what the rest predicts, until neither is left to do."""
@@ -92,8 +94,8 @@ class Scrutiny:
         without where that speaks against it, too. Those that turn out well are added to `cleared`.
         """
         factors = self.factors
-        places = groups(factors.graph, kept)
-        suspicion = np.minimum(group_costs(factors.graph, state.poses, kept, pull, places), state.chi2)
+        places = groups(factors.graph, kept, self.chain)
+        suspicion = np.minimum(group_costs(factors.graph, state.poses, kept, pull, places, self.chain), state.chi2)
         size = np.array([len(place) for place in places])
         limit = np.full(len(places), np.inf)  # of one: answered already
         for members in np.unique(size[size > 1]).tolist():
