@@ -25,7 +25,8 @@ CHANNELS = {i: Channel(f"/{i}", "sensor_msgs/msg/Image", "cdr") for i in range(3
 
 
 @pytest.mark.parametrize("threads", [False, True])
-def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool) -> None:
+def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks_module, "_ALONE_S", 0.0)
     size, lost, loaded = 2**20, [], []
 
     def load(number: int) -> bytes:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vplog import logs
 from vplog.logs.containers import Channel
-from vplog.logs.messages import BadMessageError, PoseMessage, decode
+from vplog.logs.messages import BadMessageError, decode
 
 from .drives import HEIGHT, WIDTH, D, Drive, K, foxglove_messages, png, write_raw
 
@@ -104,7 +104,7 @@ def test_every_type_agrees_with_protobuf() -> None:
         else:
             pairs = [(by_flat, by_proto)]
         for a, b in pairs:
-            for key, value in (b._asdict() if isinstance(b, PoseMessage) else vars(b)).items():
+            for key, value in (b._asdict() if isinstance(b, tuple) else vars(b)).items():
                 np.testing.assert_array_equal(getattr(a, key), value, err_msg=f"{name}.{key}")
 
 

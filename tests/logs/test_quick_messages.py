@@ -42,7 +42,7 @@ def ros(kind: str, ros_version: int, sec: int, nanosec: int, frame: str, **field
 def same(found: Any, expected: Any) -> None:
     assert found is not None
     assert type(found) is type(expected)
-    for name, value in vars(expected).items():
+    for name, value in (expected._asdict() if hasattr(expected, "_asdict") else vars(expected)).items():
         np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import threading
+import time
 import weakref
 from collections import OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +24,9 @@ in longer ones image and depth, which lie in neighbouring chunks, do not unpack 
 _THREADS = min(2, os.cpu_count() or 1)
 """Threads that read ahead: each unpacks about 1 GB/s, and images are gone through twice as fast. More cost more time of
 the processor than they save."""
+_ALONE_S = 0.02
+"""Seconds of unpacking before other threads help. To start them and to hand over costs a few ms, and while a log is
+opened images are decoded on the other cores; what takes long to unpack, by its size or its packing, is there soon."""
 _LEAST_BYTES = 64 * 2**10
 """Size of a chunk from which another thread unpacks it: handing over takes as long as some 50 kB."""
 _AHEAD_BYTES = 32 * 2**20
@@ -85,19 +89,20 @@ class Chunks:
     def in_turn(
         self, numbers: Iterable[int], stays: Callable[[int], bool] | None = None
     ) -> Generator[tuple[int, bytes | None]]:
-        """Each number with its chunk, None where it `stays` in the file. Those that follow are unpacked meanwhile, but
-        none before the second chunk is asked for: who only looks for the first message of a topic does not."""
-        numbers = iter(numbers)
+        """Each number with its chunk, None where it `stays` in the file. Those that follow are unpacked meanwhile once
+        that saves time; who only looks for the first message of a topic starts no thread."""
+        numbers, spent_s = iter(numbers), 0.0
         for number in numbers:
-            if stays is None or not stays(number):
-                if _KEPT.get((self._file, number)) is None:
-                    yield number, self(number)
-                else:  # who comes for it again goes on
-                    numbers = itertools.chain([number], numbers)
+            if stays and stays(number):
+                yield number, None
+                continue
+            began_s = time.perf_counter()
+            data = self(number)
+            spent_s += time.perf_counter() - began_s
+            yield number, data
+            if spent_s >= _ALONE_S and self._threads:
                 break
-            yield number, None
-        if not self._threads:
-            yield from ((number, None if stays and stays(number) else self(number)) for number in numbers)
+        else:
             return
         with ThreadPoolExecutor(self._threads, "vplog-read-ahead") as pool:
             yield from self._ahead(numbers, stays, pool)

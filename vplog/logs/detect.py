@@ -39,6 +39,8 @@ def open_log(path: Path, choice: TopicChoice) -> Log:
     try:
         if not path.exists():
             raise LogError(f"No log at {path}: there is no such file or folder.")
+        if not (path.is_dir() or path.is_file()):  # to open a pipe would wait for its writer
+            raise LogError(f"{path} is neither a file nor a folder. A log is {_KNOWN}.")
         return _open_folder(path, choice, notes) if path.is_dir() else _open_file(path, choice, notes)
     except OSError as error:
         reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")

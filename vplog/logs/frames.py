@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vplog.data import Frame
 from vplog.errors import LogError
+from vplog.logs.image_message import read_image
 from vplog.logs.images import depth_m, grey
 from vplog.logs.messages import BadMessageError, ImageMessage, decode
 
@@ -38,7 +39,8 @@ class Encoded:
 
     def _pixels(self, stamp_ns: int, convert: Callable[[ImageMessage], np.ndarray]) -> Any:
         try:
-            message = decode(self.channel, self.data)
+            # what each step here takes, other threads wait for: the interpreter is one
+            message = read_image(self.channel, self.data, copy=False) or decode(self.channel, self.data)
             if not isinstance(message, ImageMessage):
                 raise BadMessageError("it is not an image message")
             return convert(message)

@@ -63,12 +63,16 @@ def stamp_of_image(channel: Channel, data: Octets) -> int | None:
     return None if found is None else nanoseconds(found[0].timestamp.seconds, found[0].timestamp.nanos)
 
 
-def read_image(channel: Channel, data: Octets) -> ImageMessage | None:
-    """The record that the general decoder gives, or None as above. Raises BadMessageError likewise."""
+def read_image(channel: Channel, data: Octets, copy: bool = True) -> ImageMessage | None:
+    """The record that the general decoder gives, or None as above; without `copy`, its data are a view of the message.
+
+    Raises BadMessageError likewise.
+    """
     found = locate_image(channel, data)
     if found is None:
         return None
-    pixels = bytes(data[found.start : found.stop])
+    view = memoryview(data)[found.start : found.stop]
+    pixels = bytes(view) if copy else view
     return ImageMessage(found.stamp_ns, found.frame, found.encoding, pixels, *found[5:])
 
 

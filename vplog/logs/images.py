@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
+from vplog.logs.checksum import crc32
 from vplog.logs.messages import BadMessageError
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Float32s
+    from vplog.logs.containers import Octets
     from vplog.logs.messages import ImageMessage
 
 MAX_PIXELS = 2**26
@@ -24,6 +25,8 @@ and progressive JPEG stay below 512 px. WebP has no such limit; MAX_PIXELS alone
 _DEPTH_HEADER = 12
 """Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""
 _PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+"""Markers that a JPEG begins and ends with: ITU T.81, table B.1. Some cameras write more behind its end."""
 _INVALID_MM = (0, 65535)
 """Depth values in mm that mean no measurement: 0 in ROS REP 118 and cameras' firmware, 65535 in 7-Scenes."""
 
@@ -102,12 +105,12 @@ def depth_m(message: ImageMessage) -> Float32s:
     if not message.compressed:
         pixels, _ = _raw(message)
         return _metres(pixels, message.encoding)
-    if message.data.startswith(_PNG):
+    if message.data[:8] == _PNG:
         return _metres(_imdecode(message.data, cv2.IMREAD_UNCHANGED), message.encoding)
     if "rvl" in message.encoding.lower():
         from vplog.logs.rvl import decode_rvl  # numba loads here
 
-        pixels = decode_rvl(message.data[_DEPTH_HEADER:])
+        pixels = decode_rvl(bytes(message.data[_DEPTH_HEADER:]))
     else:
         pixels = _imdecode(message.data[_DEPTH_HEADER:], cv2.IMREAD_UNCHANGED)
     if not message.encoding.startswith("32FC1"):
@@ -149,14 +152,16 @@ def _raw(message: ImageMessage) -> tuple[Any, int | None]:
     return (pixels if channels == 1 else pixels.reshape(height, width, channels)), conversion
 
 
-def _imdecode(data: bytes, flags: int) -> Any:
+def _imdecode(data: Octets, flags: int) -> Any:
     """OpenCV's decoder, after the size in the file's own header was found believable."""
+    if data[:2] != _JPEG:
+        data = bytes(data)
     size = image_size(data)
     if size is None:
         raise BadMessageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP or PNM image")
-    if data.startswith(_PNG) and not _png_is_sound(data):
+    if data[:8] == _PNG and not _png_is_sound(bytes(data)):
         raise BadMessageError("the checksum of its PNG does not match")
-    limit = MAX_PIXELS if data.startswith(b"RIFF") else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
+    limit = MAX_PIXELS if data[:4] == b"RIFF" else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
     if size[0] * size[1] > limit:
         raise BadMessageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
     try:
@@ -169,13 +174,13 @@ def _imdecode(data: bytes, flags: int) -> Any:
     return image
 
 
-def image_size(data: bytes) -> tuple[int, int] | None:
+def image_size(data: Octets) -> tuple[int, int] | None:
     """Width and height that an image file claims in its header; None where it is of another kind or damaged."""
-    size = None
+    if data[:2] == _JPEG:
+        return _jpeg_size(data)
+    size, data = None, bytes(data)
     if data.startswith(_PNG):
         size = _png_size(data)
-    elif data[:2] == b"\xff\xd8":
-        size = _jpeg_size(data)
     elif data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
         size = _webp_size(data)
     elif data[:2] == b"BM" and len(data) >= 26:
@@ -204,9 +209,7 @@ def _png_is_sound(data: bytes) -> bool:
     while position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
         stop = position + 8 + length
-        if stop + 4 > len(data) or zlib.crc32(view[position + 4 : stop]) != int.from_bytes(
-            data[stop : stop + 4], "big"
-        ):
+        if stop + 4 > len(data) or crc32(view[position + 4 : stop]) != int.from_bytes(data[stop : stop + 4], "big"):
             return False
         if kind == b"IEND":
             return True
@@ -226,7 +229,7 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+def _jpeg_size(data: Octets) -> tuple[int, int] | None:
     position = 2
     while position + 9 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -236,6 +239,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame: ITU T.81, table B.1
             height, width = struct.unpack_from(">HH", data, position + 5)
             # Without an end marker behind this (thumbnails lie before it) the file is cut; OpenCV would grey the rest.
-            return (width, height) if data.rfind(b"\xff\xd9") > position else None
+            ends = data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > position
+            return (width, height) if ends else None
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
     return None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from typing import TYPE_CHECKING
 
 from mcap import records
@@ -15,6 +14,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
+from vplog.logs.checksum import crc32
 from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
 from vplog.logs.containers import Channel, Contents, Notes, by_topic, ordered, plural
@@ -200,7 +200,7 @@ class McapFile:
             return data
         data = unpack(chunk.compression, data, chunk.size, partial=chunk.cut)
         if chunk.crc and not chunk.cut and not self._sound[number]:
-            if zlib.crc32(data) != chunk.crc:
+            if crc32(data) != chunk.crc:
                 raise BadChunkError("its checksum does not match", data)
             self._sound[number] = 1
         return data

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
-_IS_MESSAGE, _DEFINES = int(Opcode.MESSAGE), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
+_IS_MESSAGE, _IS_SCHEMA, _DEFINES = int(Opcode.MESSAGE), int(Opcode.SCHEMA), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
 _WINDOW = 4096
 """Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
 _BRIEF = 16
@@ -108,8 +108,7 @@ class Walk:
                 elif channel_id not in self._channels:
                     self.unknown += 1
             elif opcode in _DEFINES:
-                self._define(opcode, data[at + RECORD.size : stop])
-                used = self._used = self._wanted_ids()
+                self._learn(opcode, data[at + RECORD.size : stop])
             at = stop
         while at + RECORD.size <= size:  # too short for a message
             opcode, length = RECORD.unpack_from(data, at)
@@ -117,10 +116,20 @@ class Walk:
             if stop > size:
                 break
             if opcode in _DEFINES:
-                self._define(opcode, data[at + RECORD.size : stop])
-                used = self._used = self._wanted_ids()
+                self._learn(opcode, data[at + RECORD.size : stop])
             at = stop
         self.position = base + at
+
+    def _learn(self, opcode: int, data: bytes) -> None:
+        """Take a definition; it may be of a wanted channel, and a log may have ten thousands of them."""
+        self._define(opcode, data)
+        number = int.from_bytes(data[:2], "little")  # of a schema or channel record, its first field
+        channel = self._channels.get(number)
+        if opcode != _IS_SCHEMA and channel is not None:
+            if self._wanted is None or channel in self._wanted:
+                self._used[number] = channel
+            else:
+                self._used.pop(number, None)
 
     def _wanted_ids(self) -> dict[int, Channel]:
         wanted = self._wanted

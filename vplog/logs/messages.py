@@ -19,13 +19,15 @@ class BadMessageError(Exception):
     """A message's bytes are not what its type says."""
 
 
-@dataclass(frozen=True, eq=False)
-class ImageMessage:
+class ImageMessage(NamedTuple):
+    """A tuple, which is made in no time: one is for every image."""
+
     stamp_ns: int
     frame: str
     encoding: str
     """ROS name of the pixel layout (`mono8`, `16UC1`, ...); the format string where compressed."""
-    data: bytes
+    data: Octets
+    """A view only where it was asked for."""
     compressed: bool
     width: int = 0
     height: int = 0

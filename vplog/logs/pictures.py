@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,30 +15,13 @@ from vplog.logs.messages import BadMessageError, ImageMessage, decode
 from vplog.logs.video import VideoStream
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor, Future
-
     from vplog.data import Float32s
     from vplog.logs.containers import Channel, Container, Notes, Place
     from vplog.logs.content import Content
+    from vplog.logs.early import EarlyImages
 
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
-
-
-class Early(NamedTuple):
-    """An image that is decoded while the log is read."""
-
-    place: Place
-    frame_and_size: Future[tuple[str, tuple[int, int]]]
-    """As `Pictures.first` gives them; BadMessageError where it does not decode."""
-
-
-def decode_early(container: Container, channel: Channel, pool: Executor) -> Early | None:
-    """The first image of a topic, of which the size of all is to be told: idle cores may as well find it."""
-    message = next(container.messages([channel]), None)
-    if message is None:
-        return None
-    return Early(message.place, pool.submit(_frame_and_size, channel, bytes(message.data)))
 
 
 def _frame_and_size(channel: Channel, data: bytes) -> tuple[str, tuple[int, int]]:
@@ -59,9 +42,10 @@ class Pictures:
         codec: str,
         content: Content,
         notes: Notes,
-        early: Early | None = None,
+        early: EarlyImages,
     ) -> None:
-        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
+        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty. `early` has what is decoded
+        of `image` already."""
         self._container, self._image, self._early = container, image, early
         self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
@@ -71,11 +55,16 @@ class Pictures:
         if self._image is None:
             raise LogError("No image topic is chosen.")
         if self._video is None:
-            return Encoded(self._image, self._container.read(self.content.places[row]))
+            place = self.content.places[row]
+            return self._early.take(place) or Encoded(self._image, self._container.read(place))
         try:
             return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])), "")
         except BadMessageError as error:
             return Decoded(self._image, None, str(error))
+
+    def forget_early(self) -> None:
+        """Give back the memory of images that nobody asked for."""
+        self._early.forget()
 
     def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
         """The depth or right image of a row; None where there is none."""
@@ -90,8 +79,8 @@ class Pictures:
         video, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:
-                if self._early is not None and place == self._early.place:
-                    return self._early.frame_and_size.result()
+                if channel == self._image and (found := self._early.frame_and_size(place)) is not None:
+                    return found
                 if video is None:
                     return _frame_and_size(channel, self._container.read(place))
                 message = decode(channel, self._container.read(place))
@@ -122,7 +111,7 @@ class Pictures:
                 message = decode(image, self._container.read(places[row]))
             except BadMessageError:
                 return b""
-            return message.data if isinstance(message, ImageMessage) else b""
+            return bytes(message.data) if isinstance(message, ImageMessage) else b""
 
         return VideoStream(codec, image.topic, payload, len(places))
 

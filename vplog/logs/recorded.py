@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,9 +12,10 @@ from vplog.logs.beside import Beside
 from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
 from vplog.logs.candidates import read_candidates
 from vplog.logs.content import read_content
+from vplog.logs.early import EarlyImages
 from vplog.logs.frames import RecordedFrame, size_of
 from vplog.logs.losses import Account
-from vplog.logs.pictures import Pictures, decode_early
+from vplog.logs.pictures import Pictures
 from vplog.logs.select import TopicChoice, select
 from vplog.logs.stamps import rows_of
 from vplog.logs.stereo import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
@@ -104,6 +104,7 @@ class RecordedLog:
         camera = self.camera()
         for row in rows_of(self._content.stamp_ns, stamp_ns, self._name):
             yield self._frame(row, camera)
+        self._pictures.forget_early()
 
     def odometry(self) -> Odometry | None:
         return self._beside_log.odometry or self._content.odometry
@@ -162,9 +163,8 @@ class RecordedLog:
     def _pictures(self) -> Pictures:
         image = self._selection.image
         codec = self._codec(image)
-        with ThreadPoolExecutor(1, "vplog-first-image") as pool:
-            early = None if image is None or codec else decode_early(self._container, image, pool)
-            content = read_content(self._container, self._selection, self._notes)
+        with EarlyImages(self._container, None if codec else image) as early:
+            content = read_content(self._container, self._selection, self._notes, early)
         return Pictures(self._container, image, codec, content, self._notes, early)
 
     @property

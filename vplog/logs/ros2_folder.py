@@ -24,6 +24,8 @@ _MAX_METADATA = 4 * 2**20
 
 _MOST_MESSAGES = 2**48
 """Messages of a topic that are believed: more than a recorder writes in its life."""
+_DEEPEST = 64
+"""Levels of lists and maps in metadata.yaml; rosbag2 writes 8."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -189,12 +191,23 @@ def split_parts(files: list[Path]) -> list[Path] | None:
     return [file for _, file in numbers]
 
 
+def _check_depth(text: str) -> None:
+    """Raises ValueError for what nests deeper than any bag's metadata: libyaml's loader would use up the C stack."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise ValueError(f"it nests more than {_DEEPEST} deep")
+
+
 def _metadata(folder: Path) -> dict:
     path = folder / "metadata.yaml"
     try:
         if path.stat().st_size > _MAX_METADATA:
             raise MetadataError(f"{path} is larger than {_MAX_METADATA >> 20} MiB, so it is not a bag's metadata.")
-        tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_LOADER)  # noqa: S506 - both choices are safe loaders
+        text = path.read_text(encoding="utf-8")
+        _check_depth(text)
+        tree = yaml.load(text, Loader=_LOADER)  # noqa: S506 - both choices are safe loaders
         tree = tree["rosbag2_bagfile_information"]
     except (OSError, UnicodeDecodeError, RecursionError, TypeError, KeyError, ValueError, yaml.YAMLError):
         tree = None

@@ -21,6 +21,8 @@ _MOST_TRIED = 20_000
 """Rows that are looked for one by one behind damage: a second's work."""
 _MOST_MISSED = 2_000
 """Rows that may be missing in a row where the last one is not known."""
+_LONGEST = 2**28
+"""Bytes of a message that is read: an image of as many pixels as are decoded, of four bytes each."""
 
 
 class SqliteBag:
@@ -155,7 +157,8 @@ class SqliteBag:
         db = sqlite3.connect(f"{self._path.resolve().as_uri()}?{mode}", uri=True)
         db.text_factory = lambda text: text.decode("utf-8", "replace")
         db.execute("PRAGMA trusted_schema = OFF")  # a stranger's file runs nothing
-        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(self._path.stat().st_size, 2**16))  # no value exceeds its file
+        longest = min(max(self._path.stat().st_size, 2**16), _LONGEST)  # no value exceeds its file
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
         try:
             db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         except sqlite3.DatabaseError:

@@ -71,7 +71,7 @@ class PoseTrack:
         self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable.tolist())))
         self._poses.frombytes(poses.poses[usable].tobytes())
         if poses.covariances is None:
-            self._covariances.extend(_UNKNOWN * int(usable.sum()))
+            self._covariances.frombytes(np.full((int(usable.sum()), 36), np.nan).tobytes())
         else:
             self._covariances.frombytes(poses.covariances[usable].tobytes())
             self._bare = self._bare and not usable.any()
