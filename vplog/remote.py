@@ -2,18 +2,17 @@
 
 A RemotePath answers as much of pathlib's Path as logs are read with. What is asked for is read, in blocks; nothing is
 kept on disk. Credentials and endpoints come from where each service's own tools look for them (AWS_ACCESS_KEY_ID,
-AWS_ENDPOINT_URL, GOOGLE_APPLICATION_CREDENTIALS, ...).
+AWS_ENDPOINT_URL, GOOGLE_APPLICATION_CREDENTIALS, STORAGE_EMULATOR_HOST, ...).
 """
 
 from __future__ import annotations
 
 import io
 import os
+import re
 import shutil
 import tempfile
-import urllib.error
 import urllib.parse
-import urllib.request
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -21,6 +20,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from vplog.errors import LogError, ResultError, SettingsError
+from vplog.google_store import google_file_system, google_place, plain, plain_errors
+from vplog.web import get_range, head
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,6 +33,8 @@ _BLOCK_BYTES = 1 << 20
 """Read ahead of small reads: a chunk of a log; a request costs as much as some hundred kB."""
 _TIMEOUT_S = 30.0
 """A server that says nothing for so long is taken as gone."""
+_DENIED = re.compile(r"ACCESS_DENIED|AccessDenied|PERMISSION_DENIED|HTTP response code 403")
+"""What pyarrow's clients say of a request that this account may not make."""
 
 
 @dataclass(frozen=True)
@@ -150,23 +153,19 @@ class RemotePath:
     def place(self) -> tuple[FileSystem, str]:
         """The file system of an object store, and the path in it."""
         place = urllib.parse.unquote(self._url.split("://", 1)[1])
-        return file_system(self.scheme, *s3_place()), place
+        if self.scheme == "gs":
+            return google_system(google_place(), place.partition("/")[0]), place
+        return file_system(*s3_place()), place
 
     @cached_property
     def _info(self) -> FileInfo:
         system, place = self.place
-        return system.get_file_info(place)
+        with plain_errors():
+            return system.get_file_info(place)
 
     @cached_property
     def _head(self) -> dict[str, str]:
-        request = urllib.request.Request(self._url, method="HEAD")  # noqa: S310 (the scheme is checked)
-        try:
-            with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:  # noqa: S310
-                return dict(answer.headers)
-        except urllib.error.HTTPError as error:
-            if error.code in (404, 410):
-                return {}
-            raise OSError(f"the server says {error.code} {error.reason}") from None
+        return head(self._url)
 
     @cached_property
     def _kind(self) -> str:
@@ -188,10 +187,16 @@ class RemotePath:
     def _below(self, recursive: bool) -> Iterator[RemotePath]:
         if self._is_http:
             return
+        if not recursive:
+            for name in sorted(names_below(self)):
+                yield self / name
+            return
         from pyarrow.fs import FileSelector
 
         system, place = self.place
-        for found in sorted(system.get_file_info(FileSelector(place, recursive=recursive)), key=lambda one: one.path):
+        with plain_errors():
+            below = system.get_file_info(FileSelector(place, recursive=True))
+        for found in sorted(below, key=lambda one: one.path):
             yield self / found.path[len(place) + 1 :]
 
 
@@ -199,7 +204,8 @@ class _Ranges(io.RawIOBase):
     """Random access to an object; every read is a request for just these bytes."""
 
     def __init__(self, system: FileSystem, place: str, length: int) -> None:
-        self._file, self._at, self._length = system.open_input_file(place), 0, length
+        with plain_errors():
+            self._file, self._at, self._length = system.open_input_file(place), 0, length
 
     def readable(self) -> bool:
         return True
@@ -230,7 +236,8 @@ class _Ranges(io.RawIOBase):
         super().close()
 
     def _fetch(self, start: int, count: int) -> bytes:
-        return self._file.read_at(count, start)
+        with plain_errors():
+            return self._file.read_at(count, start)
 
 
 class _HttpRanges(_Ranges):
@@ -240,15 +247,24 @@ class _HttpRanges(_Ranges):
         self._url, self._at, self._length, self._file = url, 0, length, None
 
     def _fetch(self, start: int, count: int) -> bytes:
-        wanted = {"Range": f"bytes={start}-{start + count - 1}"}
-        request = urllib.request.Request(self._url, headers=wanted)  # noqa: S310 (the scheme is checked)
-        try:
-            with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:  # noqa: S310
-                if answer.status != 206 and not (start == 0 and count == self._length):
-                    raise OSError("the server does not answer range requests; download the file first")
-                return answer.read(count)
-        except urllib.error.HTTPError as error:
-            raise OSError(f"the server says {error.code} {error.reason}") from None
+        return get_range(self._url, start, count, self._length)
+
+
+def names_below(path: RemotePath) -> dict[str, bool]:
+    """What is right below a prefix of an object store, and whether that has objects below. Raises OSError.
+
+    On gs:// pyarrow tells of no folder that is not an object itself, so there it is asked for all that is below.
+    """
+    from pyarrow.fs import FileSelector, FileType
+
+    system, place = path.place
+    below = dict[str, bool]()
+    with plain_errors():
+        found = system.get_file_info(FileSelector(place, allow_not_found=True, recursive=path.scheme == "gs"))
+    for one in found:
+        name, _, rest = one.path[len(place) + 1 :].partition("/")
+        below[name] = below.get(name, False) or bool(rest) or one.type == FileType.Directory
+    return below
 
 
 def s3_place() -> tuple[str | None, str | None]:
@@ -258,12 +274,16 @@ def s3_place() -> tuple[str | None, str | None]:
 
 
 @lru_cache
-def file_system(scheme: str, endpoint: str | None, region: str | None) -> FileSystem:
-    """One for all objects of a server: it keeps its connections."""
+def google_system(endpoint: str, bucket: str) -> FileSystem:
+    """One for all objects of a bucket. Raises OSError."""
+    return google_file_system(endpoint, bucket)
+
+
+@lru_cache
+def file_system(endpoint: str | None, region: str | None) -> FileSystem:
+    """One for all objects of a server that speaks S3: it keeps its connections."""
     from pyarrow import fs
 
-    if scheme == "gs":
-        return fs.GcsFileSystem()
     known = {"endpoint_override": endpoint, "region": region}
     return fs.S3FileSystem(  # delayed: a small file is one request, not the three of an upload in parts
         request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, allow_delayed_open=True,
@@ -302,12 +322,14 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
     """Where to write what is to end at `path`: there, or for a remote one a local folder that is sent when all is done.
 
     The run's own account, run.json, is sent last: who finds it finds everything. Nothing is sent of what failed.
-    Raises ResultError where the server does not take it, SettingsError for one that takes nothing.
+    Raises ResultError where the server does not take it, before any work where there is none, SettingsError for one
+    that takes nothing.
     """
     if not isinstance(path, RemotePath):
         yield path
         return
     check_writable(path)
+    _check_bucket(path)
     with tempfile.TemporaryDirectory(prefix="vplog-") as folder:
         target = Path(folder) / (path.name or "out")
         yield target
@@ -333,5 +355,23 @@ def check_writable(path: RemotePath) -> None:
         )
 
 
+def _check_bucket(path: RemotePath) -> None:
+    """Before an hour of work: raises ResultError where there is no server, or no such bucket on it. Whether this
+    account may write to it, only writing tells."""
+    from pyarrow.fs import FileType
+
+    try:
+        system, place = path.place
+        bucket = place.partition("/")[0]
+        there = system.get_file_info(bucket).type != FileType.NotFound
+    except OSError as error:
+        if _DENIED.search(str(error)):  # a look at the bucket; what writes need not have the right to that
+            return
+        raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
+    if not there:
+        raise ResultError(f"Cannot write {path}: there is no bucket {bucket}. Make it, or choose another with -o.")
+
+
 def reason(error: OSError) -> str:
-    return (error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__)[:300].rstrip(".")
+    said = plain(error.strerror or str(error))
+    return (said.splitlines()[0] if said else type(error).__name__)[:300].rstrip(".")

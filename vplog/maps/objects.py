@@ -9,7 +9,7 @@ from email.utils import parsedate_to_datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from vplog.remote import s3_place
+from vplog.remote import names_below, s3_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -108,6 +108,8 @@ def remove(path: RemotePath) -> None:
     kind = system.get_file_info(place).type
     if kind == FileType.File:
         system.delete_file(place)
+    elif kind == FileType.Directory and path.scheme == "gs":  # what is only a prefix has no object of its own
+        system.delete_dir_contents(place, missing_dir_ok=True)
     elif kind == FileType.Directory:
         system.delete_dir(place)
 
@@ -123,19 +125,12 @@ def files_below(path: RemotePath) -> dict[str, datetime]:
 
 def folders_in(path: RemotePath) -> list[str]:
     """Names right below this prefix that have objects below, in order. Raises OSError."""
-    from pyarrow.fs import FileSelector, FileType
-
-    system, place = path.place
-    found = system.get_file_info(FileSelector(place, allow_not_found=True))
-    return sorted(one.base_name for one in found if one.type == FileType.Directory)
+    return sorted(name for name, is_folder in names_below(path).items() if is_folder)
 
 
 def names_in(path: RemotePath) -> list[str]:
     """All names right below this prefix, in order. Raises OSError."""
-    from pyarrow.fs import FileSelector
-
-    system, place = path.place
-    return sorted(one.base_name for one in system.get_file_info(FileSelector(place, allow_not_found=True)))
+    return sorted(names_below(path))
 
 
 def age_s(path: RemotePath) -> float:

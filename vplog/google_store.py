@@ -1,0 +1,127 @@
+"""gs:// through pyarrow: where the server is, who asks, and a bound on every wait.
+
+pyarrow's client of Google Cloud Storage goes on for 15 minutes with what cannot succeed, looks for credentials by the
+same rule, and says what is wrong in some thousand characters. So it is given less time, the server is greeted first,
+and what has no credentials asks without any, as public data allow.
+"""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import ssl
+import sys
+import urllib.error
+import urllib.parse
+import urllib.request
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pyarrow.fs import FileSystem
+
+_PUBLIC = "https://storage.googleapis.com"
+_METADATA = "http://metadata.google.internal"
+"""Gives credentials on Google's own machines, and is nowhere else."""
+_GREETING_S = 10.0
+"""For one request of some hundred bytes."""
+_METADATA_S = 2.0
+"""It is on the machine itself: google-auth waits 3 s."""
+_RETRY_S = 20
+"""What fails for so long is given up; a request that says nothing is given up by the client after 120 s."""
+_SAID = re.compile(
+    r"(?:.*underlying error message was: |.*?last message of )(.*?)(?: error_info=|,? gcloud-cpp|}}|$)", re.S
+)
+"""The part of a google::cloud::Status that says what is wrong: the innermost message."""
+
+
+def google_place() -> str:
+    """Where the server is, as Google's own tools are told it."""
+    given = os.environ.get("STORAGE_EMULATOR_HOST") or _PUBLIC
+    return given if "://" in given else f"http://{given}"
+
+
+def google_file_system(endpoint: str, bucket: str, wait_s: float = _GREETING_S) -> FileSystem:
+    """Raises OSError in one line where the server does not answer within `wait_s`, or credentials are of no use."""
+    from pyarrow import fs
+
+    _greet(endpoint, bucket, wait_s)
+    parts = urllib.parse.urlsplit(endpoint)
+    anonymous = endpoint != _PUBLIC or not _has_credentials()
+    system = fs.GcsFileSystem(
+        anonymous=anonymous, scheme=parts.scheme, endpoint_override=parts.netloc,
+        retry_time_limit=timedelta(seconds=_RETRY_S),
+    )  # fmt: skip
+    if not anonymous:
+        with plain_errors():
+            _try_credentials(system, bucket)
+    return system
+
+
+def _try_credentials(system: FileSystem, bucket: str) -> None:
+    """Credentials are read with the first request; one may lack the right to this and have all that is needed."""
+    try:
+        system.get_file_info(f"{bucket}/vplog")
+    except OSError as error:
+        if "access token" in str(error):
+            raise
+
+
+def _greet(endpoint: str, bucket: str, wait_s: float) -> None:
+    """Any answer will do. Where a proxy is between, it answers, not the server: nothing to learn."""
+    if urllib.request.getproxies().get(urllib.parse.urlsplit(endpoint).scheme) and endpoint == _PUBLIC:
+        return
+    url = f"{endpoint}/storage/v1/b/{urllib.parse.quote(bucket, safe='')}/o?maxResults=1&fields=kind"
+    try:
+        urllib.request.urlopen(url, timeout=wait_s).close()  # noqa: S310 (http or https)
+    except (urllib.error.HTTPError, ssl.SSLError):
+        return
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        why = getattr(error, "reason", error)
+        if not isinstance(why, ssl.SSLError):  # it is there; the client has certificates of its own
+            raise OSError(f"{endpoint} does not answer ({why}); is there a network") from None
+
+
+def _has_credentials() -> bool:
+    """Whether the client would find any: cloud.google.com/docs/authentication/application-default-credentials."""
+    if os.environ.get("GOOGLE_APPLICATION_CREDENTIALS"):
+        return True
+    home = Path(os.environ.get("APPDATA", "")) if sys.platform == "win32" else Path.home() / ".config"
+    if (home / "gcloud" / "application_default_credentials.json").is_file():
+        return True
+    try:
+        urllib.request.build_opener(urllib.request.ProxyHandler({})).open(_METADATA, timeout=_METADATA_S).close()
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """What Google's client says in one line, as the OSError that it is; all else as it comes."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        if "google::cloud::Status" not in str(error):
+            raise
+        kind = type(error) if isinstance(error, OSError) else OSError
+        raise kind(plain(str(error))) from None
+
+
+def plain(text: str) -> str:
+    """One line of a google::cloud::Status, and what to do where it is about who asks."""
+    if "google::cloud::Status" not in text:
+        return text
+    found = _SAID.search(text)
+    said = " ".join((found[1] if found else text).split())[:200].rstrip(". ")
+    if "access token" in text or re.search(r"UNAUTHENTICATED|PERMISSION_DENIED", text):
+        return (
+            f"Google Cloud says: {said}. Log in with `gcloud auth application-default login`, or set "
+            "GOOGLE_APPLICATION_CREDENTIALS to the key of an account that may"
+        )
+    return said
