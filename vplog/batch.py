@@ -21,6 +21,7 @@ from vplog.inputs import hash_inputs
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.join import join as join_drives
+from vplog.maps.join import load_places
 from vplog.maps.layout import folder_name
 from vplog.remote import RemotePath
 
@@ -94,6 +95,7 @@ def run_batch(
         raise SettingsError(f"{twice[0]} is given twice. Give each log once.")
     with (
         map_store.writing(root) as store,
+        ThreadPoolExecutor(1) as aside,
         opened(engine, address, jobs, threads, store.staging) as workers,
     ):
         digest = map_library(store, paths, library, pipeline, topics, threads, progress)
@@ -120,6 +122,9 @@ def run_batch(
         failures = {drive: told for drive, told in store.failures().items() if drive not in set(drives)}
         progress("drives", len(done), len(paths))
         tasks = [replace(task, threads=each, keep_cache=join or keep_cache) for task in tasks]
+        places = None
+        if join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
+            places = aside.submit(load_places, store.library(digest), pipeline, threads)
         for ended in computed(workers, tasks, jobs, retries):
             found = _put_in(store, *ended)
             if found.state == "computed" and not ((join or keep_cache) and _has_room(store)):
@@ -135,7 +140,8 @@ def run_batch(
             store.write_failures(failures)
         joined = None
         if join:
-            joined = join_drives(store, pipeline, workers.helpers(threads), threads, progress)
+            ready = None if places is None else places.result
+            joined = join_drives(store, pipeline, workers.helpers(threads), threads, progress, ready)
         for drive in () if keep_cache else store.drives():
             shutil.rmtree(_cache(store, drive), ignore_errors=True)
         with suppress(OSError):  # not empty: what failed goes on there another time

@@ -9,6 +9,7 @@ from vplog import logs
 from vplog.errors import LibraryError, VplogError
 from vplog.libraries import build_library, check_library
 from vplog.maps import store as map_store
+from vplog.places.stored import read_library_record
 from vplog.references import PAPER_SIZE
 
 if TYPE_CHECKING:
@@ -39,13 +40,14 @@ def map_library(
     made = store.staging / "library"
     if given is not None:
         check_library(given, pipeline)
-        digest = pipeline.places.load(given, threads).hash
+        digest = str(read_library_record(given)["hash"])
         if known not in (None, digest):
             raise LibraryError(
                 f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
                 f"{known[:12]}: they would not compare. Leave --library out, or make another map."
             )
         if known is None:
+            digest = pipeline.places.load(given, threads).hash  # held against what it says of itself
             shutil.copytree(given, made)
     elif known is None:
         digest = build_library(_that_can_be_read(paths, topics), made, pipeline, topics, threads, progress).hash

@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from vplog.between import likely_drives, shared_of
+from vplog.graph.workers import limited
 from vplog.maps import pairs
 from vplog.maps.candidates import candidates_of, places_of
 from vplog.maps.roster import is_up_to_date, read_drives, settled_ties
@@ -35,6 +36,15 @@ if TYPE_CHECKING:
     Progress = Callable[[str, int, int], None]
 
 
+def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceState:
+    """The map's library as `join` compares places by it: what can be done while the drives are still computed.
+
+    What else is read once, as the code that joins depend on, is read along. Raises LibraryError.
+    """
+    pairs.depends(pipeline)
+    return cast("PlaceState", pipeline.places.load(library, threads))
+
+
 class Wanted(NamedTuple):
     """Candidates of one drive in another."""
 
@@ -50,13 +60,15 @@ def join(
     executor: Executor | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    places: Callable[[], PlaceState] | None = None,
 ) -> dict[str, Any]:
     """Verify what was not yet looked at, solve what that touches, and say what joins.
 
     The caller holds the map's lock. With an executor its processes verify, pair by pair, each with `threads`; they
-    must see the map and the logs under the same paths. Neither counts for the result. A pair that cannot be verified,
-    as where a log is gone, is left out with a reason, and tried again the next time. Raises VplogError where the map
-    as a whole cannot be read or written.
+    must see the map and the logs under the same paths. Neither counts for the result. `places` gives what `load_places`
+    made of the map's library, where that was begun before. A pair that cannot be verified, as where a log is gone, is
+    left out with a reason, and tried again the next time. Raises VplogError where the map as a whole cannot be read or
+    written.
     """
     watch = Watch()
     if store.mirror is not None:  # what joins drives goes to and from an object store as a whole
@@ -65,11 +77,12 @@ def join(
     drives = read_drives(store)
     new = [at for at in range(len(drives.members)) if not is_up_to_date(store, drives, at, pipeline)]
     with watch.stage("search"):
-        wanted = _search(store, drives, new, pipeline, threads, progress)
+        load = places or (lambda: load_places(store.library(drives.library), pipeline, threads))
+        wanted = _search(store, drives, new, pipeline, threads, progress, load)
     with watch.stage("verify"):
         computed, reasons = _verify(store, drives, new, wanted, pipeline, executor, threads, progress)
         _remember(store, drives, new, wanted, reasons, pipeline)
-    with watch.stage("solve"):
+    with watch.stage("solve"), limited(threads):
         ties = settled_ties(store, drives)
         record = solve_groups(store, drives, ties, pipeline, progress)
     left_out = [f"{later} in {earlier} was left out. {reason}" for (later, earlier), reason in reasons.items()]
@@ -98,14 +111,14 @@ def join(
 
 
 def _search(
-    store: Store, drives: Drives, new: Sequence[int], pipeline: Pipeline, threads: int, progress: Progress
-) -> list[Wanted]:
+    store: Store, drives: Drives, new: Sequence[int], pipeline: Pipeline, threads: int, progress: Progress,
+    load: Callable[[], PlaceState],
+) -> list[Wanted]:  # fmt: skip
     """The candidates of new drives that are worth verifying."""
     later = [at for at in new if at]  # the first has none before it
     if not later:
         return []
-    state = cast("PlaceState", pipeline.places.load(store.library(drives.library), threads))
-    wanted = []
+    state, wanted = load(), []
     for at, found in candidates_of(store, drives.members, later, state, pipeline, threads, progress).items():
         own = places_of(store, drives.members[at], state)
         for earlier in likely_drives(found, pipeline.join):

@@ -29,6 +29,7 @@ from vplog.places.code_lists import BLOCK, CodeLists, build_lists
 from vplog.places.code_search import CodeIndex
 from vplog.places.columns import check_type, check_values
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
+from vplog.places.once import Once
 from vplog.places.relearn import relearn
 from vplog.places.shared import Shared, list_shared
 
@@ -109,16 +110,27 @@ class BobbSettings(WeighedMatchSettings):
 
     def learn(self, references: Iterable[Reference], threads: int) -> BobbState:
         """Index the references, and how popular they are. Raises LibraryError where they have no features."""
+        state = self.prepare(references, threads)
+        state.learned()
+        return state
+
+    def prepare(self, references: Iterable[Reference], threads: int) -> BobbState:
+        """The same, but not indexed before it is asked to describe: places are compared without. Raises as `learn`."""
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
             raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
-        with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
-            explained = list(pool.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
-        return BobbState(self, matcher, _rarity(np.array(explained), self.popularity))
+
+        def rarity() -> Floats:
+            with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
+                explained = list(pool.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
+            return _rarity(np.array(explained), self.popularity)
+
+        return BobbState(self, matcher, Once(rarity))
 
     def load(self, folder: Path, threads: int) -> BobbState:
-        """A library saved by `BobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(BobbSettings, folder, threads)
+        """A library saved by `BobbState.save`, prepared. Raises LibraryError where it is damaged or gives another
+        hash."""
+        return relearn(BobbSettings, folder, threads, BobbSettings.prepare)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -161,11 +173,11 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class BobbState:
-    """A library, indexed. Shared freely between threads."""
+    """A library, indexed when it is first asked to describe. Shared freely between threads."""
 
     settings: BobbSettings
     matcher: Matcher
-    rarity: Floats
+    learned: Once[Floats]
     """(L,) weight of each reference."""
     hash: str = field(init=False)
 
@@ -216,13 +228,14 @@ class BobbState:
         The first 3 J by the sum of weights are looked at again, with matches that agree in their motion counting more.
         """
         s = self.settings
-        total = _sums(matches.start, matches.weight) * self.rarity
+        rarity = self.learned()
+        total = _sums(matches.start, matches.weight) * rarity
         found = []
         for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
             if total[reference] <= 0.0:
                 break
             here, there, agreed = self.agreed(matches, reference)
-            explained = float(agreed.sum(dtype=np.float64) * self.rarity[reference])
+            explained = float(agreed.sum(dtype=np.float64) * rarity[reference])
             found.append((reference, explained, here, there, agreed))
         found.sort(key=lambda one: -one[1])
         if s.own and matches.itself >= 0:

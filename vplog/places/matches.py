@@ -9,7 +9,7 @@ here a match counts by how much nearer it is than the feature's last neighbour, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numba
@@ -18,6 +18,7 @@ from pydantic import Field
 
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
+from vplog.places.once import Once
 from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from vplog.data import Bytes, Features, Float32s, Int32s, Reference
+
+    Both = tuple["Indexed | None", "Indexed | None"]
 
 
 class WeighedMatchSettings(Settings):
@@ -84,16 +87,27 @@ class Indexed:
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """The features of L references, indexed. Shared freely between threads."""
+    """The features of L references, indexed when they are first asked for. Shared freely between threads."""
 
     references: list[Reference]
     settings: WeighedMatchSettings
-    keypoints: Indexed | None
-    patches: Indexed | None
-    """None where they are not used, or the references have none."""
+    _indexed: Once[Both] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_indexed", Once(lambda: _index_both(self.references, self.settings)))
 
     def __len__(self) -> int:
         return len(self.references)
+
+    @property
+    def keypoints(self) -> Indexed | None:
+        """None where they are not used, or the references have none."""
+        return self._indexed()[0]
+
+    @property
+    def patches(self) -> Indexed | None:
+        """The same of patches."""
+        return self._indexed()[1]
 
     def match(self, features: Features) -> Matches:
         """Matches of an image."""
@@ -154,15 +168,22 @@ def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Floa
 
 
 def index_references(references: Iterable[Reference], settings: WeighedMatchSettings) -> Matcher:
-    """Index the references' features. Raises LibraryError where they have none."""
+    """The references' features, not yet indexed. Raises LibraryError where they have none."""
     kept = [replace(r, features=large_enough(r.features, settings)) for r in references]
     if not kept:
         raise LibraryError("A library needs at least one reference image; none was given.")
-    keypoints = _index([keypoints_of(r.features, settings) for r in kept], settings, 1.0)
-    patches = _index([patches_of(r.features, settings) for r in kept], settings, settings.patch_weight)
-    if keypoints is None and patches is None:
+    matcher = Matcher(kept, settings)
+    if not any(len(r.features) for r in kept) and matcher.patches is None:
         raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")
-    return Matcher(kept, settings, keypoints, patches)
+    return matcher
+
+
+def _index_both(references: Sequence[Reference], settings: WeighedMatchSettings) -> Both:
+    """Keypoints and patches."""
+    return (
+        _index([keypoints_of(r.features, settings) for r in references], settings, 1.0),
+        _index([patches_of(r.features, settings) for r in references], settings, settings.patch_weight),
+    )
 
 
 def _index(

@@ -8,7 +8,7 @@ from vplog.errors import LibraryError
 from vplog.places import stored
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from vplog.data import Reference
@@ -22,14 +22,15 @@ def keep_references(references: Iterable[Reference], features: int | None = None
     return kept
 
 
-def relearn(settings: Any, folder: Path, threads: int) -> Any:
-    """State of a folder written by `stored.save_references`, whose own settings count; `settings` is their class.
+def relearn(settings: Any, folder: Path, threads: int, learn: Callable[..., Any] | None = None) -> Any:
+    """State of a folder written by `stored.save_references`, whose own settings count; `settings` is their class, and
+    `learn` of its methods the one that makes the state.
 
     Raises LibraryError where the folder is damaged or gives another hash.
     """
     record = stored.read_library_record(folder)
     made = settings.read(record["settings"], f"{folder}/library.json")
-    state = made.learn(stored.load_references(folder), threads)
+    state = (learn or settings.learn)(made, stored.load_references(folder, threads), threads)
     if state.hash != record["hash"]:
         raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
     return state

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -134,7 +135,7 @@ def read_library_record(folder: Path) -> dict[str, Any]:
     return record
 
 
-def load_references(folder: Path) -> list[Reference]:
+def load_references(folder: Path, threads: int = 1) -> list[Reference]:
     """The references of a saved library, in their order. Raises LibraryError where the files do not fit together."""
     try:
         files = pq.ParquetFile(folder / "features.parquet"), pq.ParquetFile(folder / "references.parquet")
@@ -154,8 +155,9 @@ def load_references(folder: Path) -> list[Reference]:
     points = np.column_stack([features["x"].to_numpy(), features["y"].to_numpy()]).astype(np.float32)
     sizes = features["size"].to_numpy()
     descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
-    result = []
-    for row, entry in enumerate(entries):
+
+    def reference(row: int) -> Reference:
+        entry = entries[row]
         part = slice(int(start[row]), int(start[row + 1]))
         width, height = entry["width"], entry["height"]
         if not (0 < width < 2**15 and 0 < height < 2**15) or not np.all(
@@ -168,8 +170,10 @@ def load_references(folder: Path) -> list[Reference]:
         nothing = np.full(part.stop - part.start, np.nan, np.float32)
         thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
         found = Features(points[part], sizes[part], descriptors[part], nothing, width, height, thumbnail)
-        result.append(Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"]))
-    return result
+        return Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"])
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(reference, range(len(entries))))
 
 
 def _decode(data: bytes) -> np.ndarray | None:
