@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 # a check of a change must not fail by the luck of the draw: the same inputs each time, and on
 # `HYPOTHESIS_PROFILE=anew` others each time, for those who look for what is not yet known
-settings.register_profile("same", derandomize=True)
-settings.register_profile("anew", print_blob=True)
+settings.register_profile("same", derandomize=True, deadline=None)
+settings.register_profile("anew", print_blob=True, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 

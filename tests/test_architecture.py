@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
-    {"data", "settings", "timing"},
-    {"geometry", "geodesy", "remote"},
+    {"data", "settings", "timing", "google_store", "web"},
+    {"geometry", "geodesy", "remote", "scratch"},
     {"tum"},
     {"stages", "references", "inputs", "code_hash"},
     {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},
@@ -35,7 +35,7 @@ LAYERS = (
     {"between", "joint_graph"},
     {"methods", "trials", "joint", "retell", "resume"},
     {"compare", "export"},
-    {"study", "maps", "scratch"},
+    {"study", "maps"},
     {"batch_worker"},
     {"ray_cluster", "ray_tasks", "batch_library"},
     {"engine_ray"},

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import at_least, at_least_one, pipeline_of, place, topics_of
+from vplog.cli_options import at_least, at_least_one, local, not_negative, pipeline_of, place, topics_of
 from vplog.cli_print import (
     Progress,
     print_answers,
@@ -22,6 +22,8 @@ from vplog.cli_print import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from vplog.maps.cache import Cache
 
 
 def export_map(arguments: argparse.Namespace) -> None:
@@ -127,12 +129,13 @@ def query_map(arguments: argparse.Namespace) -> None:
     from vplog.engine import opened
     from vplog.maps.query import query_map as find_places
 
+    cache = _cache(arguments)
     with opened(arguments.engine, arguments.address, None, arguments.threads) as engine:
         workers = engine.executor if arguments.engine == "ray" else None
         with Progress(arguments) as progress:
             found = find_places(
                 arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
-                arguments.output, arguments.threads, progress, workers,
+                arguments.output, arguments.threads, progress, workers, cache,
             )  # fmt: skip
     if arguments.json:
         print_json(found)
@@ -144,8 +147,9 @@ def index_map(arguments: argparse.Namespace) -> None:
     """Bring the index of a map up to its drives, as the next query would: it is what queries search."""
     from vplog.maps.query import index_map as update
 
+    cache = _cache(arguments)
     with Progress(arguments) as progress:
-        found = update(arguments.map, arguments.threads, progress)
+        found = update(arguments.map, arguments.threads, progress, cache)
     if arguments.json:
         print_json(found)
     else:
@@ -155,6 +159,13 @@ def index_map(arguments: argparse.Namespace) -> None:
         )
         for warning in found["warnings"]:
             say(f"warning: {warning}")
+
+
+def _cache(arguments: argparse.Namespace) -> Cache | None:
+    """Of what is read of a map by URL; a map in a folder needs none."""
+    from vplog.maps.cache import cache_in
+
+    return None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)
 
 
 def add_maps(
@@ -180,10 +191,12 @@ def add_maps(
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     sub.add_argument("--address", metavar="HOST:PORT", help="Ray cluster (default: one of this machine's cores)")
+    _add_cache(sub)
     text = "make what queries search"
     sub = maps.add_parser("index", help=text, description=index_map.__doc__, parents=[common, threads])
     sub.set_defaults(verb=index_map)
     sub.add_argument("map", type=place, metavar="MAP")
+    _add_cache(sub)
     _add_export(maps, common)
     text = "take the drives of maps into another map"
     sub = maps.add_parser("merge", help=text, description=merge_maps.__doc__, parents=[common])
@@ -206,6 +219,13 @@ def add_maps(
     sub.add_argument("--library", type=place, required=True, metavar="LIB|LOG", help=text)
     sub.add_argument("--jobs", type=at_least_one, metavar="N", help="drives at once (default: 1)")
     sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP2", help="the new map")
+
+
+def _add_cache(sub: argparse.ArgumentParser) -> None:
+    text = "what is read of a map by URL stays in this folder (default: $VPLOG_CACHE, else ~/.cache/vplog)"
+    sub.add_argument("--cache", type=local, metavar="DIR", help=text)
+    text = "most that stays there, in GB; what was not used for longest goes first, 0 keeps nothing (default: 20)"
+    sub.add_argument("--cache-gb", type=not_negative, metavar="GB", help=text)
 
 
 def _add_export(maps: argparse._SubParsersAction[argparse.ArgumentParser], common: argparse.ArgumentParser) -> None:

@@ -92,6 +92,13 @@ def at_least_one(text: str) -> int:
     return at_least(1)(text)
 
 
+def not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return value
+
+
 def positive(text: str) -> float:
     value = float(text)
     if not 0 < value < math.inf:

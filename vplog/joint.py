@@ -14,6 +14,7 @@ from vplog.errors import LogError, SettingsError
 from vplog.features.store import FeatureStore
 from vplog.graph import joint as graph_joint
 from vplog.graph.correct import correct_trajectory
+from vplog.graph.workers import limited
 from vplog.joint_graph import between_of, judged_by, own_drive
 from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of
@@ -81,7 +82,7 @@ def run_joint(
                 drives.append(alone)
         with watch.stage("between"):
             ledgers = _ledgers(drives, state, pipeline, threads, progress)
-        with watch.stage("join"):
+        with watch.stage("join"), limited(threads):
             between = [between_of(*pair, ledger) for pair, ledger in ledgers.items()]
             own = [_own(alone.done) for alone in drives]
             joined = graph_joint.join(own, between, pipeline.solve, pipeline.join, pipeline.refine)

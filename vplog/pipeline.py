@@ -22,6 +22,7 @@ from vplog.graph.noise import NoiseSettings
 from vplog.graph.refine import RefineSettings
 from vplog.graph.satellites import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
+from vplog.graph.workers import limited
 from vplog.inputs import files_of
 from vplog.keyframes import KeyframeSettings, select_keyframes
 from vplog.ledger import verify_in_parts
@@ -221,7 +222,7 @@ def run(
                 lambda done, total: progress("verify", done, total),
             )  # fmt: skip
             closures = name_shared(closures, state, descriptors)
-        with watch.stage("solve"):
+        with watch.stage("solve"), limited(threads):
             solved = back_end(log, odometry, keyframes, closures, pipeline)
             closures, graph, solution = solved.closures, solved.refined.graph, solved.refined.solution
             warnings += solved.warnings
@@ -318,7 +319,7 @@ def references_of(
     """The reference images: of the library given, or chosen among the drive's own `keyframes`."""
     if library is not None:
         with stages.watch.stage("choose"):
-            return load_references(library)
+            return load_references(library, threads)
     images = stages.stage(
         "choose", ["images", "keyframes", "extract"], [settings], ["vplog.libraries"], images_codec(),
         lambda: own_images(log, selected, keyframes, features, settings, threads),

@@ -40,21 +40,27 @@ def own_folder() -> Path:
 
 
 @contextmanager
-def scratch(name: str) -> Iterator[Path]:
-    """A new folder for the time of the block. Those of processes that were killed are removed on the way."""
-    _sweep(own_folder())
-    folder = Path(tempfile.mkdtemp(prefix=f"{name}-{os.getpid()}-", dir=own_folder()))
-    with (folder / ".new").open("w") as lock:  # goes with the process, however that ends
+def scratch(name: str, among: Path | None = None) -> Iterator[Path]:
+    """A new folder for the time of the block, among others in the one given, which is there, or in `own_folder`. Those
+    of processes that were killed are removed on the way. Raises ResultError."""
+    among = among or own_folder()
+    _sweep(among)
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f"{name}-{os.getpid()}-", dir=among))
+        lock = (folder / ".new").open("w")
         fcntl.flock(lock, fcntl.LOCK_EX)
         (folder / ".new").rename(folder / ".lock")
+    except OSError as error:
+        raise ResultError(f"Cannot make a folder in {among}: {error.strerror}. Make room, or set TMPDIR.") from None
+    with lock:  # goes with the process, however that ends
         try:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _sweep(own: Path) -> None:
-    for path in own.glob("*/.lock"):
+def _sweep(among: Path) -> None:
+    for path in among.glob("*/.lock"):
         with suppress(OSError), path.open() as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
             shutil.rmtree(path.parent, ignore_errors=True)

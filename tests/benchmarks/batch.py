@@ -31,6 +31,9 @@ NAMES = ("gardens_day_left.mcap", "gardens_day_right.mcap", "gardens_night_right
 ADD_BAR = 1.2
 """Time of a drive added to a finished map, to that of its own run."""
 CLUSTER_DRIVES = 20
+_REACH = 2.5
+"""Sum of the moments of all kills, to the time of the whole: what a kill costs is computed once more, which is half of
+it where there are ten."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +67,14 @@ def batch(only: Sequence[str], kills: int, assignments: Sequence[str]) -> Iterat
         library = Path(folder) / "library"
         command("library", *logs, "-o", library, *options)
         setting = Setting(logs, library, Path(folder), options)
-        whole = Path(folder) / "jobs-1"
-        alone = make(setting, whole, logs, "--jobs", 1)
         wanted = only or PARTS
-        if "engines" in wanted:
-            yield from engines(setting, whole, alone)
-        if "kill" in wanted:
-            yield killed(setting, whole, alone.seconds, kills)
+        if {"engines", "kill"} & set(wanted):
+            whole = Path(folder) / "jobs-1"
+            alone = make(setting, whole, logs, "--jobs", 1)
+            if "engines" in wanted:
+                yield from engines(setting, whole, alone)
+            if "kill" in wanted:
+                yield killed(setting, whole, alone, kills)
         if "add" in wanted:
             yield from added(setting)
         if "cluster" in wanted:
@@ -126,25 +130,37 @@ def engines(setting: Setting, whole: Path, alone: Ended) -> Iterator[Figure]:
         shutil.rmtree(root)
 
 
-def killed(setting: Setting, whole: Path, seconds: float, kills: int) -> Figure:
-    """Kill -9 at moments from a seed, each before the whole would be done at the speed so far; then to the end."""
-    root, moments, chance = setting.folder / "killed", [], random.Random(kills)
+def killed(setting: Setting, whole: Path, alone: Ended, kills: int) -> Figure:
+    """Kill -9 at moments from a seed, each at work: a batch that ends before is held against the whole, and another one
+    begun. The moments reach some way beyond the time of the whole, so that the join at its end is hit, too."""
+    root, moments, chance, other = setting.folder / "killed", list[str](), random.Random(kills), set[str]()
     line = [sys.executable, "-m", "vplog", "batch", *setting.logs, "-o", root, "--library", setting.library]
     text = [str(part) for part in (*line, "--jobs", 2, *setting.options)]
-    for left in range(kills, 0, -1):
-        moment = chance.uniform(0, 2 * seconds / (left + 1) if left > 1 else seconds)
+    ends = 0
+    while len(moments) < kills:
+        moment = chance.uniform(0, _REACH * 2 * alone.seconds / kills)
         with subprocess.Popen(text, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             try:
                 process.wait(moment)
             except subprocess.TimeoutExpired:
                 process.send_signal(signal.SIGKILL)
-        state = "ended" if process.returncode == 0 else f"{len(list(root.glob('runs/*')))} drives in"
-        moments.append(f"{moment:.1f} s: {state}")
+        if process.returncode == -signal.SIGKILL:
+            moments.append(f"{moment:.1f} s: {len(list(root.glob('runs/*')))} drives in, {_parts_of_join(root)} joined")
+            continue
+        other |= set(differing(root, whole))
+        ends += 1
+        shutil.rmtree(root)
     done = make(setting, root, setting.logs, "--jobs", 2)
-    other = differing(root, whole)
-    facts = {"kills": moments, "last_seconds": done.seconds, "differing": other}
+    other |= set(differing(root, whole))
+    facts = {"kills": moments, "ended": ends + 1, "last_seconds": done.seconds, "differing": sorted(other)}
+    facts |= {"seconds": alone.seconds, "tables": len(files(whole, ".parquet")), "peak_mb": peaks(alone.told)}
     shutil.rmtree(root)
     return Figure(f"batch: tables that differ after {kills} kills", len(other), 0, True, facts)
+
+
+def _parts_of_join(root: Path) -> int:
+    """Pairs of drives that are looked through."""
+    return len(list(root.glob("joins/*/match=*.parquet")))
 
 
 def added(setting: Setting) -> Iterator[Figure]:
@@ -194,11 +210,19 @@ def on_a_cluster(setting: Setting) -> Figure:
         watch.join()
     drives = done.told["drives"]
     again = {one["drive"]: one["attempts"] for one in drives if one["attempts"] > 1}
-    facts = {"seconds": done.seconds, "tried again": again, "largest_peak_mb": max(peaks(done.told).values())}
+    facts: dict[str, Any] = {"seconds": done.seconds, "killed": len(ended), "tried again": again}
+    facts["largest_peak_mb"] = max(peaks(done.told).values())
+    facts["peak_mb"] = {log.name: max(_peaks_of(log, setting, done.told), default=0.0) for log in setting.logs}
     facts["nodes"] = sorted({one["worker"].split(":")[0] for one in drives})
     missing = sum(one["state"] != "computed" for one in drives)
     shutil.rmtree(root)
     return Figure(f"batch: drives of {CLUSTER_DRIVES} that a cluster lacks, a worker killed", missing, 0, True, facts)
+
+
+def _peaks_of(log: Path, setting: Setting, told: dict[str, Any]) -> list[float]:
+    """Of the drives that are links to it; 0 of those that failed."""
+    number = setting.logs.index(log)
+    return [peak for at, peak in enumerate(peaks(told).values()) if at % len(setting.logs) == number]
 
 
 @contextmanager

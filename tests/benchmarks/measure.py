@@ -77,6 +77,11 @@ def seconds(work: Callable[[], object], clock: Callable[[], float] = time.proces
     return clock() - began
 
 
+def wall(work: Callable[[], object]) -> float:
+    """Seconds by the clock on the wall, which other programs on the machine lengthen."""
+    return seconds(work, time.perf_counter)
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """OpenCV and faiss use one thread inside; numba's kernels never use more."""

@@ -14,21 +14,21 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-import faiss
 import numpy as np
 
 from vplog.data import Features, Keyframes, Reference
-from vplog.maps.index import folder_of, update_index
+from vplog.maps.index import update_index
 from vplog.maps.search import best_places
 from vplog.maps.store import Store
 from vplog.places.bobb import BobbSettings, BobbState, Place
 from vplog.results import run_record, tables
 
-from .measure import Figure, one_thread, seconds
-from .search import BEST, BITS, CHUNK, DRIVE, FLOATS, LIBRARY, Places, make_places, make_queries, plain_scores
+from .faiss_indexes import faiss_indexes
+from .measure import Figure, one_thread, seconds, wall
+from .search import BEST, DRIVE, LIBRARY, Places, make_places, make_queries, plain_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from vplog.maps.index import Part
@@ -39,7 +39,6 @@ _SAMPLED = 1009
 """Every so many places one is kept for the queries."""
 _CHECKED = 4
 """Queries whose best places are compared with those of a full sort."""
-_CODES_A_PLACE = {"IndexBinaryFlat": BITS // 8, "IndexBinaryHNSW": BITS // 8 + 2 * 16 * 4, "IndexHNSWFlat": 4 * FLOATS}
 
 
 def scale(count: int, folder: Path, queries: int, threads: int, graphs: bool) -> Iterator[Figure]:
@@ -55,7 +54,7 @@ def scale(count: int, folder: Path, queries: int, threads: int, graphs: bool) ->
     parts = _parts(store, state, threads)
     exact = are_exact(store, state, parts, asked[:_CHECKED])
     yield _searching(state, parts, asked, threads, {"cold_ms": cold, "checked": _CHECKED, "exact": exact})
-    yield from _others(count, queries, threads, graphs)
+    yield from faiss_indexes(count, queries, threads, graphs)
 
 
 def made_up_library(settings: BobbSettings, references: int = LIBRARY) -> BobbState:
@@ -109,23 +108,23 @@ def _parts(store: Store, state: BobbState, threads: int) -> list[Part]:
 
 def _building(store: Store, state: BobbState, count: int, threads: int) -> Figure:
     """From the drives alone, and again with one drive more."""
-    shutil.rmtree(folder_of(store), ignore_errors=True)
+    shutil.rmtree(store.index, ignore_errors=True)
     began, used = time.perf_counter(), time.process_time()
     parts = _parts(store, state, threads)
-    wall, used = time.perf_counter() - began, time.process_time() - used
-    opened = _wall(lambda: _parts(store, state, threads))
+    built, used = time.perf_counter() - began, time.process_time() - used
+    opened = wall(lambda: _parts(store, state, threads))
     size = sum(part.path.stat().st_size for part in parts if part.path)
     descriptors = [path.stat().st_size for path in store.root.glob("runs/*/descriptors.parquet")]
     new = count + 1
     write_drive(store, new, make_places(DRIVE, state.settings, seed=99), state)
-    adding = _wall(lambda: _parts(store, state, threads))
+    adding = wall(lambda: _parts(store, state, threads))
     shutil.rmtree(store.run(f"drive-{new:09d}"))
     _parts(store, state, threads)
     facts = {
         "places": count,
         "drives": len(descriptors),
         "threads": threads,
-        "build_s": round(wall, 2),
+        "build_s": round(built, 2),
         "build_cpu_s": round(used, 2),
         "open_s": round(opened, 3),
         "add_a_drive_s": round(adding, 3),
@@ -133,7 +132,7 @@ def _building(store: Store, state: BobbState, count: int, threads: int) -> Figur
         "index_bytes_per_place": round(size / count, 1),
         "parquet_bytes_per_place": round(sum(descriptors) / count, 1),
     }
-    return Figure(f"index of {count:,} places, microseconds a place", 1e6 * wall / count, None, True, facts)
+    return Figure(f"index of {count:,} places, microseconds a place", 1e6 * built / count, None, True, facts)
 
 
 def are_exact(store: Store, state: BobbState, parts: Sequence[Part], asked: list[Place]) -> bool:
@@ -166,7 +165,7 @@ def _cold(store: Store, state: BobbState, asked: list[Place]) -> float:
                 os.fsync(stream.fileno())
                 os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         parts = _parts(store, state, 1)
-        spent.append(_wall(lambda v=view, p=parts: best_places(p, state, [v], BEST, 1)))
+        spent.append(wall(lambda v=view, p=parts: best_places(p, state, [v], BEST, 1)))
         del parts
     return round(1000 * statistics.median(spent), 1)
 
@@ -180,12 +179,12 @@ def _searching(state: BobbState, parts: list[Part], asked: list[Place], threads:
         for view in asked:  # so that what is compiled or first touched is not counted
             one(view, 1)
         alone = [seconds(lambda v=view: one(v, 1)) for view in asked]
-        on_all = [_wall(lambda v=view: one(v, threads)) for view in asked]
+        on_all = [wall(lambda v=view: one(v, threads)) for view in asked]
         together = seconds(lambda: best_places(parts, state, asked, BEST, 1))
-        together_on_all = [_wall(lambda: best_places(parts, state, asked, BEST, threads)) for _ in range(3)]
+        together_on_all = [wall(lambda: best_places(parts, state, asked, BEST, threads)) for _ in range(3)]
     facts = {
         "places": count,
-        "median_ms": round(1000 * statistics.median(alone), 2),
+        "one_thread_ms": round(1000 * statistics.median(alone), 2),
         "seen_before_ms": round(1000 * statistics.median(alone[1::2]), 2),
         "new_ms": round(1000 * statistics.median(alone[::2]), 2),
         "of_many_ms": round(1000 * together / len(asked), 2),
@@ -195,60 +194,3 @@ def _searching(state: BobbState, parts: list[Part], asked: list[Place], threads:
         **told,
     }
     return Figure(f"map query over {count:,} places, ms a view", 1000 * statistics.median(alone), None, True, facts)
-
-
-def _others(count: int, queries: int, threads: int, graphs: bool) -> Iterator[Figure]:
-    """What faiss takes. Codes and vectors of a drive change step by step, as places do: unrelated ones are the worst
-    that a graph can be given."""
-    kinds: dict[str, tuple[Callable[[], Any], bool]] = {"IndexBinaryFlat": (lambda: faiss.IndexBinaryFlat(BITS), True)}
-    if graphs:
-        kinds["IndexBinaryHNSW"] = (lambda: faiss.IndexBinaryHNSW(BITS, 16), True)
-        kinds["IndexHNSWFlat"] = (lambda: faiss.IndexHNSWFlat(FLOATS, 16, faiss.METRIC_INNER_PRODUCT), False)
-    for name, (make, binary) in kinds.items():
-        index = make()
-        faiss.omp_set_num_threads(threads)
-        began, cpu = time.perf_counter(), time.process_time()
-        asked = np.empty((0, 0))
-        for at in range(0, count, CHUNK):
-            values = _walking(min(CHUNK, count - at), at, binary)
-            asked = values[:: max(len(values) // queries, 1)][:queries].copy() if not at else asked
-            index.add(values)
-        building = time.perf_counter() - began
-        used = time.process_time() - cpu
-        with one_thread():
-            one = [seconds(lambda i=i, a=asked, x=index: x.search(a[i : i + 1], BEST)) for i in range(queries)]
-        faiss.omp_set_num_threads(threads)
-        together = min(_wall(lambda a=asked, x=index: x.search(a, BEST)) for _ in range(3))
-        facts = {
-            "places": count,
-            "median_ms": round(1000 * statistics.median(one), 3),
-            "threads": threads,
-            "of_many_all_threads_ms": round(1000 * together / queries, 3),
-            "build_s": round(building, 1),
-            "build_cpu_s": round(used, 1),
-            "bytes_per_place": _CODES_A_PLACE[name],
-        }
-        width = BITS if binary else FLOATS
-        title = f"faiss {name} {width} over {count:,} places, ms a view"
-        yield Figure(title, 1000 * statistics.median(one), None, True, facts)
-        del index
-
-
-def _walking(count: int, seed: int, binary: bool) -> np.ndarray:
-    rng = np.random.default_rng((7, seed))
-    steps = -(-count // DRIVE)
-    values = np.empty((DRIVE, steps, FLOATS), np.float32)
-    values[0] = rng.standard_normal((steps, FLOATS))
-    for step in range(1, DRIVE):
-        values[step] = 0.97 * values[step - 1] + 0.243 * rng.standard_normal((steps, FLOATS), np.float32)
-    values = values.transpose(1, 0, 2).reshape(-1, FLOATS)[:count]
-    if binary:
-        return np.packbits(values > 0, axis=1)
-    return values / np.linalg.norm(values, axis=1, keepdims=True)
-
-
-def _wall(work: Callable[[], object]) -> float:
-    """Seconds by the clock on the wall, which other programs on the machine lengthen."""
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from tests.results.example import COUNT, make_run
 from vplog.maps import keys
@@ -76,6 +77,20 @@ def put(store: Store, drive: str, seed: int, library: str = LIBRARY, **more: Any
     folder = store.staging / f"{seed}"
     shutil.rmtree(folder, ignore_errors=True)
     map_store.publish(store, drive, write_run(folder, drive, seed, library, **more))
+
+
+def put_rows(store: Store, name: str, run: Path, library: str, rows: slice = slice(None)) -> None:
+    """A copy of a run as a drive of the map, or some of its places."""
+    made = store.staging / name
+    shutil.copytree(run, made, ignore=shutil.ignore_patterns("library"))
+    path = made / "descriptors.parquet"
+    table = pq.read_table(path)
+    order = np.arange(len(table))[rows]
+    header = {**table.schema.metadata, b"vplog.library": library.encode()}
+    pq.write_table(table.take(pa.array(order)).replace_schema_metadata(header), path)
+    about = {"drive": name, "log": f"/logs/{name}.mcap", "key": "k", "library": library, "inputs": {}}
+    run_record.write_run_json(made / "drive.json", about)
+    map_store.publish(store, name, made)
 
 
 def seeds(run: Path) -> set[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -240,6 +241,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         gone.staging.mkdir(parents=True)
         with pytest.raises(ResultError, match="taken"):
             put(gone, "two", 3)
+    shutil.rmtree(gone.root)
     assert same_state(root) == {"one": {1}, "two": {2}}
 
 

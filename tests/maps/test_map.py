@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, cast
 
 import duckdb
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -18,7 +17,9 @@ from vplog.maps.keys import drive_names
 from vplog.maps.query import search
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
-from vplog.results import run_record, tables
+from vplog.results import tables
+
+from .runs import put_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,24 +28,9 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.demo.record import Drive
-    from vplog.maps.store import Store
     from vplog.stages import PlaceState
 
     Verb = Callable[..., Said]
-
-
-def put(store: Store, name: str, run: Path, library: str, rows: slice = slice(None)) -> None:
-    """A copy of a run as a drive of the map, or some of its places."""
-    made = store.staging / name
-    shutil.copytree(run, made, ignore=shutil.ignore_patterns("library"))
-    path = made / "descriptors.parquet"
-    table = pq.read_table(path)
-    order = np.arange(len(table))[rows]
-    header = {**table.schema.metadata, b"vplog.library": library.encode()}
-    pq.write_table(table.take(pa.array(order)).replace_schema_metadata(header), path)
-    about = {"drive": name, "log": f"/logs/{name}.mcap", "key": "k", "library": library, "inputs": {}}
-    run_record.write_run_json(made / "drive.json", about)
-    map_store.publish(store, name, made)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +47,7 @@ def root(finished: Path, library: str, tmp_path: Path) -> Path:
         map_store.add_library(store, store.staging / "library", library)
         store.write_head(map_store.Head(library, load_pipeline("default").model_dump(mode="json")))
         for name, rows in (("all", slice(None)), ("back 1/2", slice(None, 20, -1)), ("ten", slice(10))):
-            put(store, name, finished, library, rows)
+            put_rows(store, name, finished, library, rows)
     return root
 
 
@@ -130,7 +116,7 @@ def test_a_drive_is_found_where_it_is(root: Path, drive: Drive, verb: Verb, tmp_
 
 def test_places_of_another_library_are_refused(root: Path, finished: Path, drive: Drive, verb: Verb) -> None:
     with map_store.writing(root) as store:
-        put(store, "stranger", finished, "f" * 64)
+        put_rows(store, "stranger", finished, "f" * 64)
     assert "places do not compare" in verb("map", "query", root, drive.log).error
     assert any("do not compare" in problem for problem in verb("map", "info", root, "--json").json["problems"])
     shutil.rmtree(root / "runs" / "drive=stranger")

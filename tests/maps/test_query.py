@@ -20,7 +20,7 @@ from vplog.maps import index as map_index
 from vplog.maps import query as map_query
 from vplog.maps import search as map_search
 from vplog.maps.answers import Answers, no_answers
-from vplog.maps.index import folder_of, update_index
+from vplog.maps.index import update_index
 from vplog.maps.query import search
 from vplog.maps.search import best_places
 from vplog.maps.segment import open_segment
@@ -93,7 +93,7 @@ class Map:
         return parts
 
     def files(self) -> dict[str, bytes]:
-        return {path.name: path.read_bytes() for path in folder_of(self.store).iterdir()}
+        return {path.name: path.read_bytes() for path in self.store.index.iterdir()}
 
 
 def told(found: Answers, view: int) -> list[tuple[float, int, int]]:
@@ -113,7 +113,7 @@ def made(tmp_path: Path, state: BobbState) -> Map:
 def test_the_best_places_are_those_of_brute_force(made: Map, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one segment or many, by any number of threads and by workers elsewhere, for one view or many."""
     made.check()
-    shutil.rmtree(folder_of(made.store))
+    shutil.rmtree(made.store.index)
     monkeypatch.setattr(map_index, "CAPACITY", 50)
     monkeypatch.setattr("vplog.places.bobb.BLOCK", 16)
     monkeypatch.setattr(map_search, "_PARTS_A_TASK", 1)
@@ -157,25 +157,25 @@ def test_drives_one_by_one_make_few_segments(tmp_path: Path, state: BobbState) -
         assert len(parts) <= 1 + np.log2(number + 1)
     grown.check()
     at_once.check()
-    shutil.rmtree(folder_of(grown.store))
+    shutil.rmtree(grown.store.index)
     grown.check(threads=4)
     assert grown.files() == at_once.files(), "the same drives, the same bytes"
 
 
 def test_a_finished_index_is_left_as_it_is(made: Map) -> None:
     made.check()
-    before = {path: path.stat().st_mtime_ns for path in folder_of(made.store).iterdir()}
+    before = {path: path.stat().st_mtime_ns for path in made.store.index.iterdir()}
     made.check()
-    assert {path: path.stat().st_mtime_ns for path in folder_of(made.store).iterdir()} == before
+    assert {path: path.stat().st_mtime_ns for path in made.store.index.iterdir()} == before
 
 
 def test_of_two_that_have_a_drive_one_counts(made: Map, tmp_path: Path) -> None:
     """A reader may find the segments of before and after a merge."""
     made.check()
-    shutil.copytree(folder_of(made.store), tmp_path / "old")
+    shutil.copytree(made.store.index, tmp_path / "old")
     made.put(5, 200)
     made.check()
-    shutil.copytree(tmp_path / "old", folder_of(made.store), dirs_exist_ok=True)
+    shutil.copytree(tmp_path / "old", made.store.index, dirs_exist_ok=True)
     assert len(made.files()) == 2
     made.check()
     assert len(made.files()) == 1
@@ -193,7 +193,7 @@ def test_other_recognisers_are_searched_drive_by_drive(made: Map) -> None:
     found, warnings = search(made.store, made.store.drives(), other, views, TOP, SequenceSettings(length=1), 2)
     assert not warnings
     assert [told(found, at) for at in range(4)] == [made.expected(view) for view in views]
-    assert not folder_of(made.store).exists()
+    assert not made.store.index.exists()
 
 
 def die(*_: object) -> None:
@@ -208,7 +208,7 @@ def test_a_lost_worker_is_one_line(made: Map, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_map_that_cannot_be_written_to_is_searched_all_the_same(made: Map) -> None:
-    folder_of(made.store).touch()
+    made.store.index.touch()
     parts, warnings = made.update()
     assert len(warnings) == 1
     assert "stays in memory" in warnings[0]

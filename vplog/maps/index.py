@@ -19,7 +19,8 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
-from vplog.maps.segment import SUFFIX, Content, Segment, open_segment, write_segment
+from vplog.maps.cache import is_sealed, seal, seal_of
+from vplog.maps.segment import SUFFIX, Content, Segment, checksum, open_segment, write_segment
 from vplog.maps.store import other_library
 from vplog.results import tables
 
@@ -55,10 +56,6 @@ class Part:
         return int(np.diff(self.segment.first)[self.numbers >= 0].sum())
 
 
-def folder_of(store: Store) -> Path:
-    return store.root / "index"
-
-
 def update_index(
     store: Store,
     drives: Mapping[str, Mapping[str, Any]],
@@ -83,12 +80,13 @@ def update_index(
     for group in groups:
         segment, path = _build(store, group, library, state, threads), None
         try:
-            path = write_segment(folder_of(store), segment)
+            if _in_cache(store):
+                seal(store.index / segment.name, checksum(segment))
+            path = write_segment(store.index, segment)
             segment = open_segment(path)
-        except ResultError as error:
-            warnings += [] if done else [f"The index stays in memory and is made again by every query. {error}"]
-        if store.mirror is not None:  # that folder goes with this process, and no other sees it
+        except (ResultError, OSError) as error:
             path = None
+            warnings += [] if done else [f"The index stays in memory and is made again by every query. {error}"]
         parts.append(Part(segment, path, np.array([numbers[one] for one in group], np.int32)))
         done += len(group)
         progress("index", done, sum(map(len, groups)))
@@ -98,8 +96,15 @@ def update_index(
     return parts, warnings
 
 
+def _in_cache(store: Store) -> bool:
+    """Whether the index is kept where nothing is taken on trust."""
+    return store.mirror is not None and store.mirror.cache is not None
+
+
 def content_of(store: Store, drive: str, key: str) -> Content:
-    """What a drive holds now. Raises ResultError."""
+    """What a drive holds now; on an object store as its manifest says. Raises ResultError."""
+    if store.mirror is not None and (mark := store.mirror.digest(drive, "descriptors.parquet")):
+        return Content(drive, key, mark)
     path = _descriptors(store, drive)
     try:
         with path.open("rb") as stream:
@@ -124,7 +129,10 @@ def _open_all(store: Store, library: str, state: BobbState) -> tuple[list[tuple[
     """The segments that fit the library, the files that are of no use, and why the damaged ones are not."""
     known, useless, warnings = [], [], []
     shape = (len(state.matcher), state.settings.boxes)
-    for path in sorted(folder_of(store).glob(f"*{SUFFIX}")):
+    for path in sorted(store.index.glob(f"*{SUFFIX}")):
+        if _in_cache(store) and not is_sealed(path):  # without a word: it costs time alone
+            useless.append(path)
+            continue
         try:
             segment = open_segment(path)
         except FileNotFoundError:  # another process has put it into a larger one
@@ -205,8 +213,8 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
 
 def _remove(paths: Sequence[Path], store: Store) -> None:
     """Who has them open keeps them. A file that cannot be removed does no harm."""
-    old = [path for path in folder_of(store).glob(".*.part") if path.stat().st_mtime < time.time() - _LEFT_OVER_S]
-    for path in [*paths, *old]:
+    old = [path for path in store.index.glob(".*.part") if path.stat().st_mtime < time.time() - _LEFT_OVER_S]
+    for path in [*paths, *map(seal_of, paths), *old]:
         try:
             path.unlink(missing_ok=True)
         except OSError:

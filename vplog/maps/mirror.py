@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.maps.bucket_lock import Lock
+    from vplog.maps.cache import Cache
     from vplog.remote import RemotePath
 
 _REQUESTS = 16
@@ -50,9 +51,12 @@ _GENERATION = re.compile(r"[0-9a-f]{16}")
 class Mirror:
     """The drives of a map on a store, and the local folder that they are read and made through."""
 
-    def __init__(self, remote: RemotePath, local: Path, lock: Lock | None = None) -> None:
-        """With a lock it may be written to. Raises ResultError where the store cannot be read."""
-        self.remote, self.local, self.lock = remote, local, lock
+    def __init__(
+        self, remote: RemotePath, local: Path, lock: Lock | None = None, *, cache: Cache | None = None
+    ) -> None:
+        """With a lock it may be written to; with a cache nothing is fetched that is there. Raises ResultError where the
+        store cannot be read."""
+        self.remote, self.local, self.lock, self.cache = remote, local, lock, cache
         self.manifests: dict[str, dict[str, Any]] = {}
         self.rest_manifest: dict[str, Any] = {}
         self._fetched: set[str] = set()
@@ -114,14 +118,17 @@ class Mirror:
         target, place = self.local / "libraries" / digest, self.remote / "libraries" / digest
         if target.exists() or not HASH.fullmatch(digest):
             return
-        part = target.with_name(f".{digest}.part")
-        with told(self.remote):
-            names = sorted(objects.files_below(place))
-            if "library.json" not in names:  # it is sent last
-                return
-            for name in filter(_sound, names):
-                (part / name).parent.mkdir(parents=True, exist_ok=True)
-                objects.fetch(place / name, part / name, _LIBRARY_FILE_BYTES)
+        part, files = target.with_name(f".{digest}.part"), dict[str, str]()
+        if self.cache is None or not self.cache.take_library(digest, part):
+            with told(self.remote):
+                names = sorted(objects.files_below(place))
+                if "library.json" not in names:  # it is sent last
+                    return
+                for name in filter(_sound, names):
+                    (part / name).parent.mkdir(parents=True, exist_ok=True)
+                    files[name] = objects.fetch(place / name, part / name, _LIBRARY_FILE_BYTES)
+            if self.cache is not None:
+                self.cache.keep_library(digest, files, part)
         part.rename(target)
 
     def rest(self, names: Collection[str] = ()) -> None:
@@ -155,6 +162,8 @@ class Mirror:
         if about is None or target.exists():
             return
         target.parent.mkdir(parents=True, exist_ok=True)
+        if self.cache is not None and self.cache.take(about["sha256"], target):
+            return
         part = target.with_name(f".{target.name}.part")
         try:
             digest = objects.fetch(place, part, about["bytes"])
@@ -165,6 +174,8 @@ class Mirror:
         if digest != about["sha256"]:
             raise ResultError(f"{place} is damaged: it does not have the sha256 that its manifest names. Run again.")
         part.replace(target)
+        if self.cache is not None:
+            self.cache.keep(digest, target)
 
     def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
         """As it is now; None where there is none. Raises OSError, and ResultError where it is damaged."""
@@ -192,6 +203,11 @@ class Mirror:
         self.manifests[manifest["drive"]] = manifest
         self._fetched.add(manifest["drive"])
 
+    def digest(self, drive: str, name: str) -> str | None:
+        """sha256 of a file of a drive, None where it has none of this name."""
+        about = self.manifests[drive]["files"].get(name) if drive in self.manifests else None
+        return None if about is None else str(about["sha256"])
+
     def run(self, drive: str) -> Path:
         return self.local / "runs" / folder_name(drive)
 
@@ -212,7 +228,10 @@ def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
         files = manifest["files"]
         generations = [manifest["generation"], manifest["replaces"] or manifest["generation"]]
         sound = all(_GENERATION.fullmatch(one) for one in generations) and all(
-            isinstance(one["bytes"], int) and isinstance(one.get("rows", 0), int) and _sound(name) and one["sha256"]
+            isinstance(one["bytes"], int)
+            and isinstance(one.get("rows", 0), int)
+            and _sound(name)
+            and HASH.fullmatch(one["sha256"])
             for name, one in files.items()
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):

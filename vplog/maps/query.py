@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,17 +20,20 @@ from vplog.maps.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely
 from vplog.pipeline import Pipeline
 from vplog.places.bobb import BobbState
 from vplog.places.sequence import SequenceSettings
+from vplog.remote import RemotePath
 from vplog.results import tables
 from vplog.results.placed import placed_table, write_placed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from concurrent.futures import Executor
+    from pathlib import Path
 
     import pyarrow as pa
 
     from vplog.data import Ints
     from vplog.maps.answers import Answers
+    from vplog.maps.cache import Cache
     from vplog.maps.store import Store
     from vplog.stages import Log, PlaceState
 
@@ -47,14 +50,16 @@ def query_map(
     threads: int = 1,
     progress: Progress = lambda *_: None,
     executor: Executor | None = None,
+    cache: Cache | None = None,
 ) -> dict[str, Any]:
     """The `top` places of the map that are most like each view of a log, in `out` too where given.
 
     Views are chosen and described as the map's drives were, with its library. With `sequence` views in a window (None:
     as the map's settings say; 1: each view for itself) lines run within a drive. With an executor its workers search
-    the map; they must see its folder. Raises VplogError with one line.
+    the map; they must see its folder. With a cache a map on an object store is read from there, but for its manifests.
+    Raises VplogError with one line.
     """
-    with map_store.reading(root) as store:
+    with map_store.reading(root, cache) as store:
         drives, pipeline, state = open_map(store, threads)
         log = logs.open(path, topics)
         stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
@@ -79,23 +84,27 @@ def query_map(
     }
 
 
-def index_map(root: Path, threads: int = 1, progress: Progress = lambda *_: None) -> dict[str, Any]:
-    """Bring the index of a map up to its drives, which the next query would do. Raises VplogError with one line."""
-    if not isinstance(root, Path):
-        raise ResultError(f"{root} is read through a folder that goes with the query, so its index does, too.")
-    store = map_store.Store(root)
-    drives, _, state = open_map(store, threads)
-    if not isinstance(state, BobbState):
-        raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
-    parts, warnings = update_index(store, drives, state.hash, state, threads, progress)
-    return {
-        "map": str(root),
-        "drives": list(drives),
-        "places": sum(part.places for part in parts),
-        "segments": [str(part.path) for part in parts if part.path is not None],
-        "bytes": sum(part.path.stat().st_size for part in parts if part.path is not None),
-        "warnings": warnings,
-    }
+def index_map(
+    root: Path, threads: int = 1, progress: Progress = lambda *_: None, cache: Cache | None = None
+) -> dict[str, Any]:
+    """Bring the index of a map up to its drives, which the next query would do; that of a map on an object store in
+    the cache. Raises VplogError with one line."""
+    if isinstance(root, RemotePath) and cache is None:
+        raise ResultError(f"The index of {root} is kept in a cache alone, and there is none. Name one with --cache.")
+    with map_store.reading(root, cache) as store:
+        drives, _, state = open_map(store, threads)
+        if not isinstance(state, BobbState):
+            raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
+        parts, warnings = update_index(store, drives, state.hash, state, threads, progress)
+        files = [part.path for part in parts if part.path is not None]
+        return {
+            "map": str(root),
+            "drives": list(drives),
+            "places": sum(part.places for part in parts),
+            "segments": [str(path) for path in files],
+            "bytes": sum(path.stat().st_size for path in files),
+            "warnings": warnings,
+        }
 
 
 def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pipeline, PlaceState]:
@@ -161,6 +170,8 @@ def search(
         top = min(top, sum(store.rows("descriptors", drive) for drive in drives))
         return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), []
     parts, told = update_index(store, drives, state.hash, state, threads, progress)
+    if store.mirror is not None:  # workers elsewhere do not see these files
+        parts = [replace(part, path=None) for part in parts]
     places = sum(part.places for part in parts)
     top = min(top, places)
     if settings.length == 1:

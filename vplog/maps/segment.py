@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from vplog.data import Ints
@@ -39,6 +40,8 @@ _MOST_REFERENCES = 65_535
 """A reference's number has 16 bits, and the last one is none."""
 _MOST_WINDOWS = 256
 """16 windows along each side, as the settings have it."""
+_READ_BYTES = 1 << 22
+"""At once of a file that is summed up."""
 
 
 @dataclass(frozen=True, order=True)
@@ -49,7 +52,8 @@ class Content:
     key: str
     """Of drive.json: hash of all that the drive was made from."""
     mark: str
-    """Hash of the footer of its descriptors.parquet, which tells another table even where the key is the same."""
+    """Hash of the footer of its descriptors.parquet, which tells another table even where the key is the same; on an
+    object store that of the whole file, which its manifest has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +90,47 @@ class Segment:
 
 def write_segment(folder: Path, segment: Segment) -> Path:
     """Write a segment under its name, whole or not at all. Raises ResultError where the folder cannot be written."""
-    path, header = folder / segment.name, segment.header
+    path = folder / segment.name
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise ResultError(f"Cannot write {folder}: {error.strerror}.") from None
     with replacing(path) as stream:
-        stream.write(_MAGIC + len(header).to_bytes(8, "little") + header)
-        for part in segment.lists.parts:
-            stream.write(bytes(-stream.tell() % _ALIGNED))
-            stream.write(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).data)
+        for block in _blocks(segment):
+            stream.write(block)
     return path
+
+
+def _blocks(segment: Segment) -> Iterator[bytes | memoryview]:
+    """What its file holds."""
+    header = segment.header
+    yield (start := _MAGIC + len(header).to_bytes(8, "little") + header)
+    at = len(start)
+    for part in segment.lists.parts:
+        yield bytes(-at % _ALIGNED)
+        at += -at % _ALIGNED
+        if part.size:  # an array of none has no bytes to look at
+            yield (data := np.ascontiguousarray(part, part.dtype.newbyteorder("<")).data.cast("B"))
+            at += len(data)
+
+
+def checksum(segment: Segment) -> str:
+    """CRC-32 and length of its file. It is there against damage, and summed up at 2.6 GB/s where sha256 takes eight
+    times as long."""
+    return _summed(_blocks(segment))
+
+
+def read_checksum(path: Path) -> str:
+    """The same of a file. Raises OSError."""
+    with path.open("rb") as stream:
+        return _summed(iter(lambda: stream.read(_READ_BYTES), b""))
+
+
+def _summed(blocks: Iterator[bytes | memoryview]) -> str:
+    total, length = 0, 0
+    for block in blocks:
+        total, length = zlib.crc32(block, total), length + len(block)
+    return f"{total:08x} {length}"
 
 
 def open_segment(path: Path) -> Segment:

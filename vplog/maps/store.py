@@ -15,11 +15,9 @@ removing its folders: `rm -r MAP/*/drive=ID`.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import pyarrow as pa
@@ -32,10 +30,13 @@ from vplog.maps.earth import earth_as_plain, earth_from_plain, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
+from vplog.scratch import scratch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+    from pathlib import Path
 
+    from vplog.maps.cache import Cache
     from vplog.maps.mirror import Mirror
     from vplog.results.shown import Earth
 
@@ -73,6 +74,13 @@ class Store:
     def __str__(self) -> str:
         """As its user calls it."""
         return str(self.root if self.mirror is None else self.mirror.remote)
+
+    @property
+    def index(self) -> Path:
+        """Where its index is; of a map on an object store that of the reader alone, in the cache if there is one."""
+        if self.mirror is not None and self.mirror.cache is not None:
+            return self.mirror.cache.index_of(self.mirror.remote)
+        return self.root / "index"
 
     @property
     def staging(self) -> Path:
@@ -201,15 +209,20 @@ class Store:
 
 
 @contextmanager
-def reading(root: Path) -> Iterator[Store]:
-    """A map, local or on an object store, for those who only read it. Raises ResultError."""
+def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
+    """A map, local or on an object store, for those who only read it; with a cache, what is read of the latter stays
+    there for the next one. Raises ResultError."""
     if not isinstance(root, RemotePath):
         yield Store(root)
         return
     from vplog.maps.mirror import Mirror
 
-    with tempfile.TemporaryDirectory(prefix="vplog-map-") as folder:
-        yield Store(Path(folder), Mirror(root, Path(folder)))
+    try:
+        with scratch("map", None if cache is None else cache.open_folders) as folder:
+            yield Store(folder, Mirror(root, folder, cache=cache))
+    finally:
+        if cache is not None:
+            cache.trim()
 
 
 @contextmanager
@@ -236,11 +249,11 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
     from vplog.maps.mirror import Mirror
 
     check_writable(root)
-    with bucket_lock.held(root) as lock, tempfile.TemporaryDirectory(prefix="vplog-map-") as folder:
-        mirror = Mirror(root, Path(folder), lock)
+    with bucket_lock.held(root) as lock, scratch("map") as folder:
+        mirror = Mirror(root, folder, lock)
         sending.begin(mirror)
         mirror.rest()
-        store = Store(Path(folder), mirror)
+        store = Store(folder, mirror)
         store.staging.mkdir()
         yield store
         sending.send_rest(mirror)
