@@ -116,7 +116,10 @@ def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(drive: Drive, bucket: s
     names = {path.name for path in located(f"{bucket}/runs/a").iterdir()}
     assert {"run.json", "result.mcap", "closures.parquet", "trajectory.tum"} <= names
     assert json.loads((located(f"{bucket}/runs/a") / "run.json").read_text())["finished"] is True
-    assert verb("evaluate", f"{bucket}/runs/a", "--truth", drive.truth, "--json").json["closures"]["keyframes"] > 40
+    put(drive.truth, f"{bucket}/two")
+    truth = f"{bucket}/two/{drive.truth.name}"
+    assert verb("evaluate", f"{bucket}/runs/a", "--truth", truth, "--json").json["closures"]["keyframes"] > 40
+    assert "Cannot read s3://" in verb("evaluate", f"{bucket}/runs/a", "--truth", f"{truth}.not").error
     assert verb("evaluate", f"{bucket}/runs/a", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
 
 

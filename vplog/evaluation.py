@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +16,8 @@ from vplog.record import reopened
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from vplog import logs
 
 
@@ -38,7 +39,7 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     if truth == "gps":
         return {"truth": "gps", **_against_gps(record, before, after, topics)}
-    known = read_truth(Path(truth))
+    known = read_truth(truth)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = _recorded(record, folder, dict, "settings", "propose")
@@ -58,7 +59,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str) -> dict[str, Any]:
     """Each drive by itself, and each map of several as one trajectory, all against a truth in the drives' clock."""
     if truth == "gps":
         raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
-    known = read_truth(Path(truth))
+    known = read_truth(truth)
     maps = []
     for found in _recorded(record, folder, list, "maps"):
         names = _recorded(found, folder, list, "drives")

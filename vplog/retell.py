@@ -63,7 +63,7 @@ def judge(folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicCh
     scores = evaluate(folder, truth, topics)
     if truth == "gps":
         return Judged(truth, scores)
-    known = read_truth(Path(truth))
+    known = read_truth(truth)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     stops = candidate_stops(keyframes, _pipeline(folder, record).propose)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog import geometry
+from vplog.remote import reason
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +33,7 @@ def read_tum(path: Path, failure: type[VplogError], option: str) -> tuple[Ints, 
     stamps: list[int] = []
     rows: list[list[float]] = []
     try:
-        with path.open(encoding="utf-8-sig") as lines:
+        with io.TextIOWrapper(path.open("rb"), encoding="utf-8-sig") as lines:
             number = 0
             while line := lines.readline(_LINE_LIMIT):
                 number += 1
@@ -43,7 +45,7 @@ def read_tum(path: Path, failure: type[VplogError], option: str) -> tuple[Ints, 
                     stamps.append(stamp_ns)
                     rows.append(row)
     except OSError as error:
-        raise failure(f"Cannot read {path}: {error.strerror}. Give a TUM file with {option}.") from None
+        raise failure(f"Cannot read {path}: {reason(error)}. Give a TUM file with {option}.") from None
     except UnicodeDecodeError:
         raise failure(f"{path} is not text. {_FORMAT}") from None
     if not rows:

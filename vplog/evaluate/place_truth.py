@@ -128,10 +128,10 @@ def _takers(option: str) -> str:
 def _files(source: str) -> tuple[Trajectory, Trajectory]:
     """One TUM file for both drives, or one for each."""
     if Path(source).is_file() or "," not in source:
-        truth = read_truth(Path(source))
+        truth = read_truth(source)
         return truth, truth
     here, _, there = source.partition(",")
-    return read_truth(Path(here)), read_truth(Path(there))
+    return read_truth(here), read_truth(there)
 
 
 def _odometry(query: Log, other: Log) -> tuple[Trajectory, Trajectory]:

@@ -6,12 +6,16 @@ from typing import TYPE_CHECKING
 
 from vplog.data import Trajectory
 from vplog.errors import TruthError
+from vplog.remote import located
 from vplog.tum import read_tum
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
-def read_truth(path: Path) -> Trajectory:
-    """A TUM file, world_from_body, s and m, in any order. Raises TruthError with the first line that does not fit."""
-    return Trajectory(*read_tum(path, TruthError, "--truth"))
+def read_truth(place: str | Path) -> Trajectory:
+    """A TUM file, here or by URL: world_from_body, s and m, in any order.
+
+    Raises TruthError with the first line that does not fit, SettingsError for a URL of no known kind.
+    """
+    return Trajectory(*read_tum(located(place), TruthError, "--truth"))
