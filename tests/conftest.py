@@ -26,6 +26,13 @@ settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("anew", print_blob=True, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
+_LONGEST = ("test_shared_drives.py", "test_ray.py", "test_join.py", "test_study.py", "test_batch.py", "test_verify.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The files that take minutes first: each stays with one worker, and the others would wait for the last."""
+    items.sort(key=lambda item: item.path.name not in _LONGEST)
+
 
 @dataclass(frozen=True)
 class Said:
