@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from vplog.logs.images import depth_m, grey, image_size, is_depth
 from vplog.logs.messages import BadMessageError, ImageMessage
@@ -189,6 +191,27 @@ def test_files_decode_and_say_their_size(kind: str) -> None:
     data = cv2.imencode(kind, colour)[1].tobytes()
     assert image_size(data) == (50, 30)
     assert np.abs(grey(ImageMessage(0, "", kind, data, True)).astype(int) - pixels).max() < 12
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+@pytest.mark.parametrize("progressive", [0, 1])
+@pytest.mark.parametrize("sampling", [0x111111, 0x211111, 0x221111])  # 4:4:4, 4:2:2, 4:2:0
+def test_a_jpeg_is_what_opencv_makes_of_it(sampling: int, progressive: int, colours: int) -> None:
+    pixels = cv2.GaussianBlur(RNG.integers(0, 256, (123, 157, 3)).astype(np.uint8), (5, 5), 2)[..., :colours]
+    settings = [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [*settings, cv2.IMWRITE_JPEG_RST_INTERVAL, 3])[1]
+    damaged = data.copy()
+    damaged[len(data) // 2 : len(data) // 2 + 5] ^= 0x55  # among its pixels: the rest is read all the same
+    for file in (data, damaged):
+        image = grey(ImageMessage(0, "", "jpeg", file.tobytes(), True))
+        np.testing.assert_array_equal(image, cv2.imdecode(file, cv2.IMREAD_GRAYSCALE))
+    assert not np.array_equal(cv2.imdecode(damaged, cv2.IMREAD_GRAYSCALE), cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
+
+
+def test_a_jpeg_of_four_colours_is_read() -> None:
+    file = io.BytesIO()
+    Image.fromarray(np.zeros((20, 30, 4), np.uint8), "CMYK").save(file, "JPEG")
+    assert grey(ImageMessage(0, "", "jpeg", file.getvalue(), True)).shape == (20, 30)
 
 
 def test_size_that_the_data_do_not_justify_is_refused_before_it_is_allocated() -> None:

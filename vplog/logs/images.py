@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+import simplejpeg
 
 from vplog.logs.checksum import crc32
 from vplog.logs.messages import BadMessageError
@@ -27,6 +28,8 @@ _DEPTH_HEADER = 12
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 """Markers that a JPEG begins and ends with: ITU T.81, table B.1. Some cameras write more behind its end."""
+_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+"""Of 16 bits, all that are there."""
 _INVALID_MM = (0, 65535)
 """Depth values in mm that mean no measurement: 0 in ROS REP 118 and cameras' firmware, 65535 in 7-Scenes."""
 
@@ -83,7 +86,7 @@ def grey(message: ImageMessage) -> Bytes:
     """(H, W) uint8; of more bits the highest eight that are used. Raises BadMessageError."""
     if message.compressed:
         mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH if mosaic is None else cv2.IMREAD_UNCHANGED
+        flags = _GREY if mosaic is None else cv2.IMREAD_UNCHANGED
         pixels, conversion = _imdecode(message.data, flags), None
         if mosaic is not None:  # some transports compress the mosaic as it is
             conversion = mosaic[2] if pixels.ndim == 2 else _COLOURS[pixels.shape[2]]
@@ -153,7 +156,8 @@ def _raw(message: ImageMessage) -> tuple[Any, int | None]:
 
 
 def _imdecode(data: Octets, flags: int) -> Any:
-    """OpenCV's decoder, after the size in the file's own header was found believable."""
+    """Decoded after the size in the file's own header was found believable: by OpenCV; a JPEG to grey, of which drives
+    are full, by the same library without OpenCV around it, a tenth faster."""
     if data[:2] != _JPEG:
         data = bytes(data)
     size = image_size(data)
@@ -164,6 +168,11 @@ def _imdecode(data: Octets, flags: int) -> Any:
     limit = MAX_PIXELS if data[:4] == b"RIFF" else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
     if size[0] * size[1] > limit:
         raise BadMessageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
+    if flags == _GREY and data[:2] == _JPEG:
+        try:
+            return simplejpeg.decode_jpeg(data, colorspace="GRAY", strict=False)[:, :, 0]
+        except ValueError:  # of four colours, or damaged in its head
+            pass
     try:
         # IGNORE_ORIENTATION: calibration and odometry belong to the sensor's own rows.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
