@@ -12,11 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from vplog.logs.compression import BadChunkError
+from vplog.logs.containers import part_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator
     from concurrent.futures import Future
     from typing import BinaryIO
+
+    from vplog.logs.containers import Octets
 
 MOST_BYTES = 64 * 2**20
 """Bytes of unpacked chunks that a process keeps, whatever their number: drives of a few minutes are unpacked once, and
@@ -85,6 +88,10 @@ class Chunks:
     def __call__(self, number: int) -> bytes:
         kept = _KEPT.get((self._file, number))
         return self._take(number, lambda: self._load(number)) if kept is None else kept
+
+    def part(self, number: int, start: int, stop: int) -> Octets:
+        """Bytes of a chunk, as `part_of`."""
+        return part_of(self(number), start, stop)
 
     def in_turn(
         self, numbers: Iterable[int], stays: Callable[[int], bool] | None = None

@@ -55,6 +55,13 @@ class Block(NamedTuple):
         return Message(self.channels[row], self.log_ns[row], data[start:stop], self.places[row])
 
 
+def part_of(data: Octets, start: int, stop: int) -> Octets:
+    """Bytes of a chunk where they lie, which keeps all of it; a copy of those of a large one."""
+    return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
+
+
+_VIEWED = 4 * 2**20
+"""Bytes of a chunk up to which its images are not copied: each that waits to be decoded may keep another."""
 _COPIED = 4096
 """Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
 _TOGETHER = 256
@@ -129,7 +136,7 @@ class Container(Protocol):
         encodings of ROS, may be cut off behind the stamp in their header: they reach beyond the block's bytes."""
         ...
 
-    def read(self, place: Place) -> bytes:
+    def read(self, place: Place) -> Octets:
         """The bytes of one message, from any place that `messages` gave."""
         ...
 

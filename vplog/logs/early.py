@@ -11,15 +11,17 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from vplog.logs.frames import Decoded
+from vplog.logs.containers import part_of
+from vplog.logs.frames import Decoded, image_in
 from vplog.logs.images import grey, image_size
-from vplog.logs.messages import BadMessageError, ImageMessage, decode
+from vplog.logs.messages import BadMessageError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from vplog.data import Bytes
-    from vplog.logs.containers import Block, Channel, Container, Place
+    from vplog.logs.containers import Block, Channel, Container, Octets, Place
+    from vplog.logs.messages import ImageMessage
 
 _THREADS = min(4, os.cpu_count() or 1) - 1
 """One core goes through the log, in about 15 ms for each 10 MB; three others decode some 25 images of 0.5 MP meanwhile.
@@ -70,7 +72,7 @@ class EarlyImages:
             if not first and (stop - start > _LARGEST or not self._places.acquire(blocking=False)):
                 return
             whole = stop <= len(block.data)
-            data = bytes(block.data[start:stop]) if whole else self._container.read(place)
+            data = part_of(block.data, start, stop) if whole else self._container.read(place)
             self._begun[place] = self._pool.submit(self._decode, channel, data, first)
 
     def frame_and_size(self, place: Place) -> tuple[str, tuple[int, int]] | None:
@@ -94,11 +96,9 @@ class EarlyImages:
         """Those that were not asked for."""
         self._begun.clear()
 
-    def _decode(self, channel: Channel, data: bytes, first: bool) -> _Found | None:
+    def _decode(self, channel: Channel, data: Octets, first: bool) -> _Found | None:
         try:
-            found = decode(channel, data)
-            if not isinstance(found, ImageMessage):
-                raise BadMessageError("it is not an image message")
+            found = image_in(channel, data)
             room = self._has_room(found)
             if not room and not first:
                 return None

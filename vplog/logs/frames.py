@@ -17,9 +17,20 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vplog.data import Bytes, Camera, Float32s
-    from vplog.logs.containers import Channel
+    from vplog.logs.containers import Channel, Octets
     from vplog.logs.losses import Account
     from vplog.logs.stereo import Pair
+
+
+def image_in(channel: Channel, data: Octets) -> ImageMessage:
+    """The image of a message, its pixels or file a view of it. Raises BadMessageError.
+
+    What this takes, other threads wait for: the interpreter is one.
+    """
+    message = read_image(channel, data, copy=False) or decode(channel, data)
+    if not isinstance(message, ImageMessage):
+        raise BadMessageError("it is not an image message")
+    return message
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +38,7 @@ class Encoded:
     """An image message as bytes."""
 
     channel: Channel
-    data: bytes
+    data: Octets
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
@@ -39,11 +50,7 @@ class Encoded:
 
     def _pixels(self, stamp_ns: int, convert: Callable[[ImageMessage], np.ndarray]) -> Any:
         try:
-            # what each step here takes, other threads wait for: the interpreter is one
-            message = read_image(self.channel, self.data, copy=False) or decode(self.channel, self.data)
-            if not isinstance(message, ImageMessage):
-                raise BadMessageError("it is not an image message")
-            return convert(message)
+            return convert(image_in(self.channel, self.data))
         except BadMessageError as error:
             raise LogError(undecodable(self.channel, stamp_ns, str(error))) from None
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.containers import Block, Message, Place
+    from vplog.logs.containers import Block, Message, Octets, Place
     from vplog.logs.mcap_layout import Chunk
 
 __all__ = ["MAGIC", "McapFile"]
@@ -99,12 +99,12 @@ class McapFile:
                 yield walk.whole(data)
             self._account_for_chunk(chunk, walk)
 
-    def read(self, place: Place) -> bytes:
+    def read(self, place: Place) -> Octets:
         number, start, stop = place
         chunk = self._layout.chunks[number]
         if self._local and self._is_plain(chunk):  # as when it was gone through
             return self._at(chunk.start + start, stop - start)
-        return self._data(number)[start:stop]
+        return self._data.part(number, start, stop)
 
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
         """What the walk could not find, and how much of what was recorded that is."""

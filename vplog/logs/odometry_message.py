@@ -7,11 +7,11 @@ expected is left to that decoder, which says what is wrong.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.logs.messages import BadMessageError, PoseMessage, decode_generally, short_type
+from vplog.logs.messages import BadMessageError, PoseMessage, decode_generally, nanoseconds, short_type
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -43,7 +43,7 @@ class Poses(NamedTuple):
 def read_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
     """The poses of messages of any type; None where they cannot be taken together: one is damaged or is no pose, or
     they name different frames."""
-    found = read_odometry(channel, messages)
+    found = read_odometry(channel, messages) or _read_poses_in_frame(channel, messages)
     if found is not None:
         return found
     try:
@@ -82,6 +82,28 @@ def read_odometry(channel: Channel, messages: list[bytes]) -> Poses | None:
         return None
     numbers = np.ascontiguousarray(rows[:, numbers_at : numbers_at + 8 * _POSE]).view("<f8")
     return Poses(stamps[:, 0] * 10**9 + stamps[:, 1], *names, numbers[:, :7], numbers[:, 7:])
+
+
+def _read_poses_in_frame(channel: Channel, messages: list[bytes]) -> Poses | None:
+    """The poses of messages of foxglove.PoseInFrame in protobuf; None as above, and for damaged ones."""
+    if channel.encoding != "protobuf" or channel.type != "foxglove.PoseInFrame":
+        return None
+    from vplog.logs.foxglove_messages import DecodeError, PoseInFrame
+
+    stamps, numbers = [], []
+    one: Any = PoseInFrame()
+    try:
+        frame = one.FromString(messages[0]).frame_id
+        for data in messages:
+            one.ParseFromString(data)
+            if one.frame_id != frame:
+                return None
+            stamps.append(nanoseconds(one.timestamp.seconds, one.timestamp.nanos))
+            p, q = one.pose.position, one.pose.orientation
+            numbers.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    except (DecodeError, BadMessageError):
+        return None
+    return Poses(np.array(stamps, np.int64), frame, "", np.array(numbers, np.float64), None)
 
 
 @lru_cache(maxsize=16)

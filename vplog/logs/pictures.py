@@ -9,14 +9,14 @@ import numpy as np
 
 from vplog.errors import LogError
 from vplog.logs.containers import plural
-from vplog.logs.frames import Decoded, Encoded
+from vplog.logs.frames import Decoded, Encoded, image_in
 from vplog.logs.images import grey
 from vplog.logs.messages import BadMessageError, ImageMessage, decode
 from vplog.logs.video import VideoStream
 
 if TYPE_CHECKING:
     from vplog.data import Float32s
-    from vplog.logs.containers import Channel, Container, Notes, Place
+    from vplog.logs.containers import Channel, Container, Notes, Octets, Place
     from vplog.logs.content import Content
     from vplog.logs.early import EarlyImages
 
@@ -24,10 +24,8 @@ _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
 
 
-def _frame_and_size(channel: Channel, data: bytes) -> tuple[str, tuple[int, int]]:
-    message = decode(channel, data)
-    if not isinstance(message, ImageMessage):
-        raise BadMessageError("it is not an image message")
+def _frame_and_size(channel: Channel, data: Octets) -> tuple[str, tuple[int, int]]:
+    message = image_in(channel, data)
     height, width = grey(message).shape
     return message.frame, (width, height)
 

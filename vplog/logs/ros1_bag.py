@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.containers import Message, Place
+    from vplog.logs.containers import Message, Octets, Place
     from vplog.logs.ros1_layout import Chunk
 
 __all__ = ["MAGIC", "Ros1Bag"]
@@ -80,9 +80,8 @@ class Ros1Bag:
                     block.places.append((count, start, stop))
             yield block
 
-    def read(self, place: Place) -> bytes:
-        chunk, start, stop = place
-        return self._data(chunk)[start:stop]
+    def read(self, place: Place) -> Octets:
+        return self._data.part(*place)
 
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
         layout, account, name = self._layout, self._notes.account, self._name

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.logs.containers import Block, Channel, Container, Place
+    from vplog.logs.containers import Block, Channel, Container, Octets, Place
 
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
@@ -78,7 +78,7 @@ class Chain:
             for block in part.blocks(channels, brief):
                 yield block._replace(places=[(number, *place) for place in block.places])
 
-    def read(self, place: Place) -> bytes:
+    def read(self, place: Place) -> Octets:
         return self._parts[place[0]].read(place[1:])
 
 
@@ -107,7 +107,7 @@ class Counted:
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         return self._found.blocks(channels, brief)
 
-    def read(self, place: Place) -> bytes:
+    def read(self, place: Place) -> Octets:
         return self._found.read(place)
 
 
