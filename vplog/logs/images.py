@@ -28,6 +28,10 @@ _DEPTH_HEADER = 12
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 """Markers that a JPEG begins and ends with: ITU T.81, table B.1. Some cameras write more behind its end."""
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers that a frame starts with: ITU T.81, table B.1."""
+_JPEG_MARKER = struct.Struct(">BBHxHH")
+"""A marker and the length behind it; where a frame starts its precision, height and width: ITU T.81, figure B.3."""
 _GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 """Of 16 bits, all that are there."""
 _INVALID_MM = (0, 65535)
@@ -239,16 +243,17 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: Octets) -> tuple[int, int] | None:
-    position = 2
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
+    position, last = 2, len(data) - _JPEG_MARKER.size
+    while position <= last:
+        begin, marker, length, height, width = _JPEG_MARKER.unpack_from(data, position)
+        if begin != 0xFF:
+            return None
         if marker == 0xFF:  # fill byte: ITU T.81, B.1.1.2
             position += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame: ITU T.81, table B.1
-            height, width = struct.unpack_from(">HH", data, position + 5)
+        elif marker in _JPEG_FRAMES:
             # Without an end marker behind this (thumbnails lie before it) the file is cut; OpenCV would grey the rest.
             ends = data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > position
             return (width, height) if ends else None
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        else:
+            position += 2 + length
     return None
