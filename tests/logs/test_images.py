@@ -197,7 +197,8 @@ def test_files_decode_and_say_their_size(kind: str) -> None:
 @pytest.mark.parametrize("progressive", [0, 1])
 @pytest.mark.parametrize("sampling", [0x111111, 0x211111, 0x221111])  # 4:4:4, 4:2:2, 4:2:0
 def test_a_jpeg_is_what_opencv_makes_of_it(sampling: int, progressive: int, colours: int) -> None:
-    pixels = cv2.GaussianBlur(RNG.integers(0, 256, (123, 157, 3)).astype(np.uint8), (5, 5), 2)[..., :colours]
+    noise = np.random.default_rng(5).integers(0, 256, (123, 157, 3)).astype(np.uint8)
+    pixels = cv2.GaussianBlur(noise, (5, 5), 2)[..., :colours]
     settings = [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
     data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [*settings, cv2.IMWRITE_JPEG_RST_INTERVAL, 3])[1]
     damaged = data.copy()
