@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 _NO_POSE = (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.TOO_FEW_INLIERS)
 """Verdicts of views that geometry does not show to be of one place."""
+_FIRST_SHARE = 8
+"""One in so many of the bests is looked at first, whatever the length of the drives: where they share a stretch, its
+views are among those that score highest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,24 +99,37 @@ def closures_between(
 ) -> Closures:
     """The ledger of the candidates of one drive's keyframes (queries) in another (matches) that are worth a look.
 
-    First comes the best of each query. Where it is of the same place by geometry, all candidates of the queries
-    around are looked at too; elsewhere the others are left out, and most drives meet in few places. `share` is by what
-    the calibrations are wrong, where that is known; `fetch` is told before each look which queries and matches it is
-    about. `progress` counts queries' bests, then candidates.
+    First come the bests of the queries that score highest. Where geometry shows none of them to be of the same place
+    the drives do not meet; else the best of each other query follows, and then all candidates of the queries around
+    those of the same place: they are for the graph, and left out where no calibration gives them metres. `share` is by
+    what the calibrations are wrong, where that is known; `fetch` is told before each look which queries and matches it
+    is about. `progress` counts the candidates of each look.
     """
-    _, first = np.unique(proposals.query, return_index=True)
-    best = np.zeros(len(proposals.query), bool)
-    best[first] = True
     if share is None:
         share = calibration_of(later, earlier, threads)
-    fetch(np.unique(proposals.query[best]), np.unique(proposals.match[best]))
-    looked = verify_between(taken(proposals, best), later, earlier, threads, progress, share)
-    held = looked.query[[verdict not in _NO_POSE for verdict in looked.verdict]]
-    others = ~best & _near(proposals.query, held, settings.around)
-    fetch(np.unique(proposals.query[others]), np.unique(proposals.match[others]))
-    more = verify_between(taken(proposals, others), later, earlier, threads, progress, share)
-    rows = np.concatenate([np.flatnonzero(best), np.flatnonzero(others)])
-    return _in_order(looked, more, np.argsort(rows))
+    _, best = np.unique(proposals.query, return_index=True)
+    by_score = best[np.argsort(-proposals.score[best], kind="stable")]
+    count = max(settings.first_look, -(-len(best) // _FIRST_SHARE))
+    looks: list[tuple[Ints, Closures]] = []
+
+    def look(rows: Ints) -> None:
+        fetch(np.unique(proposals.query[rows]), np.unique(proposals.match[rows]))
+        ledger = verify_between(taken(proposals, rows), later, earlier, threads, progress, share)
+        looks.append((rows, ledger))
+
+    def held() -> Int32s:
+        """Queries whose candidate is of the same place, increasing."""
+        return np.unique(np.concatenate([one.query[[v not in _NO_POSE for v in one.verdict]] for _, one in looks]))
+
+    look(np.sort(by_score[:count]))
+    if len(held()):
+        look(np.sort(by_score[count:]))
+        if later.camera.matrix is not None and earlier.camera.matrix is not None:
+            others = _near(proposals.query, held(), settings.around)
+            others[best] = False
+            look(np.flatnonzero(others))
+    rows = np.concatenate([rows for rows, _ in looks])
+    return _in_order([ledger for _, ledger in looks], np.argsort(rows))
 
 
 def calibration_of(later: Drive, earlier: Drive, threads: int = 1) -> float:
@@ -158,13 +174,13 @@ def _near(query: Int32s, held: Int32s, around: int) -> Bools:
     return np.minimum(np.abs(query - left), np.abs(query - right)) <= around
 
 
-def _in_order(one: Closures, other: Closures, order: Ints) -> Closures:
-    """The rows of both ledgers, in this order."""
+def _in_order(ledgers: Sequence[Closures], order: Ints) -> Closures:
+    """The rows of all ledgers, in this order."""
 
-    def joined(a: Any, b: Any) -> Any:
-        if isinstance(a, list):
-            both = a + b
-            return [both[row] for row in order.tolist()]
-        return np.concatenate([a, b])[order]
+    def joined(columns: list[Any]) -> Any:
+        if isinstance(columns[0], list):
+            every = [cell for column in columns for cell in column]
+            return [every[row] for row in order.tolist()]
+        return np.concatenate(columns)[order]
 
-    return Closures(**{part.name: joined(getattr(one, part.name), getattr(other, part.name)) for part in fields(one)})
+    return Closures(**{part.name: joined([getattr(one, part.name) for one in ledgers]) for part in fields(Closures)})

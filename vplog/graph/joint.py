@@ -36,9 +36,14 @@ class JoinSettings(Settings):
     most_drives: int = Field(default=32, ge=1)
     """Drives that one is verified against: those whose places are most like its own. With `propose.per_query`, which
     bounds the candidates of a keyframe in all drives together, what a drive costs does not grow with their number."""
+    first_look: int = Field(default=32, ge=1)
+    """Keyframes, those whose best candidate in another drive scores highest, of which this candidate is verified first,
+    or an eighth of them where that is more. Where geometry shows none of these to be of the same place, the others are
+    not looked at: of two drives that meet, ten times `least_closures` would all have to fail."""
     around: int = Field(default=10, ge=0)
     """Keyframes either side of one whose best candidate in another drive is of the same place by geometry, of which
-    all candidates there are verified: half the window of `sequence.length`. Elsewhere the best alone is."""
+    all candidates there are verified: half the window of `sequence.length`. Elsewhere the best alone is; so it is where
+    one of the drives has no calibration, for then no candidate can join them."""
     keep_features: bool = True
     """Whether a map keeps the features of its keyframes that verification looks at, 0.1 MB each, so that a new drive
     needs neither the logs of those before it nor to extract from them again."""
