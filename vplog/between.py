@@ -57,14 +57,25 @@ def with_drive(
     known: Candidates, number: int, later: Sequence[Any], earlier: Sequence[Any], state: PlaceState,
     pipeline: Pipeline, threads: int = 1,
 ) -> Candidates:  # fmt: skip
-    """The candidates with those of the places `later` in a drive more, whose places are `earlier`.
+    """The candidates with those of the places `later` in a drive more, whose places are `earlier`."""
+    return with_proposals(known, number, proposed_in(later, earlier, state, pipeline, threads), pipeline)
+
+
+def proposed_in(
+    later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, threads: int = 1
+) -> Proposals:
+    """The candidates of the places `later` among those of one drive."""
+    stops = np.full(len(later), len(earlier), np.int64)
+    ranked = rank_places(state.index(earlier), later, stops, pipeline.propose.asked, pipeline.sequence, threads)
+    return propose(ranked, pipeline.propose)
+
+
+def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pipeline) -> Candidates:
+    """The candidates with those in a drive more.
 
     `propose.per_query` bounds what is kept of a query over all drives, as it does within one: what a drive costs to
     verify does not grow with the map. Ties go to the drive of lower number, in whatever order they are searched.
     """
-    stops = np.full(len(later), len(earlier), np.int64)
-    ranked = rank_places(state.index(earlier), later, stops, pipeline.propose.asked, pipeline.sequence, threads)
-    more = propose(ranked, pipeline.propose)
     drive = np.concatenate([known.drive, np.full(len(more.query), number, np.int32)])
     every = Proposals(**{
         one.name: np.concatenate([getattr(known.proposals, one.name), getattr(more, one.name)])

@@ -98,9 +98,14 @@ def propose(rankings: Iterable[tuple[Ranking, Int32s]], settings: ProposeSetting
 def _suppress(rows: Int32s, within: int, keep: int) -> list[int]:
     """Positions of the first `keep` rows, best first, that are not within `within` rows of a better one."""
     kept: list[int] = []
+    better: list[int] = []  # the rows of those
     for at, row in enumerate(rows.tolist()):
-        if all(abs(row - int(rows[other])) > within for other in kept):
+        for other in better:
+            if -within <= row - other <= within:
+                break
+        else:
             kept.append(at)
+            better.append(row)
             if len(kept) == keep:
                 break
     return kept

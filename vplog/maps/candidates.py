@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.between import no_candidates, with_drive
+from vplog.between import no_candidates, proposed_in, with_proposals
 from vplog.errors import ResultError
+from vplog.extract import map_in_order
 from vplog.results import tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from vplog.between import Candidates
+    from vplog.loops.propose import Proposals
     from vplog.maps.members import Member
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
@@ -40,15 +43,25 @@ def candidates_of(
     store: Store, members: Sequence[Member], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
     threads: int = 1, progress: Progress = lambda *_: None,
 ) -> dict[int, Candidates]:  # fmt: skip
-    """For each new drive, by number, its best candidates in all drives of a lower number."""
+    """For each new drive, by number, its best candidates in all drives of a lower number.
+
+    Each thread has a drive of its own to look through: of a drive's few hundred views, each is done too soon to share.
+    """
     found = {number: no_candidates() for number in new}
     done, total = 0, sum(new)
-    for first in range(0, len(new), _AT_ONCE):
-        block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
-        for earlier in range(max(block)):
-            known = block.get(earlier) or places_of(store, members[earlier], state)
-            for later in (number for number in block if number > earlier):
-                found[later] = with_drive(found[later], earlier, block[later], known, state, pipeline, threads)
-                done += 1
-            progress("search the map", done, total)
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        for first in range(0, len(new), _AT_ONCE):
+            block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
+
+            def look_through(earlier: int, block: dict[int, Sequence[Any]] = block) -> list[tuple[int, Proposals]]:
+                known = block.get(earlier) or places_of(store, members[earlier], state)
+                those = [later for later in block if later > earlier]
+                return [(later, proposed_in(block[later], known, state, pipeline)) for later in those]
+
+            looked = map_in_order(pool, look_through, range(max(block)), ahead=2 * threads)
+            for earlier, proposed in enumerate(looked):
+                for later, more in proposed:
+                    found[later] = with_proposals(found[later], earlier, more, pipeline)
+                done += len(proposed)
+                progress("search the map", done, total)
     return found

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Self
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Self
 
 import numba
 import numpy as np
@@ -19,10 +20,12 @@ from vplog.data import Ranking
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from vplog.data import Float32s, Int32s, Ints
     from vplog.stages import PlaceIndex
+
+    Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
 
 _BLOCK = 64
 """Queries worked on at once: enough for every thread, and few enough that memory is that of a few rows."""
@@ -87,8 +90,8 @@ def sequence_rows(
     x = np.zeros((_BLOCK + 2 * half, width), np.float32)
     agrees = np.zeros(x.shape, np.bool_)
 
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        usual = _usual(row_of_scores, stops, settings.length, pool)
+    with _mapping(threads) as mapped:
+        usual = _usual(row_of_scores, stops, settings.length, mapped)
 
         def fill(query: int) -> None:
             row, stop = query - first + half, stops[query]
@@ -103,8 +106,8 @@ def sequence_rows(
             if first:
                 x[: 2 * half], agrees[: 2 * half] = x[_BLOCK:].copy(), agrees[_BLOCK:].copy()
             known = first + half if first else 0
-            list(pool.map(fill, range(known, min(first + _BLOCK + half, count))))
-            yield from list(pool.map(match, range(first, min(first + _BLOCK, count))))
+            list(mapped(fill, range(known, min(first + _BLOCK + half, count))))
+            yield from list(mapped(match, range(first, min(first + _BLOCK, count))))
 
 
 def match_sequences(scores: Float32s, settings: SequenceSettings, stops: Ints | None = None) -> Float32s:
@@ -145,6 +148,16 @@ def rank_places(
                 yield ranking, np.zeros(len(ranking.rows), np.int32)
 
 
+@contextmanager
+def _mapping(threads: int) -> Iterator[Mapping]:
+    """`map` by so many threads; by this one where it is one, for handing over takes longer than a short row does."""
+    if threads <= 1:
+        yield map
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool.map
+
+
 def _best_rows(score: Float32s, k: int) -> Int32s:
     rows = np.flatnonzero(score > 0)
     if len(rows) > k:  # everything as good as the k-th, so that ties do not depend on the partition
@@ -152,7 +165,7 @@ def _best_rows(score: Float32s, k: int) -> Int32s:
     return rows[np.lexsort((rows, -score[rows]))][:k].astype(np.int32)
 
 
-def _usual(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, pool: ThreadPoolExecutor) -> Float32s:
+def _usual(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, mapped: Mapping) -> Float32s:
     """(W,) how much more alike than others each row is to any view: a blank wall is a bit like everything.
 
     The mean over views spread evenly over the drive. A row that few of them may match is drawn to 0, as if `length`
@@ -163,7 +176,7 @@ def _usual(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, p
     total, seen = np.zeros(stops.max(initial=0)), np.zeros(stops.max(initial=0), np.int64)
     for first in range(0, len(queries), _BLOCK):
         block = queries[first : first + _BLOCK].tolist()
-        for row in pool.map(lambda query: _centred(row_of_scores(query)), block):  # in order: a sum of its own bytes
+        for row in mapped(lambda query: _centred(row_of_scores(query)), block):  # in order: a sum of its own bytes
             total[: len(row)] += row
             seen[: len(row)] += 1
     return (total / (seen + length)).astype(np.float32)
