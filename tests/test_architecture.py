@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
-    {"data", "settings", "timing", "google_store", "web"},
+    {"data", "settings", "timing", "cores", "google_store", "web"},
     {"geometry", "geodesy", "remote", "scratch"},
     {"tum"},
     {"stages", "references", "inputs", "code_hash"},

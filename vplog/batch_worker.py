@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import record
+from vplog.cores import limited
 from vplog.errors import VplogError
 from vplog.maps import keys
 from vplog.pipeline import Pipeline
@@ -68,10 +69,11 @@ def compute_drive(task: Task) -> Outcome:
     began, error, may_pass, peak = time.perf_counter(), "", False, 0.0
     try:
         log = located(task.log)
-        done = run_alone(
-            log, task.folder, task.pipeline, task.library, task.topics, task.threads, cache=task.cache,
-            use_cache=task.cache is not None,
-        )  # fmt: skip
+        with limited(task.threads):
+            done = run_alone(
+                log, task.folder, task.pipeline, task.library, task.topics, task.threads, cache=task.cache,
+                use_cache=task.cache is not None,
+            )  # fmt: skip
         peak = done.record["totals"]["peak_memory_mb"]
         if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):
             error = f"{task.log} changed while it was read. Run again."

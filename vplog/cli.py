@@ -17,6 +17,7 @@ from vplog.cli_options import at_least_one, pipeline_of, place, topic_options, t
 from vplog.cli_print import Progress, print_evaluation, print_info, print_joint, print_json, print_run, say
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
+from vplog.cores import available, limited
 from vplog.errors import VplogError
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
-        with _at_hand(arguments):
+        with _at_hand(arguments), limited(getattr(arguments, "threads", None)):
             arguments.verb(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
@@ -238,9 +239,8 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     topics = topic_options()
     threads = argparse.ArgumentParser(add_help=False)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads.add_argument(
-        "--threads", type=at_least_one, default=cores, metavar="N", help="workers (default: all cores)"
+        "--threads", type=at_least_one, default=available(), metavar="N", help="workers (default: all cores)"
     )
     settings = argparse.ArgumentParser(add_help=False)
     settings.add_argument("--pipeline", default="default", metavar="P", help="shipped name or .yaml file")

@@ -10,11 +10,11 @@ import numpy as np
 
 from vplog import logs, record
 from vplog.between import closures_between, likely_drives, no_candidates, shared_of, with_drive, with_shared
+from vplog.cores import limited
 from vplog.errors import LogError, SettingsError
 from vplog.features.store import FeatureStore
 from vplog.graph import joint as graph_joint
 from vplog.graph.correct import correct_trajectory
-from vplog.graph.workers import limited
 from vplog.joint_graph import between_of, judged_by, own_drive
 from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of

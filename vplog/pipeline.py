@@ -12,6 +12,7 @@ from pydantic import model_validator
 
 from vplog import logs, record
 from vplog.back_end import about_gps, back_end
+from vplog.cores import limited
 from vplog.data import Closures, EdgeKind, Keyframes, Reference
 from vplog.errors import SettingsError
 from vplog.features.sift import SiftSettings
@@ -22,7 +23,6 @@ from vplog.graph.noise import NoiseSettings
 from vplog.graph.refine import RefineSettings
 from vplog.graph.satellites import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
-from vplog.graph.workers import limited
 from vplog.inputs import files_of
 from vplog.keyframes import KeyframeSettings, select_keyframes
 from vplog.ledger import verify_in_parts

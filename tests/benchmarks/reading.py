@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from vplog import logs
+from vplog.cores import limited
 from vplog.extract import map_in_order, one_thread_each
 from vplog.keyframes import KeyframeSettings, select_keyframes
 
@@ -83,9 +84,9 @@ def speed(path: Path, topic: str, threads: int, rounds: int, bar: float | None) 
     wanted = set(stamps.tolist())
 
     def ours() -> int:
-        log = logs.open(path)
-        log.odometry()
-        with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        with limited(threads), ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+            log = logs.open(path)
+            log.odometry()
             decoded = map_in_order(pool, lambda frame: frame.decode().image, log.frames(stamps), ahead=2 * threads)
             return sum(image.size for image in decoded)
 

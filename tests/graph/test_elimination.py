@@ -11,9 +11,10 @@ import pytest
 from tests.benchmarks.graphs import city, spoiled
 from tests.benchmarks.large_graphs import drives
 from vplog import geometry
+from vplog.cores import limited
 from vplog.data import EdgeKind
 from vplog.errors import GraphError
-from vplog.graph import dense, descent, inverse_fronts, normal, workers
+from vplog.graph import dense, descent, inverse_fronts, normal
 from vplog.graph.cholesky import Blocks, Cholesky
 from vplog.graph.consistency import is_loop, residual_sigma
 from vplog.graph.elimination import Elimination
@@ -131,10 +132,10 @@ def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPa
             + str(error).encode()
         )
 
-    with workers.limited(1):
+    with limited(1):
         alone = found()
     for threads in (2, 5):
-        with workers.limited(threads):
+        with limited(threads):
             assert found() == alone
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vplog import logs
+from vplog.cores import limited
 from vplog.errors import LogError
 from vplog.logs import early as early_module
 from vplog.logs.containers import Block, Channel
@@ -23,13 +24,6 @@ if TYPE_CHECKING:
     from vplog.logs.containers import Place
 
 CAMERA = Channel("/camera", "foxglove.CompressedImage", "protobuf")
-
-
-@pytest.fixture(autouse=True)
-def cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where there are several."""
-    monkeypatch.setattr(early_module, "_MOST_PX", 2**25)
-    monkeypatch.setattr(early_module, "_WAITING", 12)
 
 
 class Plain:
@@ -64,7 +58,7 @@ def waited_for(early: EarlyImages) -> EarlyImages:
 def test_what_is_taken_is_the_image_and_is_taken_once(there: int | None) -> None:
     files = jpegs(3)
     log = Plain(files, there)
-    early = EarlyImages(log, CAMERA)  # pyright: ignore[reportArgumentType]
+    early = EarlyImages(log, CAMERA, 3)  # pyright: ignore[reportArgumentType]
     early.offer(log.block)
     waited_for(early)
     assert early.frame_and_size(log.block.places[0]) == ("c", (16, 16))
@@ -78,7 +72,7 @@ def test_what_is_taken_is_the_image_and_is_taken_once(there: int | None) -> None
 
 def test_a_damaged_image_is_told_as_ever() -> None:
     log = Plain([*jpegs(1), b"\xff\xd8\xff no image"])
-    early = EarlyImages(log, CAMERA)  # pyright: ignore[reportArgumentType]
+    early = EarlyImages(log, CAMERA, 3)  # pyright: ignore[reportArgumentType]
     early.offer(log.block)
     found = waited_for(early).take(log.block.places[1])
     if found is not None:  # its size cannot be told, so that it is not begun
@@ -92,7 +86,7 @@ def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(early_module, "_MOST_PX", room)
         monkeypatch.setattr(early_module, "_WAITING", 100)
         log = Plain(jpegs(30))
-        early = EarlyImages(log, CAMERA)  # pyright: ignore[reportArgumentType]
+        early = EarlyImages(log, CAMERA, 3)  # pyright: ignore[reportArgumentType]
         early.offer(log.block)
         waited_for(early)
         assert early.frame_and_size(log.block.places[0]) == ("c", (16, 16))
@@ -101,12 +95,12 @@ def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_few_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(early_module, "_WAITING", 5)
+    monkeypatch.setattr(early_module, "_WAITING", 2)
     monkeypatch.setattr(EarlyImages, "_decode", lambda *_: None)  # and gives no place back
     log = Plain(jpegs(30))
-    early = EarlyImages(log, CAMERA)  # pyright: ignore[reportArgumentType]
+    early = EarlyImages(log, CAMERA, 3)  # pyright: ignore[reportArgumentType]
     early.offer(log.block)
-    assert len(early._begun) == 6  # the first takes none
+    assert len(early._begun) == 7  # the first takes none
 
 
 def test_frames_are_the_same_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,3 +116,11 @@ def test_frames_are_the_same_without(tmp_path: Path, monkeypatch: pytest.MonkeyP
             np.testing.assert_array_equal(image, frame.decode().image)
         assert plain.warnings == log.warnings
         monkeypatch.undo()
+
+
+def test_none_is_decoded_early_by_one_thread() -> None:
+    log = Plain(jpegs(3))
+    with limited(1):
+        early = EarlyImages(log, CAMERA)  # pyright: ignore[reportArgumentType]
+    early.offer(log.block)
+    assert early.frame_and_size(log.block.places[0]) is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from vplog.cores import allowed
 from vplog.demo import route
 from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
 from vplog.errors import ResultError
@@ -78,7 +78,7 @@ def record_drive(folder: Path, settings: DemoSettings, threads: int | None = Non
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _write_truth(truth, settings, scene)
-        _write_log(log, settings, scene, threads or os.cpu_count() or 1)
+        _write_log(log, settings, scene, threads or allowed())
     except OSError as error:
         raise ResultError(f"Cannot write the demo drive to {folder}: {error}. Choose another folder.") from None
     return Drive(log, truth, scene.camera, scene.stamp_ns, scene.world_from_body)

@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.cores import allowed
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-_limit: ContextVar[int | None] = ContextVar("threads of graph solves", default=None)
-
-
-@contextmanager
-def limited(threads: int) -> Iterator[None]:
-    """No more threads than so many for what is solved inside."""
-    before = _limit.set(threads)
-    try:
-        yield
-    finally:
-        _limit.reset(before)
+    from collections.abc import Callable, Sequence
 
 
 class Workers:
-    """A few threads, while the `with` lasts: as many as limited() says, otherwise as there are cores."""
+    """A few threads, while the `with` lasts: as many as `vplog.cores` allows."""
 
     def __enter__(self) -> Workers:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.count = _limit.get() or cores
+        self.count = allowed()
         self._pool = ThreadPoolExecutor(self.count) if self.count > 1 else None
         return self
 

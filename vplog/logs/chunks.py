@@ -11,6 +11,7 @@ from collections import OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
+from vplog.cores import allowed
 from vplog.logs.compression import BadChunkError
 from vplog.logs.containers import part_of
 
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
 MOST_BYTES = 64 * 2**20
 """Bytes of unpacked chunks that a process keeps, whatever their number: drives of a few minutes are unpacked once, and
 in longer ones image and depth, which lie in neighbouring chunks, do not unpack their chunks twice."""
-_THREADS = min(2, os.cpu_count() or 1)
-"""Threads that read ahead: each unpacks about 1 GB/s, and images are gone through twice as fast. More cost more time of
-the processor than they save."""
+_THREADS = 2
+"""Threads that read ahead, where there may be as many: each unpacks about 1 GB/s, and images are gone through twice as
+fast. More cost more time of the processor than they save."""
 _ALONE_S = 0.02
 """Seconds of unpacking before other threads help. To start them and to hand over costs a few ms, and while a log is
 opened images are decoded on the other cores; what takes long to unpack, by its size or its packing, is there soon."""
@@ -81,7 +82,7 @@ class Chunks:
         """`load` reads and unpacks one, in any thread where `threads`; it raises BadChunkError, which `damaged` is told
         in the thread that asks. `size` says how many bytes there will be, `packed` whether to keep them."""
         self._load, self._damaged, self._size, self._packed = load, damaged, size, packed
-        self._threads = _THREADS if threads else 0
+        self._threads = min(_THREADS, allowed()) if threads else 0
         self._file = next(_FILES)
         weakref.finalize(self, _KEPT.forget, self._file)
 

@@ -6,11 +6,11 @@ The first one, since its size is that of all; of those behind it as many as ther
 
 from __future__ import annotations
 
-import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple, Self
 
+from vplog.cores import allowed
 from vplog.logs.containers import part_of
 from vplog.logs.frames import Decoded, image_in
 from vplog.logs.images import grey, image_size
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from vplog.logs.containers import Block, Channel, Container, Octets, Place
     from vplog.logs.messages import ImageMessage
 
-_THREADS = min(4, os.cpu_count() or 1) - 1
-"""One core goes through the log, in about 15 ms for each 10 MB; three others decode some 25 images of 0.5 MP meanwhile.
-With a fourth the first is slower by more than is saved."""
-_MOST_PX = 32 * 2**20 if _THREADS else 0
-"""Pixels, of a byte each, that are kept until they are asked for: about 60 images of 0.5 MP. None with one core."""
-_WAITING = 4 * _THREADS
-"""Images that wait for a thread: what is left when the pass ends is work for nothing, but only a copy of its bytes."""
+_THREADS = 3
+"""Where there may be one more: one core goes through the log, in about 15 ms for each 10 MB; three others decode some
+25 images of 0.5 MP meanwhile. With a fourth the first is slower by more than is saved."""
+_MOST_PX = 32 * 2**20
+"""Pixels, of a byte each, that are kept until they are asked for: about 60 images of 0.5 MP."""
+_WAITING = 4
+"""Images that wait for each thread: what is left when the pass ends is work for nothing, but nothing is copied."""
 _LARGEST = 4 * 2**20
-"""Bytes of a compressed image that may wait, 48 MiB for all; those of 12 MP have as many."""
+"""Bytes of a compressed image that may wait, 48 MiB for three threads; those of 12 MP have as many."""
 
 
 class _Found(NamedTuple):
@@ -46,11 +46,13 @@ class EarlyImages:
     """The images of one topic, as far as they are decoded early; none where the topic is None. Close it behind the
     pass: what is begun by then may still be taken."""
 
-    def __init__(self, container: Container, channel: Channel | None) -> None:
-        self._container, self._channel = container, channel
-        self._pool = ThreadPoolExecutor(max(_THREADS, 1), "vplog-early-image")
+    def __init__(self, container: Container, channel: Channel | None, threads: int | None = None) -> None:
+        """Without `threads`, one fewer than are allowed: where that is none, none is decoded."""
+        threads = min(_THREADS, allowed() - 1) if threads is None else threads
+        self._container, self._channel = container, channel if threads else None
+        self._pool = ThreadPoolExecutor(max(threads, 1), "vplog-early-image")
         self._begun: dict[Place, Future[_Found | None]] = {}
-        self._places = threading.Semaphore(_WAITING)
+        self._places = threading.Semaphore(_WAITING * threads)
         self._lock = threading.Lock()
         self._left_px = _MOST_PX
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from vplog.between import likely_drives, shared_of
-from vplog.graph.workers import limited
+from vplog.cores import limited
 from vplog.maps import pairs
 from vplog.maps.candidates import candidates_of, places_of
 from vplog.maps.roster import is_up_to_date, read_drives, settled_ties

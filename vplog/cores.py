@@ -1,0 +1,33 @@
+"""How many threads there may be: the cores that this process may use, or as many as the user allowed."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_limit: ContextVar[int | None] = ContextVar("threads allowed", default=None)
+
+
+def available() -> int:
+    """Cores of this machine that the system lets this process use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def allowed() -> int:
+    """Threads for work that is not told how many: as `limited` says, otherwise as many as cores."""
+    return _limit.get() or available()
+
+
+@contextmanager
+def limited(threads: int | None) -> Iterator[None]:
+    """No more threads than so many for what is done inside; None changes nothing."""
+    before = _limit.set(threads or _limit.get())
+    try:
+        yield
+    finally:
+        _limit.reset(before)
