@@ -18,10 +18,11 @@ from vplog.data import Ranking
 from vplog.evaluate.truth import read_truth
 from vplog.graph.joint import JoinSettings
 from vplog.inputs import hash_inputs
+from vplog.maps import candidates, pairs, together
 from vplog.maps import join as map_join
-from vplog.maps import pairs, together
 from vplog.maps import store as map_store
 from vplog.maps.joint_record import components_of
+from vplog.maps.roster import read_drives
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
 
@@ -260,3 +261,22 @@ def test_candidates_are_bounded_over_all_drives() -> None:
     assert 6 in likely_drives(found[0], JoinSettings(most_drives=1))
     assert len(likely_drives(found[0], JoinSettings(most_drives=3))) == 3
     assert likely_drives(found[0], JoinSettings(least_closures=1000)) == []
+
+
+def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The index tells them from the others by single views; of few drives every one is searched."""
+    monkeypatch.setattr(candidates, "_CHOICE", 1)
+    few = PIPELINE.model_copy(update={"join": JoinSettings(most_drives=1)})
+    with map_store.reading(copy) as store:
+        drives = read_drives(store)
+        by_name = {member.drive: member for member in drives.members}
+        other = next(name for name in by_name if name not in HALVES)
+        members = [by_name[name] for name in (other, *HALVES)]
+        state = map_join.load_places(store.library(drives.library), few)
+        later = {number: candidates.places_of(store, members[number], state) for number in (1, 2)}
+        assert candidates.worth_a_search(store, members, later, state, few) == {1: range(1), 2: {1}}
+        every = candidates.worth_a_search(store, members, later, state, PIPELINE)
+        assert every == {1: range(1), 2: range(2)}
+        for threads in (1, 3):
+            found = candidates.candidates_of(store, members, [2], state, few, threads)[2]
+            assert set(found.drive.tolist()) == {1}

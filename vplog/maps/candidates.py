@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pyarrow as pa
 
 from vplog.between import no_candidates, proposed_in, with_proposals
 from vplog.errors import ResultError
 from vplog.extract import map_in_order
+from vplog.maps.index import update_index
+from vplog.maps.search import best_places
+from vplog.places.bobb import BobbState
 from vplog.results import tables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Container, Mapping, Sequence
 
     from vplog.between import Candidates
+    from vplog.data import Floats
     from vplog.loops.propose import Proposals
+    from vplog.maps.answers import Answers
     from vplog.maps.members import Member
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
@@ -24,6 +31,11 @@ if TYPE_CHECKING:
 
     Progress = Callable[[str, int, int], None]
 
+_CHOICE = 3
+"""Drives searched for each that may be verified. Views alone and in sequences seldom differ in which drives are alike,
+but in their order."""
+_PLACES = 256
+"""Best places of each view by which drives are chosen: a place comes with its neighbours, some ten of each drive."""
 _AT_ONCE = 64
 """New drives that are looked for while the places of one before them are in memory; theirs are too, some 40 MB."""
 
@@ -43,19 +55,24 @@ def candidates_of(
     store: Store, members: Sequence[Member], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
     threads: int = 1, progress: Progress = lambda *_: None,
 ) -> dict[int, Candidates]:  # fmt: skip
-    """For each new drive, by number, its best candidates in all drives of a lower number.
+    """For each new drive, by number, its best candidates in the drives of a lower number that are worth a look.
 
     Each thread has a drive of its own to look through: of a drive's few hundred views, each is done too soon to share.
     """
     found = {number: no_candidates() for number in new}
-    done, total = 0, sum(new)
+    done, total = 0, sum(min(number, most_searched(pipeline)) for number in new)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         for first in range(0, len(new), _AT_ONCE):
             block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
+            searched = worth_a_search(store, members, block, state, pipeline, threads)
 
-            def look_through(earlier: int, block: dict[int, Sequence[Any]] = block) -> list[tuple[int, Proposals]]:
+            def look_through(
+                earlier: int, block: dict[int, Sequence[Any]] = block, searched: dict[int, Container[int]] = searched
+            ) -> list[tuple[int, Proposals]]:
+                those = [later for later in block if earlier in searched[later]]
+                if not those:
+                    return []
                 known = block.get(earlier) or places_of(store, members[earlier], state)
-                those = [later for later in block if later > earlier]
                 return [(later, proposed_in(block[later], known, state, pipeline)) for later in those]
 
             looked = map_in_order(pool, look_through, range(max(block)), ahead=2 * threads)
@@ -65,3 +82,48 @@ def candidates_of(
                 done += len(proposed)
                 progress("search the map", done, total)
     return found
+
+
+def most_searched(pipeline: Pipeline) -> int:
+    """Drives that one is searched in, at most: so many that `likely_drives` chooses from enough."""
+    return _CHOICE * pipeline.join.most_drives
+
+
+def worth_a_search(
+    store: Store, members: Sequence[Member], later: Mapping[int, Sequence[Any]], state: PlaceState,
+    pipeline: Pipeline, threads: int = 1,
+) -> dict[int, Container[int]]:  # fmt: skip
+    """For each drive of `later`, places by number, the drives of a lower number that it is searched in: all, and where
+    these are many the ones that hold most of what is like its views, each view for itself, by the map's index.
+
+    So what a drive more costs grows as a query of the map does, not with its drives. Maps without an index, which are
+    those of other recognisers and those on object stores, are searched drive by drive.
+    """
+    most = most_searched(pipeline)
+    searched: dict[int, Container[int]] = {number: range(number) for number in later}
+    if max(later) <= most or not isinstance(state, BobbState) or store.mirror is not None:
+        return searched
+    about = store.drives()
+    parts, _ = update_index(store, {one.drive: about[one.drive] for one in members}, state.hash, state, threads)
+    for number, views in later.items():
+        if number <= most:
+            continue
+        before = [replace(part, numbers=np.where(part.numbers < number, part.numbers, -1)) for part in parts]
+        answers = best_places(before, state, views, _PLACES, threads)
+        like = _alike(answers, number)
+        best = np.lexsort((np.arange(number), -like))[:most]
+        searched[number] = set(best[like[best] > 0].tolist())
+    return searched
+
+
+def _alike(answers: Answers, drives: int) -> Floats:
+    """(drives,) how much each holds of what is like the views: its best place for each, less the mean of the places
+    found for that view. Many places that are a bit like everything do not count."""
+    like = np.zeros(drives)
+    for drive, score, count in zip(
+        answers.drive, answers.score.astype(np.float64), answers.count.tolist(), strict=True
+    ):
+        if count:
+            best, first = np.unique(drive[:count], return_index=True)  # the first of a drive is its best
+            like[best] += np.maximum(score[first] - score[:count].mean(), 0.0)
+    return like
