@@ -14,6 +14,7 @@ from vplog.errors import ResultError
 from vplog.extract import map_in_order
 from vplog.maps.index import update_index
 from vplog.maps.search import best_places
+from vplog.maps.sequences import PLACES_A_VIEW, credits_of
 from vplog.places.bobb import BobbState
 from vplog.results import tables
 
@@ -21,9 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Mapping, Sequence
 
     from vplog.between import Candidates
-    from vplog.data import Floats
     from vplog.loops.propose import Proposals
-    from vplog.maps.answers import Answers
     from vplog.maps.members import Member
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
 _CHOICE = 3
 """Drives searched for each that may be verified. Views alone and in sequences seldom differ in which drives are alike,
 but in their order."""
-_PLACES = 256
-"""Best places of each view by which drives are chosen: a place comes with its neighbours, some ten of each drive."""
 _AT_ONCE = 64
 """New drives that are looked for while the places of one before them are in memory; theirs are too, some 40 MB."""
 
@@ -109,21 +106,8 @@ def worth_a_search(
         if number <= most:
             continue
         before = [replace(part, numbers=np.where(part.numbers < number, part.numbers, -1)) for part in parts]
-        answers = best_places(before, state, views, _PLACES, threads)
-        like = _alike(answers, number)
+        _, drive, credit = credits_of(best_places(before, state, views, PLACES_A_VIEW, threads))
+        like = np.bincount(drive, credit, number)
         best = np.lexsort((np.arange(number), -like))[:most]
         searched[number] = set(best[like[best] > 0].tolist())
     return searched
-
-
-def _alike(answers: Answers, drives: int) -> Floats:
-    """(drives,) how much each holds of what is like the views: its best place for each, less the mean of the places
-    found for that view. Many places that are a bit like everything do not count."""
-    like = np.zeros(drives)
-    for drive, score, count in zip(
-        answers.drive, answers.score.astype(np.float64), answers.count.tolist(), strict=True
-    ):
-        if count:
-            best, first = np.unique(drive[:count], return_index=True)  # the first of a drive is its best
-            like[best] += np.maximum(score[first] - score[:count].mean(), 0.0)
-    return like

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from typing import Any
 
-    from vplog.data import Ints
+    from vplog.data import Floats, Int32s, Ints
     from vplog.maps.store import Store
     from vplog.places.sequence import SequenceSettings
     from vplog.stages import PlaceState
@@ -71,10 +71,25 @@ def best_lines(
 def likely_drives(single: Answers, length: int) -> Ints:
     """Numbers of the drives in which lines may be, rising, by the best places of each single view.
 
-    A drive has the credit of each view by how much its best place there is above the last of the view's places: a
-    view that is like everything says little. Stretches of `length` views, each half over the last, name their best.
+    Stretches of `length` views, each half over the last, name the drives with most credit.
     """
-    views, top = single.score.shape
+    view, drive, credit = credits_of(single)
+    chosen = []
+    for start in range(0, len(single.score), max(length // 2, 1)):
+        part = slice(*np.searchsorted(view, [start, start + length]))
+        total = np.bincount(drive[part], credit[part])
+        best = np.argsort(-total, kind="stable")[:_DRIVES_A_STRETCH]
+        chosen.append(best[total[best] > 0])
+    return np.unique(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
+
+
+def credits_of(single: Answers) -> tuple[Ints, Int32s, Floats]:
+    """(C,) views, rising, drives, and how much each view says for the drive.
+
+    That is by how much the drive's best place is above the last of the view's places: a view that is like everything
+    says little.
+    """
+    top = single.score.shape[1]
     there = single.score > NONE
     least = np.where(there, single.score, np.inf).min(axis=1, initial=np.inf)
     full = there.sum(axis=1) == top
@@ -85,11 +100,4 @@ def likely_drives(single: Answers, length: int) -> Ints:
     drive = single.drive[view, rank]
     first = np.ones(len(view), np.bool_)  # a drive's best place for a view comes first
     first[1:] = (view[1:] != view[:-1]) | (drive[1:] != drive[:-1])
-    view, drive, credit = view[first], drive[first], credit[view[first], rank[first]]
-    chosen = []
-    for start in range(0, views, max(length // 2, 1)):
-        part = slice(*np.searchsorted(view, [start, start + length]))
-        total = np.bincount(drive[part], credit[part])
-        best = np.argsort(-total, kind="stable")[:_DRIVES_A_STRETCH]
-        chosen.append(best[total[best] > 0])
-    return np.unique(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
+    return view[first], drive[first], credit[view[first], rank[first]].astype(np.float64)
