@@ -9,6 +9,7 @@ import random
 import resource
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -30,6 +31,8 @@ NAMES = ("gardens_day_left.mcap", "gardens_day_right.mcap", "gardens_night_right
 """In the folder VPLOG_DATA / drives."""
 ADD_BAR = 1.2
 """Time of a drive added to a finished map, to that of its own run."""
+_ROUNDS = 3
+"""Of the drive that is added."""
 CLUSTER_DRIVES = 20
 _REACH = 2.5
 """Sum of the moments of all kills, to the time of the whole: what a kill costs is computed once more, which is half of
@@ -164,35 +167,39 @@ def _parts_of_join(root: Path) -> int:
 
 
 def added(setting: Setting) -> Iterator[Figure]:
-    """The last walk of the Gardens, or else the last drive, added to a map of the others; and run by itself."""
+    """The last walk of the Gardens, or else the last drive, added to a map of the others; and run by itself. In turns,
+    and the medians are told: machines are noisy."""
     new = next((log for log in setting.logs if log.name == NAMES[2]), setting.logs[-1])
     others = [log for log in setting.logs if log != new]
-    root, run = setting.folder / "grown", setting.folder / "run"
+    root, run, grown = (setting.folder / name for name in ("before", "run", "grown"))
     make(setting, root, others, "--jobs", 1)
-    before = files(root)
-    alone = [command("run", new, "-o", run, "--library", setting.library, *setting.options)]
-    shutil.rmtree(run)
-    without = setting.folder / "grown-apart"
-    shutil.copytree(root, without)
-    apart = make(setting, without, [*others, new], "--jobs", 1, "--no-join")
-    grown = make(setting, root, [*others, new], "--jobs", 1)
-    alone.append(command("run", new, "-o", run, "--library", setting.library, *setting.options))  # machines are noisy
-    own_s = sum(one.seconds for one in alone) / len(alone)
-    own_cpu_s = sum(one.cpu_seconds for one in alone) / len(alone)
-    after = files(root)
+    turns: dict[str, list[Ended]] = {"run": [], "without": [], "joined": []}
+    for _ in range(_ROUNDS):
+        turns["run"].append(command("run", new, "-o", run, "--library", setting.library, *setting.options))
+        shutil.rmtree(run)
+        for way, options in (("without", ["--no-join"]), ("joined", [])):
+            shutil.rmtree(grown, ignore_errors=True)
+            shutil.copytree(root, grown)
+            before = files(grown)
+            turns[way].append(make(setting, grown, [*others, new], "--jobs", 1, *options))
+    after = files(grown)
     changed = sorted(name for name in before if name in after and before[name] != after[name])
     gone = sorted(before.keys() - after.keys())
     made = sorted(after.keys() - before.keys())
     apart_from_it = [name for name in made if f"drive={new.stem}/" not in name]
-    facts = {"changed": changed, "gone": gone, "new_in_other_folders": apart_from_it, "new": len(made)}
+    facts: dict[str, Any] = {"changed": changed, "gone": gone, "new_in_other_folders": apart_from_it, "new": len(made)}
     yield Figure("batch: files of other drives that an added one changes", len(others_of(changed, new)), 0, True, facts)
-    facts = {"run_seconds": [one.seconds for one in alone], "run_cpu": [one.cpu_seconds for one in alone]}
-    facts |= {"seconds": apart.seconds, "cpu": apart.cpu_seconds, "cpu to run": round(apart.cpu_seconds / own_cpu_s, 3)}
-    yield Figure("batch: a drive added, to its own run", apart.seconds / own_s, ADD_BAR, True, facts)
-    facts = {"seconds": grown.seconds, "cpu": grown.cpu_seconds, "cpu to run": round(grown.cpu_seconds / own_cpu_s, 3)}
-    facts |= {"joined": grown.told["joined"]["pairs"], "stages": grown.told["joined"]["stages"]}
-    yield Figure("batch: the same with closures between the drives", grown.seconds / own_s, ADD_BAR, True, facts)
-    for folder in (root, run, without):
+    seconds = {way: [one.seconds for one in ended] for way, ended in turns.items()}
+    cpu = {way: [one.cpu_seconds for one in ended] for way, ended in turns.items()}
+    told = turns["joined"][-1].told["joined"]
+    names = {"without": "a drive added", "joined": "the same with closures between the drives"}
+    for way, name in names.items():
+        facts = {"seconds": seconds[way], "run_seconds": seconds["run"], "cpu": cpu[way], "run_cpu": cpu["run"]}
+        facts["cpu to run"] = round(statistics.median(cpu[way]) / statistics.median(cpu["run"]), 3)
+        facts |= {"joined": told["pairs"], "stages": told["stages"]} if way == "joined" else {}
+        ratio = statistics.median(seconds[way]) / statistics.median(seconds["run"])
+        yield Figure(f"batch: {name}, to its own run", ratio, ADD_BAR, True, facts)
+    for folder in (root, grown):
         shutil.rmtree(folder)
 
 
