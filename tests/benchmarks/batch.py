@@ -174,6 +174,7 @@ def added(setting: Setting) -> Iterator[Figure]:
     root, run, grown = (setting.folder / name for name in ("before", "run", "grown"))
     make(setting, root, others, "--jobs", 1)
     turns: dict[str, list[Ended]] = {"run": [], "without": [], "joined": []}
+    before: dict[str, tuple[int, str]] = {}
     for _ in range(_ROUNDS):
         turns["run"].append(command("run", new, "-o", run, "--library", setting.library, *setting.options))
         shutil.rmtree(run)
