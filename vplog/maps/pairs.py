@@ -39,6 +39,9 @@ _CODE = ("vplog.between", "vplog.extract", "vplog.features.sift", "vplog.results
 """Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
 less than another search of all drives is worth, and drive.json has them."""
 
+_SEARCH = "vplog.maps.candidates"
+"""What chooses the drives that one is searched in."""
+
 
 @dataclass(frozen=True)
 class PairTask:
@@ -185,7 +188,7 @@ class Joins:
 
 def search_key(member: Member, pipeline: Pipeline) -> str:
     """sha256 over what a drive's joins depend on, beside the drives before it."""
-    return key_of({"member": member.key, **depends(pipeline)})
+    return key_of({"member": member.key, **depends(pipeline), "search": code_of(*_CODE, _SEARCH)["code"]})
 
 
 def read_joins(store: Store, drive: str) -> Joins | None:
