@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -11,13 +13,14 @@ import pyarrow.parquet as pq
 from vplog import geometry
 from vplog.evaluate.truth import read_truth
 from vplog.evaluation import evaluate
+from vplog.pipeline import Pipeline
+from vplog.record import begin_folder
 from vplog.results import tables
 
 from .joined import QUICK, cut
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from conftest import Said
 
@@ -44,6 +47,32 @@ def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_no
         assert np.linalg.norm(away, axis=1).max() < 1.5
     assert not (joint / "drive" / "joint_keyframes.parquet").exists()
     assert {path.name for path in joint.rglob(".*")} == {".cache"}
+
+
+def test_a_killed_run_of_several_drives_is_gone_on_with(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    whole = json.loads((joint / "run.json").read_text())
+    out = shutil.copytree(joint, tmp_path / "out")
+    paths = [Path(log) for log in whole["logs"]]
+    begin_folder(out, Pipeline.read(whole["settings"], "run.json"), paths[0], 1, drives=paths)
+    assert f"vplog run --resume -o {out}" in verb("evaluate", out, "--truth", "gps").error
+    shutil.rmtree(out / "after")  # not come to yet
+    for left in (out / "joins.parquet", *out.glob("*.g2o"), *out.glob("*/joint_*")):
+        left.unlink()
+    assert "Leave out the log" in verb("run", "--resume", whole["logs"][0], "-o", out).error
+    stages = {name: record["stages"]["extract"]["result"] for name, record in _resumed(verb, out).items()}
+    assert stages == {"before": "reused", "after": "computed", "drive": "reused"}
+    assert tables_of(out) == tables_of(joint)
+
+
+def _resumed(verb: Callable[..., Said], out: Path) -> dict[str, Any]:
+    """run.json of each drive."""
+    told = verb("run", "--resume", "-o", out, "--json").json
+    return {drive["name"]: json.loads((out / drive["folder"] / "run.json").read_text()) for drive in told["drives"]}
+
+
+def tables_of(out: Path) -> dict[str, bytes]:
+    files = [*out.rglob("*.parquet"), *out.glob("*.g2o"), *out.rglob("*.tum")]
+    return {file.relative_to(out).as_posix(): file.read_bytes() for file in files}
 
 
 def test_the_ledger_names_both_drives(joint: Path) -> None:

@@ -170,7 +170,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
         option = given[0].removesuffix("_file").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is gone on with as it began; leave out --{option}")
     asked = asked_for(arguments.output, arguments.logs)
-    arguments.one_drive = True
+    arguments.one_drive = not asked.several
     return asked.logs, asked.pipeline, asked.library, asked.topics
 
 

@@ -28,11 +28,7 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
 
     Raises TruthError or ResultError with one line.
     """
-    record = run_record.read_run_json(folder / "run.json")
-    if not record.get("finished"):
-        raise ResultError(
-            f"The run in {folder} did not finish. Run it again: vplog run {record.get('log')} -o {folder}"
-        )
+    record = run_record.read_finished_run(folder)
     if "maps" in record:
         return _joint(folder, record, truth)
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")

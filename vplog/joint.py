@@ -65,7 +65,7 @@ def run_joint(
     names = _names([logs.open(path, topics).name for path in paths])
     check_library(library, pipeline)
     watch = Watch()
-    record.begin_folder(out, pipeline, paths[0], threads)
+    record.begin_folder(out, pipeline, paths[0], threads, library, topics, paths)
     with ExitStack() as stack:
         if library is None:
             library = out / "library"
@@ -101,7 +101,7 @@ def run_joint(
             _write_maps(out, drives, joined, header)
         account = {
             **record.head(pipeline, paths[0], threads),
-            "logs": [str(path.resolve()) for path in paths],
+            **record.logs_of(paths),
             "finished": True,
             "library": {"hash": state.hash, "from": str(library)},
             **_told(drives, pairs, judged, joined),

@@ -51,8 +51,12 @@ def begin_folder(
     threads: int,
     library: Path | None = None,
     topics: logs.TopicChoice | None = None,
+    drives: Sequence[Path] = (),
 ) -> None:
-    """Make the run folder, with a run.json that says the run is not finished until it is, and how it was asked for."""
+    """Make the run folder, with a run.json that says the run is not finished until it is, and how it was asked for.
+
+    `drives` are the logs of a run of several drives, of which `path` is the first.
+    """
     others = [file for file in out.iterdir() if file.name != CACHE] if out.is_dir() else []
     if others and not (out / "run.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
@@ -61,6 +65,7 @@ def begin_folder(
     except OSError as error:
         raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
     asked = {"topics": (topics or logs.TopicChoice()).model_dump(mode="json"), "library": {"from": library_of(library)}}
+    asked |= logs_of(drives)
     run_record.write_run_json(out / "run.json", {**head(pipeline, path, threads), "finished": False, **asked})
     for file in out.glob(".*.part"):  # what a killed run was writing
         file.unlink(missing_ok=True)
@@ -71,6 +76,11 @@ def begin_folder(
 def library_of(library: Path | None) -> str:
     """What run.json says of where a library is from."""
     return OWN_LIBRARY if library is None else str(library.resolve())
+
+
+def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
+    """What run.json says of the logs of several drives."""
+    return {"logs": [str(path.resolve()) for path in drives]} if drives else {}
 
 
 def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[str, Any]:

@@ -22,7 +22,9 @@ class Asked:
     """What a run was asked for."""
 
     logs: list[Path]
-    """The parts of one recording."""
+    """The parts of one recording, or the drives of one map."""
+    several: bool
+    """Whether they are drives, each of its own."""
     pipeline: Pipeline
     library: Path | None
     topics: logs.TopicChoice
@@ -38,10 +40,10 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
     account = run_record.read_run_json(out / "run.json")
     if account.get("finished") is not False:
         raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")
-    if not isinstance(account.get("topics"), dict):  # several drives in one map, or an older version
+    if not isinstance(account.get("topics"), dict):  # of an older version
         raise ResultError(
             f"{out}/run.json does not say all that its run was asked for. Give the same command again without "
-            "--resume: what is done of each drive is found."
+            "--resume: what is done is found."
         )
     paths = [located(text) for text in _texts(account, out)]
     if given and {path.resolve() for path in given} != {path.resolve() for path in paths}:
@@ -56,6 +58,7 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
         raise _lacking(out, "library.from")
     return Asked(
         paths,
+        "logs" in account,
         pipeline,
         None if library == OWN_LIBRARY else located(library),
         logs.TopicChoice.read(_tree(account, "topics", out), where),
@@ -63,7 +66,7 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
 
 
 def _texts(account: dict[str, Any], out: Path) -> list[str]:
-    named = account.get("parts") or [account.get("log")]
+    named = account.get("logs") or account.get("parts") or [account.get("log")]
     paths = [path for path in named if isinstance(path, str)] if isinstance(named, list) else []
     if not paths or len(paths) < len(named):
         raise _lacking(out, "log")

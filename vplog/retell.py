@@ -39,23 +39,13 @@ def report(
     `truth` is a TUM file or `gps`; `log` the drive, read again where result.mcap has no pictures of closures.
     Raises VplogError with one line.
     """
-    record = finished(folder)
+    record = run_record.read_finished_run(folder)
     judged = judge(folder, record, truth, topics) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
         pictures = pictures_from(log, folder, record, threads)
     written = write_report(folder, record, path, judged, pictures)
     return {"report": str(written), "bytes": written.stat().st_size, "truth": truth}
-
-
-def finished(folder: Path) -> dict[str, Any]:
-    """run.json of a run that came to its end. Raises ResultError."""
-    record = run_record.read_run_json(folder / "run.json")
-    if not record.get("finished"):
-        raise ResultError(
-            f"The run in {folder} did not finish. Run it again: vplog run {record.get('log')} -o {folder}"
-        )
-    return record
 
 
 def judge(folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None = None) -> Judged:

@@ -11,14 +11,17 @@ import faiss
 import numpy as np
 
 from .measure import Figure, one_thread, seconds, wall
-from .search import BEST, BITS, DRIVE, FLOATS
+from .search import BEST, BITS, DRIVE, FLOATS, free_memory_gb
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-_LINKS = {"IndexBinaryHNSW": 16, "IndexHNSWFlat": 32}
+_LINKS = {"IndexBinaryHNSW": 16, "IndexHNSWFlat": 32, "IndexHNSWSQ": 32}
 """Of a node of a graph, on every layer but the lowest, which has twice as many: for vectors 32 (HNSW32), with the
-efConstruction of 40 and the efSearch of 16 that faiss has by itself; for codes 16."""
+efConstruction of 40 and the efSearch of 16 that faiss has by itself; for codes 16. IndexHNSWSQ is the graph of vectors
+again, of floats of 16 bits."""
+_ROOM = 0.8
+"""Of the free memory what a graph may take: what is added needs some, too."""
 _ADDED = 10 * DRIVE
 """Codes and vectors made and added at a time: 41 MB of floats, of which there are three copies meanwhile."""
 _TOLD_S = 10.0
@@ -28,20 +31,20 @@ _TOLD_S = 10.0
 def faiss_indexes(count: int, queries: int, threads: int, graphs: bool) -> Iterator[Figure]:
     """What faiss takes. Codes and vectors of a drive change step by step, as places do: unrelated ones are the worst
     that a graph can be given."""
-    kinds: dict[str, tuple[Callable[[], Any], bool]] = {"IndexBinaryFlat": (lambda: faiss.IndexBinaryFlat(BITS), True)}
+    kinds: dict[str, tuple[Callable[[], Any], int]] = {"IndexBinaryFlat": (lambda: faiss.IndexBinaryFlat(BITS), 1)}
     if graphs:
-        links = _LINKS["IndexBinaryHNSW"], _LINKS["IndexHNSWFlat"]
-        kinds["IndexBinaryHNSW"] = (lambda: faiss.IndexBinaryHNSW(BITS, links[0]), True)
-        kinds["IndexHNSWFlat"] = (lambda: _graph_of_vectors(links[1], count), False)
-    for name, (make, binary) in kinds.items():
+        kinds["IndexBinaryHNSW"] = (lambda: faiss.IndexBinaryHNSW(BITS, _LINKS["IndexBinaryHNSW"]), 1)
+        fits = count * _bytes_per_place("IndexHNSWFlat", 32) < _ROOM * 1e9 * free_memory_gb()
+        vectors, wide = ("IndexHNSWFlat", 32) if fits else ("IndexHNSWSQ", 16)
+        kinds[vectors] = (lambda: _graph_of_vectors(vectors, count), wide)
+    for name, (make, wide) in kinds.items():
         index = make()
-        spent, cpu, asked, best = _filled(index, name, count, queries, threads, binary)
+        spent, cpu, asked, best = _filled(index, name, count, queries, threads, wide == 1)
         with one_thread():
             one = [seconds(lambda i=i, a=asked, x=index: x.search(a[i : i + 1], BEST)) for i in range(queries)]
         faiss.omp_set_num_threads(threads)
         on_all = [wall(lambda i=i, a=asked, x=index: x.search(a[i : i + 1], BEST)) for i in range(queries)]
         together = min(wall(lambda a=asked, x=index: x.search(a, BEST)) for _ in range(3))
-        width = BITS if binary else FLOATS
         facts = {
             "places": count,
             "one_thread_ms": round(1000 * statistics.median(one), 3),
@@ -50,20 +53,29 @@ def faiss_indexes(count: int, queries: int, threads: int, graphs: bool) -> Itera
             "of_many_all_threads_ms": round(1000 * together / queries, 3),
             "build_s": round(spent, 1),
             "build_cpu_s": round(cpu, 1),
-            "bytes_per_place": (width // 8 if binary else 4 * width) + 2 * 4 * _LINKS.get(name, 0),
+            "bytes_per_place": _bytes_per_place(name, wide),
             "of_the_best": round(_found(index.search(asked, BEST), best), 3),
         }
-        title = f"faiss {name} {width} over {count:,} places, ms a view"
+        title = f"faiss {name} {BITS if wide == 1 else FLOATS} over {count:,} places, ms a view"
         yield Figure(title, 1000 * statistics.median(one), None, True, facts)
         del index
 
 
-def _graph_of_vectors(links: int, count: int) -> Any:
+def _bytes_per_place(name: str, wide: int) -> int:
+    """Of values of so many bits, and of links on the lowest layer of a graph."""
+    return (BITS if wide == 1 else FLOATS) * wide // 8 + 2 * 4 * _LINKS.get(name, 0)
+
+
+def _graph_of_vectors(name: str, count: int) -> Any:
     """An empty one with room for all vectors: else twice their memory is taken while they grow."""
-    index = faiss.IndexHNSWFlat(FLOATS, links, faiss.METRIC_INNER_PRODUCT)
-    room = cast("Any", faiss.downcast_index(index.storage)).codes
-    room.resize(4 * FLOATS * count)
-    room.resize(0)
+    if name == "IndexHNSWFlat":
+        index = faiss.IndexHNSWFlat(FLOATS, _LINKS[name], faiss.METRIC_INNER_PRODUCT)
+    else:
+        index = faiss.IndexHNSWSQ(FLOATS, faiss.ScalarQuantizer.QT_fp16, _LINKS[name], faiss.METRIC_INNER_PRODUCT)
+        index.is_trained = True  # nothing is learned for these
+    storage = cast("Any", faiss.downcast_index(index.storage))
+    storage.codes.resize(storage.code_size * count)
+    storage.codes.resize(0)
     return index
 
 

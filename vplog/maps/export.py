@@ -15,7 +15,7 @@ from vplog.remote import local_copy
 from vplog.results import tables
 from vplog.results.geo import on_earth
 from vplog.results.places_map import names_of, read_places, write_map, write_places
-from vplog.retell import finished
+from vplog.results.run_record import read_finished_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -74,7 +74,7 @@ def export_map(
     with ExitStack() as stack:
         folders = [stack.enter_context(local_copy(source)) for source in sources]
         for folder in folders:
-            finished(folder)
+            read_finished_run(folder)
         if box is None and kind == "parquet":
             return write_map(path, folders)
         run = dict(zip(names_of(folders), folders, strict=True))

@@ -36,6 +36,14 @@ def read_run_json(path: Path) -> dict[str, Any]:
     return record
 
 
+def read_finished_run(folder: Path) -> dict[str, Any]:
+    """The record of a run that came to its end. Raises ResultError."""
+    record = read_run_json(folder / "run.json")
+    if not record.get("finished"):
+        raise ResultError(f"The run in {folder} did not finish. Go on with it: vplog run --resume -o {folder}")
+    return record
+
+
 def canonical_json(tree: Any) -> str:
     """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
     return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
