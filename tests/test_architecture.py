@@ -37,7 +37,7 @@ LAYERS = (
     {"compare", "export"},
     {"study", "maps"},
     {"batch_worker"},
-    {"ray_cluster", "ray_tasks", "batch_library"},
+    {"ray_cluster", "ray_tasks", "batch_library", "batch_inputs"},
     {"engine_ray"},
     {"engine"},
     {"batch", "explain_words", "info"},

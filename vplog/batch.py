@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
+from vplog.batch_inputs import NAME, known_hashes
 from vplog.batch_library import map_library
 from vplog.batch_worker import Task, made_by
 from vplog.engine import RETRIES, LocalEngine, computed, opened
 from vplog.errors import ResultError, SettingsError
-from vplog.inputs import hash_inputs
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.join import join as join_drives
@@ -101,7 +101,7 @@ def run_batch(
         digest = map_library(store, paths, library, pipeline, topics, threads, progress)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        inputs, errors = _hashed(paths, topics, threads)
+        inputs, errors = known_hashes(dict(zip(given, paths, strict=True)), topics, store.root / NAME, threads)
         drives = keys.drive_names([_name(path) for path in paths], given, known, inputs)
         done: dict[str, Drive] = {}
         tasks = []
@@ -189,23 +189,6 @@ def _name(path: Path) -> str:
     if path.is_dir():
         return path.name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
-
-
-def _hashed(paths: Sequence[Path], topics: TopicChoice, threads: int) -> tuple[list[Any], dict[str, str]]:
-    """sha256 of the files of each log and of those beside it, in order; why not by log, where they cannot be read."""
-    beside = [file for file in (topics.odometry_file, topics.calibration_file) if file is not None]
-
-    def hashes(path: Path) -> dict[str, str] | str:
-        try:
-            found = [hash_inputs(one) for one in (path, *beside)]
-        except OSError as error:
-            return f"Cannot read {error.filename or path}: {error.strerror or error}."
-        return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}
-
-    with ThreadPoolExecutor(threads) as pool:
-        answers = list(pool.map(hashes, paths))
-    errors = {_place(path): answer for path, answer in zip(paths, answers, strict=True) if isinstance(answer, str)}
-    return [{} if isinstance(answer, str) else answer for answer in answers], errors
 
 
 def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, Any]:

@@ -45,6 +45,12 @@ def look_of(drive: Path | Sequence[Path]) -> dict[str, str]:
     return look
 
 
+def changed_s(drive: Path | Sequence[Path]) -> float:
+    """When a file of a log on this machine was last changed in any way, in seconds since the epoch; 0 without files."""
+    stats = [file.stat() for _, file in _named(drive) if not isinstance(file, RemotePath)]
+    return max((max(stat.st_mtime, stat.st_ctime) for stat in stats), default=0.0)
+
+
 def _named(drive: Path | Sequence[Path]) -> list[tuple[str, Path]]:
     return [
         (str(file.relative_to(path)) if path.is_dir() else file.name, file)

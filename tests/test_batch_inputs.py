@@ -1,0 +1,119 @@
+"""Logs that have not changed since the last batch are not read again, and all others are."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+
+from vplog import batch_inputs
+from vplog.batch_inputs import known_hashes
+from vplog.logs import TopicChoice
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files that are read from now on; what was just written counts as settled."""
+    found: list[str] = []
+    original = batch_inputs.hash_inputs
+
+    def counted(path: Path) -> dict[str, str]:
+        found.append(path.name)
+        return original(path)
+
+    monkeypatch.setattr(batch_inputs, "hash_inputs", counted)
+    monkeypatch.setattr(batch_inputs, "_SETTLED_S", -3600.0)
+    return found
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> dict[str, Path]:
+    (tmp_path / "folder").mkdir()
+    for name in ("one.mcap", "two.mcap", "folder/a.mcap", "folder/b.mcap"):
+        (tmp_path / name).write_bytes(name.encode())
+    return {name: tmp_path / name for name in ("one.mcap", "two.mcap", "folder")}
+
+
+def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dict[str, str]], dict[str, str]]:
+    return known_hashes(logs, TopicChoice.model_validate(beside), record, 2)
+
+
+def sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_what_has_not_changed_is_not_read_again(logs: dict[str, Path], tmp_path: Path, read: list[str]) -> None:
+    record, odometry = tmp_path / ".inputs.json", tmp_path / "odometry.tum"
+    odometry.write_text("0 0 0 0 0 0 0 1")
+    first = asked(logs, record, odometry_file=odometry)
+    beside = {"beside odometry.tum": sha256("0 0 0 0 0 0 0 1")}
+    assert first == (
+        [
+            {"one.mcap": sha256("one.mcap"), **beside},
+            {"two.mcap": sha256("two.mcap"), **beside},
+            {"a.mcap": sha256("folder/a.mcap"), "b.mcap": sha256("folder/b.mcap"), **beside},
+        ],
+        {},
+    )
+    read.clear()
+    assert asked(logs, record, odometry_file=odometry) == first
+    assert not read
+    (tmp_path / "folder" / "c.mcap").write_bytes(b"more")
+    now = logs["two.mcap"].stat()
+    logs["two.mcap"].write_bytes(b"TWO.mcap")
+    os.utime(logs["two.mcap"], ns=(now.st_atime_ns, now.st_mtime_ns))  # a copy may bring its time of writing along
+    found, _ = asked(logs, record, odometry_file=odometry)
+    assert read == ["two.mcap", "folder"]
+    assert found[0] == first[0][0]
+    assert found[1]["two.mcap"] == sha256("TWO.mcap")
+    assert found[2]["c.mcap"] == sha256("more")
+
+
+def test_a_log_just_written_is_read_the_next_time_too(
+    logs: dict[str, Path], tmp_path: Path, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch_inputs, "_SETTLED_S", 3600.0)
+    asked(logs, tmp_path / ".inputs.json")
+    read.clear()
+    asked(logs, tmp_path / ".inputs.json")
+    assert sorted(read) == ["folder", "one.mcap", "two.mcap"]
+
+
+def test_a_log_that_cannot_be_read_is_one_line(logs: dict[str, Path], tmp_path: Path) -> None:
+    gone = tmp_path / "gone.mcap"
+    found, errors = asked({**logs, "gone": gone}, tmp_path / ".inputs.json")
+    assert [len(one) for one in found] == [1, 1, 2, 0]
+    assert errors == {"gone": f"Cannot read {gone}: No such file or directory."}
+
+
+@pytest.mark.parametrize("damage", ["", "[]", "{", '{"LOG": 3}', '{"LOG": {"look": {"a": 1}, "hashes": {}}}'])
+def test_a_damaged_record_is_made_anew(logs: dict[str, Path], tmp_path: Path, read: list[str], damage: str) -> None:
+    record = tmp_path / ".inputs.json"
+    first = asked(logs, record)
+    whole = record.read_text()
+    record.write_text(damage.replace("LOG", str(logs["one.mcap"])))
+    assert asked(logs, record) == first
+    assert len(read) == 6
+    assert record.read_text() == whole
+
+
+def test_the_record_forgets_logs_that_are_gone(logs: dict[str, Path], tmp_path: Path, read: list[str]) -> None:
+    record = tmp_path / ".inputs.json"
+    asked(logs, record)
+    logs.pop("one.mcap").unlink()
+    (tmp_path / "three.mcap").write_bytes(b"three")
+    asked({"three": tmp_path / "three.mcap"}, record)
+    assert set(json.loads(record.read_text())) == {
+        str(tmp_path / name) for name in ("two.mcap", "folder", "three.mcap")
+    }
+    assert read[3:] == ["three.mcap"]
+
+
+def test_a_record_that_cannot_be_written_is_done_without(logs: dict[str, Path], tmp_path: Path) -> None:
+    assert len(asked(logs, tmp_path / "no" / ".inputs.json")[0]) == 3

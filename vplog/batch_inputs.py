@@ -1,0 +1,94 @@
+"""What the logs of a batch are: their sha256, which is known of those that have not changed since the last one."""
+
+from __future__ import annotations
+
+import json
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import ResultError
+from vplog.inputs import changed_s, hash_inputs, look_of
+from vplog.remote import RemotePath
+from vplog.results.atomic import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from vplog.logs import TopicChoice
+
+NAME = ".inputs.json"
+"""In the map: hidden, as it tells of the logs on this machine and nothing of the map."""
+_SETTLED_S = 3.0
+"""A file written this short a time ago could be written again without a change of its times: some file systems count
+them in steps of two seconds."""
+_MOST_BYTES = 10**9
+"""Longest record that is read: a million logs of several files."""
+
+Hashes = dict[str, str]
+
+
+def known_hashes(
+    logs: Mapping[str, Path], topics: TopicChoice, record: Path, threads: int
+) -> tuple[list[Hashes], dict[str, str]]:
+    """sha256 of the files of each log and of those beside it, by name, in order; by log one line where they cannot be
+    read.
+
+    A file whose length and times are those of the record, a file that is made and kept up to date, is not read. The
+    record is only to save time: one that cannot be read is made anew, one that cannot be written is done without.
+    """
+    beside = [file for file in (topics.odometry_file, topics.calibration_file) if file is not None]
+    known = _read(record)
+    seen: dict[str, dict[str, Any]] = {}
+
+    def one(path: Path) -> Hashes:
+        if isinstance(path, RemotePath):
+            return hash_inputs(path)
+        name, look = str(path.absolute()), look_of(path)
+        if name in known and known[name]["look"] == look:
+            seen[name] = known[name]
+            return known[name]["hashes"]
+        asked = time.time()
+        hashes = hash_inputs(path)
+        if look_of(path) == look and changed_s(path) < asked - _SETTLED_S:
+            seen[name] = {"look": look, "hashes": hashes}
+        return hashes
+
+    def of_log(path: Path) -> Hashes | str:
+        try:
+            found = [one(file) for file in (path, *beside)]
+        except OSError as error:
+            return f"Cannot read {error.filename or path}: {error.strerror or error}."
+        return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}
+
+    with ThreadPoolExecutor(threads) as pool:
+        answers = dict(zip(logs, pool.map(of_log, logs.values()), strict=True))
+    if any(known.get(name) != about for name, about in seen.items()):
+        _write(record, {**known, **seen})
+    errors = {log: answer for log, answer in answers.items() if isinstance(answer, str)}
+    return [{} if isinstance(answer, str) else answer for answer in answers.values()], errors
+
+
+def _read(record: Path) -> dict[str, dict[str, Any]]:
+    """By log, its `look` and its `hashes`; nothing where there is no such file, or another thing."""
+    try:
+        if record.stat().st_size > _MOST_BYTES:
+            return {}
+        known = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+
+    def sound(about: Any) -> bool:
+        parts = [about.get("look"), about.get("hashes")] if isinstance(about, dict) else [None]
+        return all(isinstance(part, dict) and all(isinstance(text, str) for text in part.values()) for part in parts)
+
+    return {name: about for name, about in known.items() if sound(about)} if isinstance(known, dict) else {}
+
+
+def _write(record: Path, known: dict[str, dict[str, Any]]) -> None:
+    """Of all logs that are still there."""
+    there = {name: about for name, about in sorted(known.items()) if Path(name).exists()}
+    with suppress(ResultError), replacing(record) as stream:
+        stream.write(json.dumps(there, separators=(",", ":")).encode())
