@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
-    {"data", "settings", "timing", "cores", "google_store", "web"},
-    {"geometry", "geodesy", "remote", "scratch"},
+    {"data", "settings", "timing", "cores", "google_store", "web", "scratch", "own_processes"},
+    {"geometry", "geodesy", "remote"},
     {"tum"},
     {"stages", "references", "inputs", "code_hash"},
     {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},

@@ -20,11 +20,12 @@ import pytest
 from vplog.batch import run_batch
 from vplog.batch_worker import Outcome, Task
 from vplog.demo import SMALL, make_drive
-from vplog.engine import LocalEngine, OwnProcesses, computed
+from vplog.engine import LocalEngine, computed
 from vplog.errors import LibraryError, SettingsError
 from vplog.libraries import build_library
 from vplog.logs import TopicChoice
 from vplog.maps import store as map_store
+from vplog.own_processes import OwnProcesses
 from vplog.pipeline import load_pipeline
 
 if TYPE_CHECKING:
@@ -164,7 +165,7 @@ def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp
         run_batch(logs, whole, pipeline, other)
     with pytest.raises(LibraryError, match=r"places\.references"):
         run_batch(logs, whole, load_pipeline("default", [*QUICK, "places.references=5"]))
-    with map_store.writing(whole), pytest.raises(SettingsError, match="Another `vplog batch`"):
+    with map_store.writing(whole), pytest.raises(SettingsError, match="Another vplog process"):
         run_batch(logs, whole, pipeline)
     with pytest.raises(SettingsError, match="given twice"):
         run_batch([logs[0], logs[0]], whole, pipeline)

@@ -23,10 +23,12 @@ from vplog.maps import store as map_store
 from vplog.maps.join import join as join_drives
 from vplog.maps.join import load_places
 from vplog.maps.layout import folder_name
+from vplog.own_processes import known_ahead
+from vplog.pipeline import load_pipeline, pipeline_from
 from vplog.remote import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from vplog.batch_worker import Outcome
     from vplog.engine import Engine
@@ -39,6 +41,12 @@ if TYPE_CHECKING:
 _FREE_BYTES = 10**10
 """Of the map's disk that stay free of what would only be quicker to have: what a drive of several hours needs while it
 is computed, at 0.3 MB a keyframe."""
+
+
+_OTHER = (
+    "Other settings made {count} of the drives that were in the map before. Give their logs too and they are made "
+    "anew; the first is {first}."
+)
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,21 @@ class Drive:
     """Largest resident memory of that process, in MB (10^6 bytes)."""
     error: str = ""
     """One line, of a drive that failed."""
+    keyframes: int = 0
+    """Of a drive that was computed now, as the next two."""
+    accepted: int = 0
+    """Closures within it."""
+    warnings: Sequence[str] = ()
+    """What its run had to say, as losses of its log."""
+
+
+def settings_for(root: Path, name: str | None = None, assignments: Sequence[str] = ()) -> Pipeline:
+    """The pipeline of this name, without one that of the map's last batch, if there is a map, else the default; with
+    `a.b=c` overrides. Raises SettingsError, ResultError."""
+    if name is None and (root / "map.json").exists():
+        with map_store.reading(root) as store:
+            return pipeline_from(store.head().settings, f"{store}/map.json", assignments)
+    return load_pipeline(name or "default", assignments)
 
 
 def run_batch(
@@ -102,7 +125,7 @@ def run_batch(
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
         inputs, errors = known_hashes(dict(zip(given, paths, strict=True)), topics, store.root / NAME, threads)
-        drives = keys.drive_names([_name(path) for path in paths], given, known, inputs)
+        drives = keys.drive_names([_name(path) for path in paths], given, {**_failed(store), **known}, inputs)
         done: dict[str, Drive] = {}
         tasks = []
         alike = _alike(pipeline, topics, digest)
@@ -119,7 +142,6 @@ def run_batch(
                 tasks.append(Task(drive, log, *place, pipeline, topics, 1, about, _cache(store, drive)))
         each = _threads_each(workers, jobs, len(tasks))
         at_once = jobs or workers.at_once(each)
-        failures = {drive: told for drive, told in store.failures().items() if drive not in set(drives)}
         progress("drives", len(done), len(paths))
         tasks = [replace(task, threads=each, keep_cache=join or keep_cache) for task in tasks]
         places = None
@@ -131,13 +153,7 @@ def run_batch(
                 shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
             done[found.drive] = found
             progress("drives", len(done), len(paths))
-        failures |= {
-            one.drive: {"log": one.log, "error": one.error, "attempts": one.attempts}
-            for one in done.values()
-            if one.state == "failed"
-        }
-        if failures or (store.root / "failures.json").exists():
-            store.write_failures(failures)
+        tell_failures(store, done)
         joined = None
         if join:
             ready = None if places is None else places.result
@@ -157,7 +173,29 @@ def run_batch(
         "failed": sum(one.state == "failed" for one in fate),
         "drives": [asdict(one) for one in fate],
         "joined": joined,
+        "warnings": _mixed([about for drive, about in known.items() if drive not in done], alike),
     }
+
+
+def _failed(store: Store) -> dict[str, dict[str, Any]]:
+    """What is known of drives that failed, as of those that are in: their IDs are theirs as long as that is told."""
+    return {drive: {"log": told.get("log"), "inputs": None} for drive, told in store.failures().items()}
+
+
+def tell_failures(store: Store, done: Mapping[str, Drive]) -> None:
+    """failures.json: of this batch, and those of other drives that were there before."""
+    failures = {drive: told for drive, told in store.failures().items() if drive not in done}
+    for drive, one in done.items():
+        if one.state == "failed":
+            failures[drive] = {"log": one.log, "error": one.error, "attempts": one.attempts}
+    if failures or (store.root / "failures.json").exists():
+        store.write_failures(failures)
+
+
+def _mixed(others: Sequence[dict[str, Any]], alike: dict[str, Any]) -> list[str]:
+    """A warning where drives that are no part of this batch were made with other settings."""
+    other = [about["log"] for about in others if about.get("settings") != alike["settings"]]
+    return [_OTHER.format(count=len(other), first=other[0])] if other else []
 
 
 def _cache(store: Store, drive: str) -> Path:
@@ -186,8 +224,9 @@ def _place(path: Path) -> str:
 
 def _name(path: Path) -> str:
     """What a log is called: its file without the ending, or its folder."""
-    if path.is_dir():
-        return path.name
+    with suppress(OSError):  # what cannot be asked for is said of the log elsewhere
+        if path.is_dir():
+            return path.name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
 
 
@@ -200,7 +239,7 @@ def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, A
         "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file"}),
         "settings": keys.key_of(pipeline.model_dump(mode="json")),
         "library": library,
-        **made_by(),
+        **(known_ahead() or made_by()),
     }
 
 
@@ -215,4 +254,5 @@ def _put_in(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
     if error:
         shutil.rmtree(task.folder, ignore_errors=True)
     told = (outcome.seconds, outcome.worker, outcome.peak_memory_mb, error)
+    told += (outcome.keyframes, outcome.accepted, outcome.warnings)
     return Drive(task.drive, task.log, "failed" if error else "computed", attempts, *told)

@@ -57,6 +57,12 @@ class Outcome:
     """Machine and process; none of a worker that died."""
     peak_memory_mb: float = 0.0
     """Largest resident memory of the worker, in MB (10^6 bytes); 0 where unknown."""
+    keyframes: int = 0
+    """Of the drive."""
+    accepted: int = 0
+    """Closures within it."""
+    warnings: tuple[str, ...] = ()
+    """What the run had to say."""
 
 
 def made_by() -> dict[str, Any]:
@@ -66,7 +72,7 @@ def made_by() -> dict[str, Any]:
 
 def compute_drive(task: Task) -> Outcome:
     """Make the run folder of a drive, drive.json last; why not, in one line, where that fails."""
-    began, error, may_pass, peak = time.perf_counter(), "", False, 0.0
+    began, error, may_pass, peak, found = time.perf_counter(), "", False, 0.0, dict[str, Any]()
     try:
         log = located(task.log)
         with limited(task.threads):
@@ -81,14 +87,18 @@ def compute_drive(task: Task) -> Outcome:
             if done.keyframes.drive != task.drive:
                 keys.name_keyframes(task.folder / "keyframes.parquet", task.drive)
             run_record.write_run_json(task.folder / "drive.json", task.about)
+            counts = done.record["counts"]
+            found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
+            found["warnings"] = tuple(done.record["warnings"])
     except VplogError as problem:
         error = str(problem)
     except MemoryError:
         error, may_pass = "Out of memory. Use fewer --jobs.", True
     except OSError as problem:
-        error = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}."
+        # another attempt may be on another machine, and finds what this one had done
+        error, may_pass = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True
     except Exception as problem:  # a fault of ours in one drive must not stop the others
         text = " ".join(str(problem).split())[:200]
         error = f"Internal error: {type(problem).__name__}: {text}. `vplog run` shows more."
     seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
-    return Outcome(error, may_pass, seconds, worker, max(peak, round(peak_memory_mb(), 1)))
+    return Outcome(error, may_pass, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)

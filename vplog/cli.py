@@ -7,13 +7,22 @@ import json
 import logging
 import os
 import sys
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import vplog
 from vplog.cli_maps import add_maps
-from vplog.cli_options import at_least_one, pipeline_of, place, topic_options, topics_of
+from vplog.cli_options import (
+    at_least_one,
+    local,
+    local_file,
+    pipeline_of,
+    place,
+    settings_options,
+    topic_options,
+    topics_of,
+)
 from vplog.cli_print import Progress, print_evaluation, print_info, print_joint, print_json, print_run, say
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
@@ -50,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except KeyboardInterrupt:
-        say("interrupted; what was finished is kept, run.json says that the run is not")
+        say("interrupted; what was finished is kept, and the same command goes on from there")
         sys.exit(130)
     except VplogError as error:
         _fail(arguments, str(error))
@@ -109,7 +118,7 @@ def info(arguments: argparse.Namespace) -> None:
 
 
 def library(arguments: argparse.Namespace) -> None:
-    """Build a reference library of random frames."""
+    """Build a reference library of frames of logs."""
     from vplog.libraries import build_library
 
     pipeline = pipeline_of(arguments)
@@ -132,7 +141,8 @@ def run(arguments: argparse.Namespace) -> None:
     paths, pipeline, library, topics = _asked(arguments)
     # a cache that is sent over the net costs more than it saves
     use_cache = arguments.cache and "://" not in str(arguments.shown)
-    with Progress(arguments) as progress:
+    with ExitStack() as stack, Progress(arguments) as progress:
+        library = None if library is None else stack.enter_context(_library_at_hand(library))
         if len(paths) > 1 and not arguments.one_drive:
             from vplog.joint import run_joint
 
@@ -153,6 +163,13 @@ def run(arguments: argparse.Namespace) -> None:
         print_run(arguments.shown, found)
 
 
+def _library_at_hand(library: Path) -> AbstractContextManager[Path]:
+    """One by URL, as a run that is gone on with may name, is copied."""
+    from vplog.remote import local_copy
+
+    return local_copy(library)
+
+
 def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
     """Logs, settings, library and topics: those of the command, or with --resume of the run that is gone on with."""
     if not arguments.resume:
@@ -163,6 +180,8 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
         return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
     from vplog.resume import asked_for
 
+    if "://" in str(arguments.shown):
+        arguments.refuse("argument --resume: a run by URL is sent when it is finished; begin it again")
     asking, asked_by = vars(arguments), ("pipeline", "set", "library", "gps")
     names = [name for name in asking if name in asked_by or name.endswith(("_topic", "_file"))]
     given = [name for name in names if asking[name] not in (None, [], False, "default")]
@@ -242,16 +261,15 @@ def _parser() -> argparse.ArgumentParser:
     threads.add_argument(
         "--threads", type=at_least_one, default=available(), metavar="N", help="workers (default: all cores)"
     )
-    settings = argparse.ArgumentParser(add_help=False)
-    settings.add_argument("--pipeline", default="default", metavar="P", help="shipped name or .yaml file")
-    settings.add_argument("--set", action="append", default=[], metavar="A.B=C", help="change one setting; repeatable")
+    settings = settings_options("default", "default")
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
+    def group(name: str, text: str, parents: Sequence[argparse.ArgumentParser] = ()) -> argparse.ArgumentParser:
+        said = text[0].lower() + text[1:].rstrip(".")
+        return verbs.add_parser(name, help=said, description=text, parents=parents)
+
     def add(name: str, verb: Verb, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
-        text = verb.__doc__ or ""
-        sub = verbs.add_parser(
-            name, help=text[0].lower() + text[1:].rstrip("."), description=text, parents=[common, *parents]
-        )
+        sub = group(name, verb.__doc__ or "", [common, *parents])
         sub.set_defaults(verb=verb)
         return sub
 
@@ -267,12 +285,12 @@ def _parser() -> argparse.ArgumentParser:
     output(sub, "run folder")
     add_results(add, topics, threads)
     add_studies(add, topics, threads, settings)
-    add_maps(add, common, topics, threads, settings)
+    add_maps(add, group, common, topics, threads)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
     sub = add("schemas", schemas)
     sub.add_argument(
-        "-o", "--output", type=Path, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
+        "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
     )
     add("config", config, settings)
     return parser
@@ -280,7 +298,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=place, metavar="LOG")
-    sub.add_argument("--html", type=Path, metavar="FILE.html", help="also write a page with pictures of the drive")
+    text = "also write a page with pictures of the drive"
+    sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 
 
 def _add_run(sub: argparse.ArgumentParser) -> None:

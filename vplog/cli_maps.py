@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import at_least, at_least_one, local, not_negative, pipeline_of, place, topics_of
+from vplog.cli_options import (
+    at_least,
+    at_least_one,
+    local,
+    local_file,
+    not_negative,
+    place,
+    settings_options,
+    topics_of,
+)
 from vplog.cli_print import (
     Progress,
     print_answers,
@@ -22,6 +32,7 @@ from vplog.cli_print import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from contextlib import AbstractContextManager
 
     from vplog.maps.cache import Cache
 
@@ -45,7 +56,7 @@ def merge_maps(arguments: argparse.Namespace) -> None:
     from vplog.maps.merge import merge_maps as merge
 
     with Progress(arguments) as progress:
-        found = merge(arguments.maps, arguments.target, progress)
+        found = merge(arguments.maps, arguments.target, progress, arguments.drive)
     if arguments.json:
         print_json(found)
     else:
@@ -73,17 +84,22 @@ def remove_drives(arguments: argparse.Namespace) -> None:
         print_json(found)
     else:
         print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
+        if found["still_joined"]:
+            said = f"Solve those that were joined with {', '.join(found['still_joined'])}"
+            print(f"{said}: vplog map join {found['map']}")
 
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """The drives of a map in another map, described with another library; their logs are read again."""
     from vplog.errors import ResultError
-    from vplog.redescribe import redescribe_map as redescribe
 
-    with Progress(arguments) as progress:
+    with _drive_ahead(arguments), Progress(arguments) as progress:
+        from vplog.redescribe import redescribe_map as redescribe
+
         found = redescribe(
-            arguments.map, arguments.library, arguments.target, arguments.jobs, arguments.threads, progress
-        )
+            arguments.map, arguments.library, arguments.target, arguments.jobs, arguments.threads, progress,
+            engine=arguments.engine, address=arguments.address, retries=arguments.retries,
+        )  # fmt: skip
     if arguments.json:
         print_json(found)
     else:
@@ -92,15 +108,24 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
         raise ResultError(f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}.")
 
 
+def _drive_ahead(arguments: argparse.Namespace) -> AbstractContextManager[None]:
+    """The process of the first drive loads while this one does."""
+    from vplog.own_processes import begun_ahead
+
+    return begun_ahead() if arguments.engine == "local" else nullcontext()
+
+
 def batch(arguments: argparse.Namespace) -> None:
     """Many recorded drives to one map that grows, each drive in a process of its own, here or over a Ray cluster."""
-    from vplog.batch import run_batch
     from vplog.errors import ResultError
 
-    with Progress(arguments) as progress:
+    with _drive_ahead(arguments), Progress(arguments) as progress:
+        from vplog.batch import run_batch, settings_for
+
+        pipeline = settings_for(arguments.map, arguments.pipeline, arguments.set)
         found = run_batch(
-            arguments.logs, arguments.map, pipeline_of(arguments), arguments.library, topics_of(arguments),
-            arguments.jobs, arguments.threads, progress, engine=arguments.engine, address=arguments.address,
+            arguments.logs, arguments.map, pipeline, arguments.library, topics_of(arguments), arguments.jobs,
+            arguments.threads, progress, engine=arguments.engine, address=arguments.address,
             retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
         )  # fmt: skip
     if arguments.json:
@@ -169,12 +194,13 @@ def _cache(arguments: argparse.Namespace) -> Cache | None:
 
 
 def add_maps(
-    add: Callable[..., argparse.ArgumentParser], common: argparse.ArgumentParser, topics: argparse.ArgumentParser,
-    threads: argparse.ArgumentParser, settings: argparse.ArgumentParser,
+    add: Callable[..., argparse.ArgumentParser], group: Callable[..., argparse.ArgumentParser],
+    common: argparse.ArgumentParser, topics: argparse.ArgumentParser, threads: argparse.ArgumentParser,
 ) -> None:  # fmt: skip
     """The verb `batch`, and the verb `map` with its own verbs."""
-    _add_batch(add("batch", batch, topics, threads, settings))
-    maps = add("map", info_map).add_subparsers(required=True, metavar="VERB")
+    _add_batch(add("batch", batch, topics, threads, settings_options(None, "that of the map, else default")))
+    text = "Look into a map of many drives, search, export, merge, join or change it."
+    maps = group("map", text).add_subparsers(required=True, metavar="VERB")
     sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
     sub.set_defaults(verb=info_map)
     sub.add_argument("map", type=place, metavar="MAP")
@@ -187,7 +213,7 @@ def add_maps(
     sub.add_argument(
         "--sequence", type=at_least_one, metavar="L", help="views in a window, odd; 1: none (default: as the map's)"
     )
-    sub.add_argument("-o", "--output", type=Path, metavar="FILE.parquet", help="write the answers")
+    sub.add_argument("-o", "--output", type=local_file, metavar="FILE.parquet", help="write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     sub.add_argument("--address", metavar="HOST:PORT", help="Ray cluster (default: one of this machine's cores)")
@@ -202,6 +228,7 @@ def add_maps(
     sub = maps.add_parser("merge", help=text, description=merge_maps.__doc__, parents=[common])
     sub.set_defaults(verb=merge_maps)
     sub.add_argument("maps", type=place, nargs="+", metavar="MAP")
+    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="this one alone; may be given again")
     sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP", help="map that they go to")
     text = "what joins the drives of a map"
     sub = maps.add_parser("join", help=text, description=join_map.__doc__, parents=[common, threads])
@@ -217,8 +244,8 @@ def add_maps(
     sub.add_argument("map", type=place, metavar="MAP")
     text = "the library, or a log to make one from"
     sub.add_argument("--library", type=place, required=True, metavar="LIB|LOG", help=text)
-    sub.add_argument("--jobs", type=at_least_one, metavar="N", help="drives at once (default: 1)")
     sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP2", help="the new map")
+    _add_workers(sub)
 
 
 def _add_cache(sub: argparse.ArgumentParser) -> None:
@@ -239,7 +266,7 @@ def _add_export(maps: argparse._SubParsersAction[argparse.ArgumentParser], commo
         help="places in it alone, in degrees; LON0 beyond LON1 crosses the antimeridian (write --box=-33.9,...)",
     )  # fmt: skip
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.parquet", help="file to write")
+    sub.add_argument("-o", "--output", type=local_file, required=True, metavar="FILE.parquet", help="file to write")
 
 
 def _box(text: str) -> tuple[float, float, float, float]:
@@ -254,21 +281,25 @@ def _box(text: str) -> tuple[float, float, float, float]:
     return south, west, north, east
 
 
-def _add_batch(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="a drive each")
-    sub.add_argument("-o", "--map", type=place, required=True, metavar="MAP", help="folder or s3:// of the map")
+def _add_workers(sub: argparse.ArgumentParser) -> None:
+    """Who computes drives."""
     text = "drives at once (default: 1; over Ray as many as the cluster has cores for)"
     sub.add_argument("--jobs", type=at_least_one, metavar="N", help=text)
     text = "processes of this machine, or tasks of a Ray cluster (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     text = "the Ray cluster, as `ray start` says it, or auto (default: one of this machine for the time of the batch)"
     sub.add_argument("--address", metavar="HOST:PORT", help=text)
-    text = "more attempts at a drive whose worker was killed (default: 2)"
+    text = "more attempts at a drive whose worker was killed or could not read or write (default: 2)"
     sub.add_argument("--retries", type=at_least(0), default=2, metavar="N", help=text)
+
+
+def _add_batch(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="a drive each")
+    sub.add_argument("-o", "--map", type=place, required=True, metavar="MAP", help="folder, s3:// or gs:// of the map")
+    _add_workers(sub)
     text = "do not look for closures between the drives at the end"
     sub.add_argument("--no-join", dest="join", action="store_false", help=text)
-    text = "keep what the stages came to, about 0.3 MB a keyframe: other settings then need the images no more"
+    text = "keep what stages came to, 0.35 MB a keyframe, so that other settings need no images; in a map on this disk"
     sub.add_argument("--keep-cache", action="store_true", help=text)
-    sub.add_argument(
-        "--library", type=place, metavar="LIB", help="reference library (default: the map's, or one of the logs)"
-    )
+    text = "reference library (default: the map's, else one of the first logs)"
+    sub.add_argument("--library", type=place, metavar="LIB", help=text)

@@ -38,6 +38,16 @@ def local(text: str) -> Path:
     return Path(text)
 
 
+def local_file(text: str) -> Path:
+    """A single file to write, in a folder that is there: found out before any work."""
+    if "://" in text:
+        raise argparse.ArgumentTypeError("must be a local file")
+    path = Path(text)
+    if not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {path.parent}")
+    return path
+
+
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     from vplog.pipeline import load_pipeline
 
@@ -69,6 +79,15 @@ def topic_options() -> argparse.ArgumentParser:
         help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml",
     )  # fmt: skip
     return topics
+
+
+def settings_options(unless_given: str | None, called: str) -> argparse.ArgumentParser:
+    """`--pipeline`, with what it is unless given, and what help calls that; and `--set`."""
+    settings = argparse.ArgumentParser(add_help=False)
+    text = f"shipped name or .yaml file (default: {called})"
+    settings.add_argument("--pipeline", default=unless_given, metavar="P", help=text)
+    settings.add_argument("--set", action="append", default=[], metavar="A.B=C", help="change one setting; repeatable")
+    return settings
 
 
 def resolved(text: str) -> Path:

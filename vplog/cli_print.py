@@ -144,12 +144,14 @@ def print_batch(found: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("drive", "state", box=None, pad_edge=False)
-    for title in ("attempts", "seconds", "peak MB"):
+    for title in ("keyframes", "closures", "attempts", "seconds", "peak MB"):
         table.add_column(title, justify="right")
     table.add_column("worker")
     table.add_column("error", overflow="fold")
     for drive in found["drives"]:
-        counts = [str(drive["attempts"] or "")]
+        computed = drive["state"] == "computed"
+        counts = [str(drive[name]) if computed else "" for name in ("keyframes", "accepted")]
+        counts += [str(drive["attempts"] or "")]
         counts += [f"{drive[name]:.{digits}f}" if drive[name] else "" for name, digits in _BATCH_COSTS]
         table.add_row(escape(drive["drive"]), drive["state"], *counts, escape(drive["worker"]), escape(drive["error"]))
     console(sys.stdout).print(table)
@@ -159,7 +161,10 @@ def print_batch(found: dict[str, Any]) -> None:
     )
     for component in (found["joined"] or {}).get("components", []):
         print(f"together  {', '.join(component['drives'])}")
-    for warning in (found["joined"] or {}).get("warnings", []):
+    for drive in found["drives"]:
+        for warning in drive["warnings"]:
+            say(f"warning: {drive['drive']}: {warning}")
+    for warning in found["warnings"] + (found["joined"] or {}).get("warnings", []):
         say(f"warning: {warning}")
 
 
@@ -176,7 +181,8 @@ def print_map(found: dict[str, Any]) -> None:
     print(f"on earth  {found['on_earth']} of {len(found['drives'])} drives")
     if found["components"] is not None:
         joined = sum(len(one["drives"]) for one in found["components"])
-        print(f"joined    {joined} drives in {len(found['components'])} frames of several")
+        groups = len(found["components"])
+        print(f"joined    {joined} drives in {groups} group{'' if groups == 1 else 's'}, each in one frame")
     table = Table("drive", box=None, pad_edge=False)
     for title in ("keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"):
         table.add_column(title, justify="right")
@@ -193,8 +199,8 @@ def print_map(found: dict[str, Any]) -> None:
 
 def print_export(found: dict[str, Any]) -> None:
     for drive in found.get("left_out", ()):
-        say(f"warning: {drive} is left out: it has no place on earth, as its log has no three satellite fixes.")
-    print(f"{found['map']}: {found['places']} places of {len(found['drives'])} drives")
+        say(f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes.")
+    print(f"{found['written']}: {found['places']} places of {len(found['drives'])} drives")
 
 
 def print_joined(found: dict[str, Any]) -> None:
@@ -212,7 +218,9 @@ def print_merge(found: dict[str, Any]) -> None:
         other = "" if one["as"] == one["drive"] else f" as {one['as']}"
         print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
     taken = sum(one["state"] == "taken" for one in found["drives"])
-    print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken. `vplog batch` finds what joins them.")
+    print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
+    if taken:
+        print(f"What joins them: vplog map join {found['map']}")
 
 
 def print_redescribed(found: dict[str, Any]) -> None:
@@ -220,6 +228,8 @@ def print_redescribed(found: dict[str, Any]) -> None:
         other = "" if one["was"] == one["drive"] else f", was {one['was']}"
         print(f"{one['state']:10}{one['drive']}{other}{': ' if one['error'] else ''}{one['error']}")
     print(f"{found['map']}: {len(found['drives']) - found['failed']} drives, library {found['library']}")
+    for warning in (found["joined"] or {}).get("warnings", []):
+        say(f"warning: {warning}")
 
 
 def print_answers(found: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import place, topics_of
+from vplog.cli_options import local_file, place, topics_of
 from vplog.cli_print import print_evaluation, print_explanation, print_json, print_optimised
 
 if TYPE_CHECKING:
@@ -91,11 +91,11 @@ def add_results(
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
     sub.add_argument("--log", type=place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
-    sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="page (default: RUN/report.html)")
+    sub.add_argument("-o", "--output", type=local_file, metavar="FILE.html", help="page (default: RUN/report.html)")
     sub = add("export", export)
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
+    sub.add_argument("-o", "--output", type=local_file, required=True, metavar="FILE", help="file to write")
     sub = add("optimize", optimize)
     sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
     sub.add_argument(
@@ -112,9 +112,8 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
         help="row of closures.parquet, or its two keyframes, by row or by stamp in ns",
     )  # fmt: skip
     which.add_argument("--worst", action="store_true", help="the closure that the solved trajectory is furthest from")
-    sub.add_argument(
-        "-o", "--output", type=Path, metavar="PICTURE.png", help="picture, .png or .svg (default: RUN/closure-K.png)"
-    )
+    text = "picture, .png or .svg (default: RUN/closure-K.png)"
+    sub.add_argument("-o", "--output", type=local_file, metavar="PICTURE.png", help=text)
     sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
     sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import at_least, at_least_one, pipeline_of, place, positive, topics_of
+from vplog.cli_options import at_least, at_least_one, local, pipeline_of, place, positive, topics_of
 from vplog.cli_print import Progress, print_comparison, print_json, print_study
 
 if TYPE_CHECKING:
@@ -115,7 +114,7 @@ def _add_comparison(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--sequence", type=at_least_one, metavar="L", help="also match sequences of L frames")
     sub.add_argument("--library", type=place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
     sub.add_argument("--library-seed", type=at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
-    sub.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for compare.json, scores and curves")
+    sub.add_argument("-o", "--output", type=local, metavar="OUT", help="folder for compare.json, scores and curves")
 
 
 def _add_study(sub: argparse.ArgumentParser) -> None:

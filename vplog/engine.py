@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections import deque
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from vplog.batch_worker import Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError
+from vplog.own_processes import OwnProcesses
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
@@ -26,8 +21,6 @@ if TYPE_CHECKING:
 ENGINES = ("local", "ray")
 RETRIES = 2
 """More attempts at a drive whose worker died: one that dies three times will most likely die again."""
-_TERMINATE_EVERY_S = 0.1
-"""A process that was just about to start is not there yet the first time."""
 
 
 class Engine(Protocol):
@@ -127,29 +120,6 @@ def _brought(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
     return outcome
 
 
-class OwnProcesses(ThreadPoolExecutor):
-    """Runs each task in a process of its own: its memory is given back, and one that dies takes no other along."""
-
-    def __init__(self, jobs: int) -> None:
-        super().__init__(jobs)
-        self._unfinished: set[Future[Any]] = set()
-
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        future = super().submit(_in_process, fn, args, kwargs)
-        self._unfinished.add(future)
-        future.add_done_callback(self._unfinished.discard)
-        return future
-
-    def __exit__(self, kind: Any, error: Any, at: Any) -> bool | None:
-        """Wait for all, or end them where the block failed."""
-        if kind is not None:
-            self.shutdown(wait=False, cancel_futures=True)
-            while wait(list(self._unfinished), _TERMINATE_EVERY_S).not_done:
-                for child in multiprocessing.active_children():
-                    child.terminate()
-        return super().__exit__(kind, error, at)
-
-
 class LocalEngine:
     """This machine."""
 
@@ -168,31 +138,3 @@ class LocalEngine:
 
     def take(self, task: Task, outcome: Outcome) -> None:
         """It is there already."""
-
-
-def _in_process(function: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
-    """Call it in a new process."""
-    context = multiprocessing.get_context("spawn")
-    # Ctrl-C reaches every process of a terminal; a worker inherits the mask and is ended by this process instead.
-    # The tracker that Python starts with the first worker would take the mask off again.
-    resource_tracker.ensure_running()
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        with ProcessPoolExecutor(1, context, _end_with_parent) as pool:
-            return pool.submit(function, *args, **kwargs).result()
-    except BrokenProcessPool:
-        raise BrokenExecutor(
-            "Its process was killed, as for want of memory. Use fewer --jobs, and run again."
-        ) from None
-
-
-def _end_with_parent() -> None:
-    """A worker whose batch was killed must not go on beside the next one."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import explain_words, logs
-from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.explain_picture import Side, View, draw
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
-from vplog.record import reopened
+from vplog.record import library_at, reopened
+from vplog.remote import original
 from vplog.results import run_record, tables
 from vplog.shared_view import find_agreement, find_boxes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from vplog.data import Closures, Keyframes
     from vplog.shared_view import SharedBoxes
@@ -38,12 +39,7 @@ def explain(
     `picture` is the .png or .svg to write, `closure-K.png` in the run folder where None. The run's log is read for it,
     or `log` where that has moved. Raises VplogError with one line.
     """
-    record = run_record.read_run_json(folder / "run.json")
-    if not record.get("finished"):
-        raise ResultError(
-            f"The run in {folder} did not finish, and has no ledger yet. Run it again: "
-            f"vplog run {record.get('log')} -o {folder}"
-        )
+    record = run_record.read_single_run(folder)
     if picture is not None and picture.suffix not in (".png", ".svg"):
         raise ResultError(f"A picture is a .png or .svg, and {picture} is neither.")
     try:
@@ -138,15 +134,13 @@ def _boxes(
     """What both views share on the library's references, or why that is not known."""
     if not row["shared_references"]:
         return [], f"{pipeline.places.kind} tells of no reference that both views share"
-    library = folder / "library"
-    if not (library / "library.json").is_file():
-        library = Path(str(_part(record, folder, "library").get("from")))
     try:
-        state = pipeline.places.load(library, 1)
-        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
-        if made_by != state.hash:
-            raise LibraryError(f"{library} is not the library of this run")
+        with library_at(folder, record) as library:
+            state = pipeline.places.load(library, 1)
+            column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+            if made_by != state.hash:
+                raise LibraryError(f"{original(library)} is not the library of this run")
         query, match = state.from_arrow(column.take([row["query"], row["match"]]))
-    except LibraryError as error:
+    except (LibraryError, LogError) as error:
         return [], str(error).rstrip(".")
     return find_boxes(state, query, match, row["shared_references"]), ""

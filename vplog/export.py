@@ -9,7 +9,7 @@ from vplog.report import gather_tracks
 from vplog.results import geo, poses, tables, tum
 from vplog.results.atomic import replacing
 from vplog.results.rrd import write_rrd
-from vplog.results.run_record import read_finished_run
+from vplog.results.run_record import read_single_run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +22,7 @@ FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
 
 def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
     """Write the run in `folder` as one of `FORMATS`; what was written. Raises ResultError."""
-    tracks = gather_tracks(folder, read_finished_run(folder))
+    tracks = gather_tracks(folder, read_single_run(folder))
     written = [str(path)]
     match kind:
         case "tum":

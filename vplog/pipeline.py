@@ -123,11 +123,14 @@ def load_pipeline(name: str, assignments: Iterable[str] = ()) -> Pipeline:
         if not path.is_file():
             known = ", ".join(sorted(file.stem for file in shipped.glob("*.yaml")))
             raise SettingsError(f"No pipeline {name!r}. Pipelines: {known}, or the path of a .yaml file.")
-    tree, where = load_yaml(path), path.name
+    return pipeline_from(load_yaml(path), path.name, assignments)
+
+
+def pipeline_from(tree: dict[str, Any], where: str, assignments: Iterable[str] = ()) -> Pipeline:
+    """A pipeline from a tree of settings, with `a.b=c` overrides. Raises SettingsError."""
     for assignment in assignments:
         tree = override(tree, assignment)
-        where = f"{path.name} and --set"
-    return Pipeline.read(tree, where)
+    return Pipeline.read(tree, f"{where} and --set" if assignments else where)
 
 
 def pipeline_schema() -> dict[str, Any]:

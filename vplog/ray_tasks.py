@@ -101,7 +101,8 @@ def compute_away(
     except VplogError as error:
         return Away(str(error), worker=where)
     except OSError as error:
-        return Away(f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}.", worker=where)
+        why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
+        return Away(why, may_pass=True, worker=where)
 
 
 def _name_library(made: Path, library: Path) -> None:

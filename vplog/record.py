@@ -15,7 +15,7 @@ from vplog import logs
 from vplog.data import Verdict
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.inputs import files_of
-from vplog.remote import located
+from vplog.remote import local_copy, located, original
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def begin_folder(
 
     `drives` are the logs of a run of several drives, of which `path` is the first.
     """
-    others = [file for file in out.iterdir() if file.name != CACHE] if out.is_dir() else []
+    others = [file for file in out.iterdir() if not file.name.startswith(".")] if out.is_dir() else []
     if others and not (out / "run.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
     try:
@@ -69,18 +69,32 @@ def begin_folder(
     run_record.write_run_json(out / "run.json", {**head(pipeline, path, threads), "finished": False, **asked})
     for file in out.glob(".*.part"):  # what a killed run was writing
         file.unlink(missing_ok=True)
-    if (out / "library" / "library.json").is_file():  # an earlier run's, which would not be this one's
-        shutil.rmtree(out / "library")
+    own = out / "library"  # an earlier run's, which would not be this one's unless it is given
+    if (own / "library.json").is_file() and (library is None or library.resolve() != own.resolve()):
+        shutil.rmtree(own)
 
 
 def library_of(library: Path | None) -> str:
     """What run.json says of where a library is from."""
-    return OWN_LIBRARY if library is None else str(library.resolve())
+    return OWN_LIBRARY if library is None else str(original(library).resolve())
 
 
 def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
     """What run.json says of the logs of several drives."""
     return {"logs": [str(path.resolve()) for path in drives]} if drives else {}
+
+
+@contextmanager
+def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
+    """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
+    library = folder / "library"
+    if not (library / "library.json").is_file():
+        told = account.get("library")
+        if not isinstance(told, dict) or not isinstance(told.get("from"), str):
+            raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again to write it anew.")
+        library = located(told["from"])
+    with local_copy(library) as here:
+        yield here
 
 
 def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[str, Any]:

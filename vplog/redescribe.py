@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.batch import run_batch
+from vplog.batch import Drive, run_batch, tell_failures
+from vplog.engine import RETRIES
 from vplog.errors import SettingsError
 from vplog.libraries import build_library
 from vplog.maps import store as map_store
@@ -19,9 +19,11 @@ from vplog.pipeline import Pipeline
 from vplog.places.stored import read_library_record
 from vplog.remote import local_copy, located
 from vplog.results import run_record
+from vplog.scratch import scratch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     Progress = Callable[[str, int, int], None]
 
@@ -33,12 +35,16 @@ def redescribe_map(
     jobs: int | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    *,
+    engine: str = "local",
+    address: str | None = None,
+    retries: int = RETRIES,
 ) -> dict[str, Any]:
     """The drives of a map in a new map `target`, described with another library: one on disk, or one of a log's frames.
 
     Settings are those of the map, and of the library how places are described; topics those of each drive. Every drive
-    is run again, from what its stages kept where that is there; one whose log is gone is said and stops no other. A
-    command that was stopped goes on. Raises VplogError.
+    is run again, as a batch runs it, from what its stages kept where that is there; one whose log is gone is said and
+    stops no other. A command that was stopped goes on. Raises VplogError.
     """
     if str(root.resolve()) == str(target.resolve()):
         raise SettingsError(f"{root} is given as its own target. Choose another map with -o.")
@@ -47,13 +53,15 @@ def redescribe_map(
         _, drives = map_store.one_library(store)
         topics = {drive: run_record.read_run_json(store.file(drive, "run.json")).get("topics") for drive in drives}
         _bring_caches(store.root, target)
-    fate, missing = [], []
+    fate, missing, joined = [], dict[str, Drive](), None
     groups: dict[str, list[str]] = {}
     for drive in in_order(drives):
-        if located(drives[drive]["log"]).exists():
+        log = drives[drive]["log"]
+        if located(log).exists():
             groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
         else:
-            missing.append(drive)
+            why = f"Its log {log} is not there any more. Put it back, and give the same command again."
+            missing[drive] = Drive(drive, log, "failed", error=why)
     with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), threads, progress) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
             raise SettingsError(f"{root} is described with {library} already. Give another library.")
@@ -61,19 +69,24 @@ def redescribe_map(
             choice = logs.TopicChoice.read(topics[group[0]] or {}, f"{root}: {group[0]}/run.json")
             paths = [located(drives[drive]["log"]) for drive in group]
             last = number + 1 == len(groups)
-            found = run_batch(paths, target, pipeline, folder, choice, jobs, threads, progress, join=last)
+            found = run_batch(
+                paths, target, pipeline, folder, choice, jobs, threads, progress,
+                engine=engine, address=address, retries=retries, join=last,
+            )  # fmt: skip
+            joined = found["joined"]
             fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
         digest = read_library_record(folder)["hash"]
-    for drive in missing:
-        log = drives[drive]["log"]
-        why = f"Its log {log} is not there any more. Put it back, and give the same command again."
-        fate.append({"drive": drive, "was": drive, "log": log, "state": "failed", "error": why})
+    fate += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
+    if missing:
+        with map_store.writing(target) as store:
+            tell_failures(store, missing)
     return {
         "map": str(target),
         "from": str(root),
         "library": digest,
         "failed": sum(one["state"] == "failed" for one in fate),
         "drives": fate,
+        "joined": joined,
     }
 
 
@@ -86,8 +99,8 @@ def _made(library: Path, pipeline: Pipeline, threads: int, progress: Progress) -
             settings = {**pipeline.model_dump(mode="json"), "places": places}
             yield folder, Pipeline.read(settings, f"{library}/library.json")
         return
-    with tempfile.TemporaryDirectory(prefix="vplog-library-") as made:
-        folder = Path(made) / "library"
+    with scratch("made") as made:
+        folder = made / "library"
         build_library([library], folder, pipeline, logs.TopicChoice(), threads, progress)
         yield folder, pipeline
 

@@ -11,7 +11,6 @@ import io
 import os
 import re
 import shutil
-import tempfile
 import urllib.parse
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.google_store import google_file_system, google_place, plain, plain_errors
+from vplog.scratch import scratch
 from vplog.web import get_range, head
 
 if TYPE_CHECKING:
@@ -291,21 +291,34 @@ def file_system(endpoint: str | None, region: str | None) -> FileSystem:
     )  # fmt: skip
 
 
+_COPIED: dict[Path, RemotePath] = {}
+"""What local copies are of, while they are there."""
+
+
+def original(path: Path) -> Path:
+    """What a local copy is of; any other path itself."""
+    return cast("Path", _COPIED.get(path, path))
+
+
 @contextmanager
 def local_copy(path: Path | RemotePath) -> Iterator[Path]:
     """A remote folder or file as a local one for the time of the block; a local one as it is. Raises LogError."""
     if not isinstance(path, RemotePath):
         yield path
         return
-    with tempfile.TemporaryDirectory(prefix="vplog-") as folder:
-        target = Path(folder) / (path.name or "remote")
+    with scratch("url") as folder:
+        target = folder / (path.name or "remote")
         try:
             if not path.exists():
                 raise LogError(f"There is nothing at {path}.")
             _download(path, target)
         except OSError as error:
             raise LogError(f"Cannot read {path}: {reason(error)}.") from None
-        yield target
+        _COPIED[target] = path
+        try:
+            yield target
+        finally:
+            del _COPIED[target]
 
 
 def _download(path: RemotePath, target: Path) -> None:
@@ -330,17 +343,17 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
         return
     check_writable(path)
     _check_bucket(path)
-    with tempfile.TemporaryDirectory(prefix="vplog-") as folder:
-        target = Path(folder) / (path.name or "out")
+    with scratch("url") as folder:
+        target = folder / (path.name or "out")
         yield target
-        files = sorted(file for file in target.rglob("*") if file.is_file())
+        files = [target] if target.is_file() else sorted(file for file in target.rglob("*") if file.is_file())
         files.sort(key=lambda file: file.name == "run.json" and file.parent == target)
         try:
             system, place = path.place
             for file in files:
                 with (
                     file.open("rb") as source,
-                    system.open_output_stream(f"{place}/{file.relative_to(target)}") as sink,
+                    system.open_output_stream(str(PurePosixPath(place) / file.relative_to(target))) as sink,
                 ):
                     shutil.copyfileobj(source, sink, _BLOCK_BYTES)
         except OSError as error:

@@ -16,6 +16,8 @@ from vplog.evaluation import evaluate
 from vplog.extract import extract_frames
 from vplog.loops.propose import candidate_stops
 from vplog.pipeline import Pipeline
+from vplog.record import library_at
+from vplog.remote import original
 from vplog.report import write_report
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
@@ -39,7 +41,7 @@ def report(
     `truth` is a TUM file or `gps`; `log` the drive, read again where result.mcap has no pictures of closures.
     Raises VplogError with one line.
     """
-    record = run_record.read_finished_run(folder)
+    record = run_record.read_single_run(folder)
     judged = judge(folder, record, truth, topics) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
@@ -71,13 +73,12 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int)
     pipeline = _pipeline(folder, record)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
-    library = folder / "library"
-    if not (library / "library.json").is_file():
-        library = Path(str((record.get("library") or {}).get("from")))
-    state = pipeline.places.load(library, threads)
-    column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
-    if made_by != state.hash:
-        raise LibraryError(f"{library} is not the library of the run in {folder}; its report stays without pictures.")
+    with library_at(folder, record) as library:
+        state = pipeline.places.load(library, threads)
+        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+        if made_by != state.hash:
+            whose = f"{original(library)} is not the library of the run in {folder}"
+            raise LibraryError(f"{whose}; its report stays without pictures.")
     opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
     settings = pipeline.pictures.model_copy(update={"megapixels": pipeline.pictures.megapixels or 0.15})
     rows = choose_examples(closures, settings.closures)

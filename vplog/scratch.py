@@ -88,9 +88,11 @@ def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
     path = folder / name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as stream:
+        whole = path.with_name(f".{path.name}.{os.getpid()}.part")
+        with whole.open("wb") as stream:
             for part in parts:
                 stream.write(part.data)
+        whole.replace(path)
     except OSError as error:
         raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
 

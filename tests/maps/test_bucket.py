@@ -223,7 +223,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     for thread in threads:
         thread.join()
     assert (len(entered), len(refused)) == (1, 3)
-    assert all("Another `vplog batch`" in text for text in refused)
+    assert all("Another vplog process" in text for text in refused)
 
     monkeypatch.setattr(bucket_lock, "_release", lambda _: None)
     with map_store.writing(root) as gone:  # it ends without giving its lock back

@@ -152,7 +152,7 @@ def test_one_writer_at_a_time_and_none_after_a_kill(root: Path) -> None:
             os.read(go[0], 1)
         os._exit(0)
     os.read(ready[0], 1)
-    with pytest.raises(SettingsError, match="Another `vplog batch`"), map_store.writing(root):
+    with pytest.raises(SettingsError, match="Another vplog process"), map_store.writing(root):
         pass
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)

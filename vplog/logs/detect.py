@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,14 +67,19 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
     `name` is what the file is called where something is said of it, its own name where empty.
     """
     kind, inside = _magic(path), path
-    if kind == "zstd":
-        inside = unpacked(path)
-        kind = _magic(inside)
-    if kind not in _READERS:
-        raise LogError(_no_log(path) if inside is path else f"{path} holds something else than a log when unpacked.")
-    if kind == "db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
-        inside = fetched(inside)
-    return _READERS[kind](inside, notes, name or path.name), kind
+    with ExitStack() as copies:
+        if kind == "zstd":
+            inside = copies.enter_context(unpacked(path))
+            kind = _magic(inside)
+        if kind not in _READERS:
+            raise LogError(
+                _no_log(path) if inside is path else f"{path} holds something else than a log when unpacked."
+            )
+        if kind == "db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
+            inside = copies.enter_context(fetched(inside))
+        container = _READERS[kind](inside, notes, name or path.name)
+        weakref.finalize(container, copies.pop_all().close)  # a process may read thousands of logs
+    return container, kind
 
 
 def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:

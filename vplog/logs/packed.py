@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import atexit
 import shutil
-import tempfile
-from pathlib import Path
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import zstandard
 
 from vplog.errors import LogError
 from vplog.logs.compression import FREE_BYTES, MAX_RATIO
+from vplog.scratch import scratch
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
     from vplog.remote import RemotePath
 
 _BLOCK = 2**20
@@ -22,10 +24,24 @@ _SPARE = 2**30
 """Bytes of disk that are left free for others."""
 
 
-def fetched(path: RemotePath) -> Path:
-    """A temporary copy of a remote file, removed when the process ends. Raises LogError where the disk is too small."""
-    folder = Path(tempfile.mkdtemp(prefix="vplog-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+@contextmanager
+def fetched(path: RemotePath) -> Iterator[Path]:
+    """A copy of a remote file for the time of the block. Raises LogError where the disk is too small."""
+    with scratch("log") as folder:
+        yield _fetch(path, folder)
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """A file with what `path` holds, for the time of the block. A cut one is unpacked as far as it goes.
+
+    Raises LogError where it is no zstd data, would fill the disk, or claims more than its bytes justify.
+    """
+    with scratch("log") as folder:
+        yield _unpack(path, folder)
+
+
+def _fetch(path: RemotePath, folder: Path) -> Path:
     room, size = shutil.disk_usage(folder).free - _SPARE, path.stat().st_size
     if size > room:
         raise LogError(
@@ -36,13 +52,7 @@ def fetched(path: RemotePath) -> Path:
     return folder / path.name
 
 
-def unpacked(path: Path) -> Path:
-    """A temporary file with what `path` holds, removed when the process ends. A cut one is unpacked as far as it goes.
-
-    Raises LogError where it is no zstd data, would fill the disk, or claims more than its bytes justify.
-    """
-    folder = Path(tempfile.mkdtemp(prefix="vplog-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+def _unpack(path: Path, folder: Path) -> Path:
     target = folder / path.name.removesuffix(".zstd").removesuffix(".zst")
     most = max(FREE_BYTES, MAX_RATIO * path.stat().st_size)
     room = shutil.disk_usage(folder).free - _SPARE

@@ -116,7 +116,7 @@ def _take(lock: Lock, root: RemotePath) -> None:
         time.sleep(_SETTLE_S)
         _still_mine(lock)
     if lock.lost:
-        raise SettingsError(f"Another `vplog batch` has just begun to write to {root}. Wait for it to end.")
+        raise SettingsError(f"Another vplog process has just begun to write to {root}. Wait for it to end.")
 
 
 def _said(lock: Lock) -> bytes:
@@ -162,7 +162,7 @@ def _refuse_held(found: bytes, age_s: float, root: RemotePath) -> None:
     if holder.get("host") == _machine() and isinstance(pid, int) and known and _started(pid) != known:
         return
     raise SettingsError(
-        f"Another `vplog batch` is writing to {root} (process {pid} on {str(holder.get('host')).split(' ')[0]}). Wait "
+        f"Another vplog process is writing to {root} (process {pid} on {str(holder.get('host')).split(' ')[0]}). Wait "
         f"for it to end; were it killed, its lock ends by itself within {LEASE_S - max(age_s, 0.0):.0f} s."
     )
 

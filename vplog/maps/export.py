@@ -15,7 +15,7 @@ from vplog.remote import local_copy
 from vplog.results import tables
 from vplog.results.geo import on_earth
 from vplog.results.places_map import names_of, read_places, write_map, write_places
-from vplog.results.run_record import read_finished_run
+from vplog.results.run_record import read_single_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -74,9 +74,9 @@ def export_map(
     with ExitStack() as stack:
         folders = [stack.enter_context(local_copy(source)) for source in sources]
         for folder in folders:
-            read_finished_run(folder)
+            read_single_run(folder)
         if box is None and kind == "parquet":
-            return write_map(path, folders)
+            return {**write_map(path, folders), "left_out": []}
         run = dict(zip(names_of(folders), folders, strict=True))
         source = _Source(
             list(run), lambda drive: earth_of_run(run[drive]), lambda drive, of, _: of(run[drive]), lambda _: None

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.maps.joint_record import components_of
+from vplog.maps.joint_record import components_in
 from vplog.maps.store import other_library
 from vplog.places.stored import read_library_record
 from vplog.results import run_record
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from vplog.maps.store import Store
@@ -67,7 +68,7 @@ def _describe(store: Store) -> dict[str, Any]:
         "bytes_per_place": round(stored / places, 1) if places else None,
         "bytes": sum(one["bytes"] for one in drives),
         "on_earth": sum(one["on_earth"] for one in drives),
-        "components": _components(store, problems),
+        "components": _components(store, abouts, problems),
         "drives": drives,
         "failures": store.failures(),
         "problems": problems,
@@ -90,20 +91,26 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
             "bytes": sum(sizes.values()),
             "seconds": record.get("totals", {}).get("seconds"),
             "peak_memory_mb": record.get("totals", {}).get("peak_memory_mb"),
+            "warnings": record.get("warnings", []),
         }
 
     return store.read(drive, read, ())
 
 
-def _components(store: Store, problems: list[str]) -> list[dict[str, Any]] | None:
+def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> list[dict[str, Any]] | None:
     """The drives that closures join in one frame, as joint.json has them; None where nothing was joined yet."""
     try:
-        if store.mirror is not None:
-            store.mirror.rest(["joint.json"])
-        return components_of(store.root) if (store.root / "joint.json").is_file() else None
+        found = components_in(store)
     except ResultError as error:
         problems.append(str(error))
         return None
+    gone = sorted({drive for one in found or [] for drive in one["drives"]} - known.keys())
+    if gone:
+        problems.append(
+            f"{', '.join(gone)} was removed and is still in the joint graphs. Solve the others without: "
+            f"vplog map join {store}"
+        )
+    return found
 
 
 def _left_behind(store: Store, drives: list[str]) -> list[str]:

@@ -6,6 +6,7 @@ by geometry. Drives come in order of their IDs within a batch, and after all tha
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 
     Progress = Callable[[str, int, int], None]
 
+_KEEP_EVERY_S = 300.0
+"""Of a map on an object store what is verified is sent this often: each time what is there already is copied there."""
+
 
 def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceState:
     """The map's library as `join` compares places by it: what can be done while the drives are still computed.
@@ -42,6 +46,7 @@ def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceSta
     What else is read once, as the code that joins depend on, is read along. Raises LibraryError.
     """
     pairs.depends(pipeline)
+    pairs.search_code()
     return cast("PlaceState", pipeline.places.load(library, threads))
 
 
@@ -156,13 +161,16 @@ def _verify(
             if not pairs.is_stored(store, task):
                 yield task
 
-    computed = 0
+    computed, kept_at = 0, time.monotonic()
     for task, data, why in each_done(pairs.compute_pair, tasks(), executor):
         if data is None:
             reasons[task.later.drive, task.earlier.drive] = why
         else:
             pairs.put_ledger(store, task, data)
             computed += 1
+        if time.monotonic() - kept_at > _KEEP_EVERY_S:
+            store.keep()
+            kept_at = time.monotonic()
     progress("verify between drives", len(wanted), len(wanted))
     return computed, reasons
 

@@ -10,6 +10,8 @@ from vplog.results import run_record
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from vplog.maps.store import Store
+
 FORMAT = 1
 """Version of this record. A reader refuses another one."""
 
@@ -37,6 +39,13 @@ def read_joint(root: Path) -> dict[str, Any]:
 def components_of(root: Path) -> list[dict[str, Any]]:
     """The components that count: `folder` in MAP/joint and `drives`, in order of their first drives."""
     return [component for group in read_joint(root).get("groups", []) for component in group["components"]]
+
+
+def components_in(store: Store) -> list[dict[str, Any]] | None:
+    """The same of any map; None where nothing was joined yet. Raises ResultError where the record is damaged."""
+    if store.mirror is not None:
+        store.mirror.rest(["joint.json"])
+    return components_of(store.root) if (store.root / "joint.json").is_file() else None
 
 
 def write_joint(root: Path, record: dict[str, Any]) -> None:

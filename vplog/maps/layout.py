@@ -23,9 +23,23 @@ HASH = re.compile(r"[0-9a-f]{64}")
 """How a library is called: the sha256 of all that descriptors depend on."""
 
 
+_MOST_NAME = 120
+"""Characters of a drive's name in a file's; what stands around them takes up to forty more."""
+
+
 def folder_name(drive: str) -> str:
-    """What a partition of a data set is called; other characters than letters, digits and `_.-~` as in a URL."""
-    return f"drive={quote(drive, safe='')}"
+    """What a partition of a data set is called."""
+    return f"drive={quoted(drive)}"
+
+
+def quoted(drive: str) -> str:
+    """A drive in a file's name: other characters than letters, digits and `_.-~` as in a URL, the end of what is very
+    long as a hash: a name has 255 bytes on most file systems, and a letter beyond ASCII takes six to twelve."""
+    name = quote(drive, safe="")
+    if len(name) <= _MOST_NAME:
+        return name
+    begins = re.sub(r"%[0-9A-F]?$", "", name[:_MOST_NAME])
+    return f"{begins}~{hashlib.sha256(drive.encode()).hexdigest()[:16]}"
 
 
 def drive_record(folder: Path) -> dict[str, Any]:

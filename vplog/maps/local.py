@@ -6,7 +6,7 @@ import ctypes
 import fcntl
 import os
 import shutil
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
@@ -41,25 +41,33 @@ def locked(root: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise SettingsError(
-                f"Another `vplog batch` is writing to {root}. Wait for it to end, or choose another folder with -o."
-            ) from None
+            raise SettingsError(f"Another vplog process is writing to {root}. Wait for it to end.") from None
         except OSError as error:  # file systems without locks
             raise SettingsError(f"Cannot lock {root}/.lock: {error.strerror}. Choose another folder with -o.") from None
         yield
 
 
 def settle(store: Store) -> None:
-    """Put in what a killed writer had finished: a folder with drive.json, which is written last."""
+    """Put in what a killed writer had finished: a folder with drive.json, which is written last. Take out what is left
+    of drives that it was removing: their tables without a run folder."""
     for file in sorted(store.staging.glob("*/drive.json")):
         if not file.parent.name.startswith(_REMOVED):
-            record = drive_record(file.parent)
-            if not store.run(record["drive"]).exists():
-                publish(store, record["drive"], file.parent)
+            with suppress(ResultError):  # it is not whole, and goes
+                record = drive_record(file.parent)
+                if _has_tables(file.parent) and not store.run(record["drive"]).exists():
+                    publish(store, record["drive"], file.parent)
     shutil.rmtree(store.staging, ignore_errors=True)
     store.staging.mkdir(parents=True, exist_ok=True)
+    for name in TABLES:
+        for left in store.root.glob(f"{name}/drive=*"):
+            if not (store.root / "runs" / left.name).exists():
+                shutil.rmtree(left, ignore_errors=True)
     for drive in store.drives():
         link_tables(store, drive)
+
+
+def _has_tables(made: Path) -> bool:
+    return all((made / f"{name}.parquet").is_file() for name in TABLES)
 
 
 def clear(store: Store) -> None:
@@ -106,7 +114,10 @@ def link_tables(store: Store, drive: str) -> None:
         if path.exists() and (path.samefile(source) or _same_copy(source, path)):
             continue
         part = store.staging / f"{name}-{os.getpid()}.parquet"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ResultError(f"Cannot make {path.parent}: {error.strerror}. Make room, and run again.") from None
         try:
             part.unlink(missing_ok=True)
             os.link(source, part)

@@ -21,8 +21,11 @@ if TYPE_CHECKING:
     Progress = Callable[[str, int, int], None]
 
 
-def merge_maps(sources: Sequence[Path], target: Path, progress: Progress = lambda *_: None) -> dict[str, Any]:
-    """Take the drives of maps into `target`, which is made where it is not there; what became of each.
+def merge_maps(
+    sources: Sequence[Path], target: Path, progress: Progress = lambda *_: None, chosen: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; what became of
+    each.
 
     Maps in the order given, the drives of each in order of their IDs. One whose log is in the map already, by its
     content, is left out; one whose ID is taken gets a number. Each is in whole or not at all, so a merge that was
@@ -33,15 +36,17 @@ def merge_maps(sources: Sequence[Path], target: Path, progress: Progress = lambd
     if len({str(source.resolve()) for source in sources}) < len(sources):
         raise SettingsError("A map is given twice. Give each once.")
     library = _check_libraries(sources, target)
+    _check_chosen(sources, chosen)
     fate: list[dict[str, Any]] = []
     with map_store.writing(target) as store:
-        known = {_content(record): drive for drive, record in store.drives().items()}
+        there = store.drives()
+        known, names = {_content(record): drive for drive, record in there.items()}, set(there)
         for number, source in enumerate(sources):
             with map_store.reading(source) as other:
                 _, drives = map_store.one_library(other)
                 _take_library(store, other, library)
-                for drive in in_order(drives):
-                    fate.append(_take(store, other, drives[drive], known, f"{os.getpid()}-{len(fate)}"))
+                for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
+                    fate.append(_take(store, other, drives[drive], known, names, f"{os.getpid()}-{len(fate)}"))
                     progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
         return {"map": str(store), "library": library, "drives": fate}
 
@@ -65,6 +70,17 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
     return str(wanted)
 
 
+def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
+    """Raises SettingsError where no map has a drive that is asked for."""
+    known: set[str] = set()
+    for source in sources if chosen else ():
+        with map_store.reading(source) as other:
+            known |= other.drives().keys()
+    unknown = [drive for drive in chosen if drive not in known]
+    if unknown:
+        raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(in_order(known))}.")
+
+
 def _take_library(store: Store, other: Store, library: str) -> None:
     """The library and the settings of the first map are those of a new one."""
     if (store.root / "map.json").exists() and store.head().library is not None:
@@ -76,28 +92,32 @@ def _take_library(store: Store, other: Store, library: str) -> None:
     store.write_head(map_store.Head(library, other.head().settings))
 
 
-def _take(store: Store, other: Store, record: dict[str, Any], known: dict[str, str], staged: str) -> dict[str, Any]:
-    """One drive; what became of it. `known` are the IDs in the map by content, and gets this one."""
+def _take(
+    store: Store, other: Store, record: dict[str, Any], known: dict[str, str], names: set[str], staged: str
+) -> dict[str, Any]:
+    """One drive; what became of it. `known` are IDs in the map by content, `names` all of them; both get this one."""
     drive = record["drive"]
     told = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
     if (same := known.get(_content(record))) is not None:
         return {**told, "as": same, "state": "there already"}
-    taken, made = keys.free_name(drive, record["log"], set(known.values())), store.staging / staged
+    taken, made = keys.free_name(drive, record["log"], names), store.staging / staged
 
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
         try:
-            shutil.copytree(other.whole(drive), made, copy_function=_linked)
+            ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
+            shutil.copytree(other.whole(drive), made, copy_function=_linked, ignore=ignored)
         except (OSError, shutil.Error) as error:
             raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
 
     other.read(drive, copied, ())
     if taken != drive:
         keys.name_keyframes(made / "keyframes.parquet", taken)
-        run_record.write_run_json(made / "drive.json", keys.renamed(record, taken))
+    run_record.write_run_json(made / "drive.json", record if taken == drive else keys.renamed(record, taken))
     map_store.publish(store, taken, made)
     other.forget(drive)
     known[_content(record)] = taken
+    names.add(taken)
     return {**told, "as": taken, "state": "taken"}
 
 

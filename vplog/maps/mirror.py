@@ -133,12 +133,18 @@ class Mirror:
 
     def rest(self, names: Collection[str] = ()) -> None:
         """Have all else that the map has in the local folder, or what of it has these names. Raises ResultError."""
+        before = None
         for _ in range(3):
             with told(self.remote):
-                data = objects.get(self.remote / "rest.json")
-            if data is None:
+                manifest = read_rest(self.remote)
+            if manifest is None:
                 return
-            manifest = sound_manifest(data, self.remote / "rest.json")
+            if manifest["generation"] == before:
+                raise ResultError(
+                    f"{self.remote}/rest has lost files that rest.json names. Remove {self.remote}/rest.json, and join "
+                    f"the drives again: vplog map join {self.remote}"
+                )
+            before = manifest["generation"]
             place = self.remote / "rest" / manifest["generation"]
             files = {name: about for name, about in manifest["files"].items() if self._is_of_a_drive(name)}
             wanted = {name: about for name, about in files.items() if name in names or not names}
@@ -210,6 +216,13 @@ class Mirror:
 
     def run(self, drive: str) -> Path:
         return self.local / "runs" / folder_name(drive)
+
+
+def read_rest(remote: RemotePath) -> dict[str, Any] | None:
+    """The manifest of all that is neither a drive's nor a library's; None where there is none. Raises OSError, and
+    ResultError where it is damaged."""
+    data = objects.get(remote / "rest.json")
+    return None if data is None else sound_manifest(data, remote / "rest.json")
 
 
 @contextmanager

@@ -12,15 +12,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote, unquote
 
 from vplog.between import closures_between, with_shared
 from vplog.code_hash import code_of
 from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.maps.keys import key_of
+from vplog.maps.layout import folder_name, quoted
 from vplog.maps.seen import Sight, checked_with, keep_features, sight_of
-from vplog.maps.store import folder_name
 from vplog.results import run_record, tables
 from vplog.results.atomic import replacing
 
@@ -111,7 +110,7 @@ def folder_of(store: Store, drive: str) -> Path:
 
 
 def ledger_path(store: Store, later: str, earlier: str) -> Path:
-    return folder_of(store, later) / f"match={quote(earlier, safe='')}.parquet"
+    return folder_of(store, later) / f"match={quoted(earlier)}.parquet"
 
 
 def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
@@ -185,9 +184,14 @@ class Joins:
     left out; `reason` then says why."""
 
 
+def search_code() -> str:
+    """sha256 over the code that chooses what is verified, and verifies it; read once, which takes half a second."""
+    return code_of(*_CODE, _SEARCH)["code"]
+
+
 def search_key(member: Member, pipeline: Pipeline) -> str:
     """sha256 over what a drive's joins depend on, beside the drives before it."""
-    return key_of({"member": member.key, **depends(pipeline), "search": code_of(*_CODE, _SEARCH)["code"]})
+    return key_of({"member": member.key, **depends(pipeline), "search": search_code()})
 
 
 def read_joins(store: Store, drive: str) -> Joins | None:
@@ -213,9 +217,9 @@ def put_joins(store: Store, drive: str, joins: Joins) -> None:
 def forget(store: Store, drive: str, kept: set[str]) -> None:
     """Remove ledgers of a drive in others than these, and what a killed writer left."""
     folder = folder_of(store, drive)
-    for path in sorted(folder.glob("match=*.parquet")):
-        if unquote(path.name.removeprefix("match=").removesuffix(".parquet")) not in kept:
-            path.unlink(missing_ok=True)
+    known = {ledger_path(store, drive, earlier) for earlier in kept}
+    for path in set(folder.glob("match=*.parquet")) - known:
+        path.unlink(missing_ok=True)
     for path in folder.glob(".*.part"):
         path.unlink(missing_ok=True)
 

@@ -69,10 +69,14 @@ def query_map(
         answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
         table = _table(store, list(drives), answers, stamps)
     if out is not None:
+        pipeline = pipeline.model_copy(update={"sequence": settings})
         write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
     return {
         "map": str(root),
         "log": str(path),
+        "library": state.hash,
+        "top": top,
+        "sequence": settings.length,
         "written": None if out is None else str(out),
         "views": len(stamps),
         "answered": int((answers.count > 0).sum()),
@@ -168,7 +172,8 @@ def search(
     numbered = dict(enumerate(drives))
     if not isinstance(state, BobbState):
         top = min(top, sum(store.rows("descriptors", drive) for drive in drives))
-        return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), []
+        told = [] if executor is None else ["Ray was not used: a map of another recogniser than bobb is searched here."]
+        return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
     parts, told = update_index(store, drives, state.hash, state, threads, progress)
     if store.mirror is not None:  # workers elsewhere do not see these files
         parts = [replace(part, path=None) for part in parts]
@@ -180,6 +185,8 @@ def search(
         single = best_places(parts, state, descriptors, PLACES_A_VIEW, threads, executor, progress)
         numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
         told.append(f"Sequences were looked for in the {len(numbered)} of {len(drives)} drives most like single views.")
+    elif executor is not None:
+        told.append(f"Ray was not used: up to {EXACT_PLACES} places sequences are drawn in every drive, here.")
     return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
 
 

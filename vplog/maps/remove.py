@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from vplog.errors import SettingsError
+from vplog.errors import ResultError, SettingsError
 from vplog.maps import store as map_store
+from vplog.maps.joint_record import components_in
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,12 +25,26 @@ def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
         failures, known = store.failures(), store.drives()
         _check(store, drives)
         for drive in drives:
-            if drive in known:
+            if drive in known or drive in failures:  # of a drive that failed there may be a cache
                 map_store.remove(store, drive)
         kept = {drive: told for drive, told in failures.items() if drive not in drives}
         if kept != failures:
             store.write_failures(kept)
-        return {"map": str(store), "removed": list(dict.fromkeys(drives)), "drives": list(store.drives())}
+        return {
+            "map": str(store),
+            "removed": list(dict.fromkeys(drives)),
+            "drives": list(store.drives()),
+            "still_joined": _still_joined(store, drives),
+        }
+
+
+def _still_joined(store: map_store.Store, drives: Sequence[str]) -> list[str]:
+    """Of the drives that are taken out, those that the joint graphs hold until they are solved anew."""
+    try:
+        joined = {drive for one in components_in(store) or [] for drive in one["drives"]}
+    except ResultError:  # damaged: the next join writes it anew
+        return []
+    return sorted(joined & set(drives))
 
 
 def _check(store: map_store.Store, drives: Sequence[str]) -> None:

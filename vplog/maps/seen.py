@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from vplog.maps.members import check_unchanged, opened_log
 from vplog.parts import stored_features
 from vplog.results import run_record, tables
 from vplog.results.kept_features import KeptFeatures, write_features
+from vplog.scratch import scratch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -122,7 +121,7 @@ def checked_with(
         return
     log = opened_log(member)
     check_unchanged(member)
-    with tempfile.TemporaryDirectory(prefix="vplog-") as folder, FeatureStore(Path(folder) / "features") as store:
+    with scratch("features") as folder, FeatureStore(folder / "features") as store:
         again = _Again(log, keyframes.stamp_ns, member, store, threads)
         yield checked(again.__getitem__), again.fetch
 

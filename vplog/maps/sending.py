@@ -15,10 +15,11 @@ import pyarrow.parquet as pq
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import objects
 from vplog.maps.layout import AT_HAND, TABLES, folder_name, sha256_of
-from vplog.maps.mirror import told
+from vplog.maps.mirror import read_rest, told
 from vplog.results import run_record
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from vplog.maps.mirror import Mirror
@@ -54,7 +55,11 @@ def begin(mirror: Mirror) -> None:
         named_runs = {f"{folder_name(drive)}/{one['generation']}" for drive, one in mirror.manifests.items()}
         for left in _left_over(runs, 2, named_runs):
             objects.remove(remote / "runs" / left)
-        for left in _left_over(rest, 1, {mirror.rest_manifest.get("generation")}):
+        manifest = read_rest(remote) or {}
+        before = f"{manifest.get('replaces')}/"
+        if known := [name.removeprefix(before) for name in rest if name.startswith(before)]:
+            _after_rest(remote, manifest, manifest["files"], known)
+        for left in _left_over(rest, 1, {manifest.get("generation")}):
             objects.remove(remote / "rest" / left)
 
 
@@ -195,11 +200,18 @@ def send_rest(mirror: Mirror) -> None:
         manifest = {"generation": generation, "replaces": old.get("generation"), "files": dict(sorted(files.items()))}
         put_json(remote / "rest.json", manifest)
         mirror.rest_manifest = manifest
-        for name in files:
-            if name not in kept and name.endswith((".parquet", ".json")):
-                objects.copy(place / name, remote / name)
-        for name in known:
-            if name not in files:
-                objects.remove(remote / name)
-        if old:
-            objects.remove(remote / "rest" / old["generation"])
+        _after_rest(remote, manifest, [name for name in files if name not in kept], known)
+
+
+def _after_rest(remote: RemotePath, manifest: dict[str, Any], new: Iterable[str], known: Iterable[str]) -> None:
+    """What is `new` by its own name, too; away with what was `known` before and is not any more, and last with the
+    generation that was replaced, which tells a later writer that this was not done to its end."""
+    place = remote / "rest" / manifest["generation"]
+    for name in new:
+        if name.endswith((".parquet", ".json")):
+            objects.copy(place / name, remote / name)
+    for name in known:
+        if name not in manifest["files"]:
+            objects.remove(remote / name)
+    if manifest["replaces"]:
+        objects.remove(remote / "rest" / manifest["replaces"])

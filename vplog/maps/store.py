@@ -16,7 +16,7 @@ removing its folders: `rm -r MAP/*/drive=ID`.
 from __future__ import annotations
 
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import vplog
-from vplog.errors import LibraryError, ResultError
+from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps import local
 from vplog.maps.earth import earth_as_plain, earth_from_plain, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
@@ -139,6 +139,13 @@ class Store:
         """Where on earth a drive is, None where nothing says so. Raises ResultError."""
         about = drive_record(self.root / "runs" / folder_name(drive))
         return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
+
+    def keep(self) -> None:
+        """Of a map on an object store, send what was made so far beside drives; a folder has it already."""
+        if self.mirror is not None:
+            from vplog.maps.sending import send_rest
+
+            send_rest(self.mirror)
 
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order. Raises ResultError where one cannot be read."""
@@ -255,7 +262,12 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
         mirror.rest()
         store = Store(folder, mirror)
         store.staging.mkdir()
-        yield store
+        try:
+            yield store
+        except BaseException:  # what was verified of closures stays
+            with suppress(VplogError):
+                sending.send_rest(mirror)
+            raise
         sending.send_rest(mirror)
 
 

@@ -132,7 +132,7 @@ def write_places(
                 arrays.append(geo.points(part.where))
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=ROWS_PER_GROUP)
             places += len(part.keyframe)
-    return {"map": str(path), "drives": list(names), "places": places, "library": library}
+    return {"written": str(path), "drives": list(names), "places": places, "library": library}
 
 
 def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:

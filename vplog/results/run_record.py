@@ -44,6 +44,15 @@ def read_finished_run(folder: Path) -> dict[str, Any]:
     return record
 
 
+def read_single_run(folder: Path) -> dict[str, Any]:
+    """The same, of one drive. Raises ResultError where the folder holds several, too."""
+    record = read_finished_run(folder)
+    drives = record.get("drives")
+    if "maps" in record and isinstance(drives, list) and drives and isinstance(drives[0], dict):
+        raise ResultError(f"{folder} holds {len(drives)} drives. Give one of them: {folder}/{drives[0].get('folder')}")
+    return record
+
+
 def canonical_json(tree: Any) -> str:
     """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
     return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
