@@ -211,7 +211,13 @@ def test_a_map_holds_the_places_of_a_run(verb: Verb, finished: Path, tmp_path: P
     found = verb("map", "export", finished, "-o", path, "--json").json
     column, library = tables.read_descriptors(finished / "descriptors.parquet")
     keyframes, world = tables.read_keyframes(finished / "keyframes.parquet")
-    assert found == {"map": str(path), "drives": [keyframes.drive], "places": len(column), "library": library}
+    assert found == {
+        "written": str(path),
+        "left_out": [],
+        "drives": [keyframes.drive],
+        "places": len(column),
+        "library": library,
+    }
     table, places = read_map(path, column.type)
     assert places.equals(column)
     assert table["stamp_ns"].to_pylist() == keyframes.stamp_ns.tolist()

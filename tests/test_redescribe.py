@@ -84,11 +84,13 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
     asked: list[tuple[list[str], str | None, str]] = []
 
     def run_batch(
-        paths: list[Path], root: Path, pipeline: Any, library: Path, topics: Any, *_: Any, join: bool
+        paths: list[Path], root: Path, pipeline: Any, library: Path, topics: Any, *_: Any, join: bool, **workers: Any
     ) -> dict[str, Any]:
         assert join == bool(asked), "once, when all are there"
+        assert workers == {"engine": "local", "address": None, "retries": 2}
         asked.append(([path.parent.name for path in paths], topics.image, pipeline.places.kind))
-        return {"drives": [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]}
+        fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
+        return {"drives": fate, "joined": None}
 
     monkeypatch.setattr("vplog.redescribe.run_batch", run_batch)
     other = tmp_path / "library"

@@ -59,6 +59,8 @@ def query_map(
     the map; they must see its folder. With a cache a map on an object store is read from there, but for its manifests.
     Raises VplogError with one line.
     """
+    if out is not None and not out.parent.is_dir():  # before any work
+        raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
     with map_store.reading(root, cache) as store:
         drives, pipeline, state = open_map(store, threads)
         log = logs.open(path, topics)
