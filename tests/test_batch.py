@@ -4,33 +4,36 @@ from __future__ import annotations
 
 import hashlib
 import json
+import multiprocessing
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import duckdb
 import pytest
 
 from vplog.batch import run_batch
-from vplog.batch_worker import Outcome, Task
+from vplog.batch_worker import Outcome, Task, made_by
 from vplog.demo import SMALL, make_drive
 from vplog.engine import LocalEngine, computed
 from vplog.errors import LibraryError, SettingsError
 from vplog.libraries import build_library
 from vplog.logs import TopicChoice
 from vplog.maps import store as map_store
-from vplog.own_processes import OwnProcesses
+from vplog.maps.keys import drive_names
+from vplog.own_processes import OwnProcesses, begun_ahead, known_ahead
 from vplog.pipeline import load_pipeline
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from conftest import Said
 
@@ -261,6 +264,71 @@ def test_a_process_that_dies_takes_no_other_along() -> None:
         slept += [executor.submit(time.sleep, 600) for _ in range(3)]
         raise KeyboardInterrupt
     assert all(future.done() for future in slept)
+
+
+def test_a_process_begun_ahead_is_that_of_the_first_task_or_ends() -> None:
+    with begun_ahead():
+        [ahead] = multiprocessing.active_children()
+        assert known_ahead() == made_by()
+        with OwnProcesses(1) as executor:
+            assert executor.submit(os.getpid).result() == ahead.pid
+            assert executor.submit(os.getpid).result() != ahead.pid
+    assert known_ahead() is None
+    with begun_ahead():
+        assert multiprocessing.active_children()
+    assert not multiprocessing.active_children()
+    with begun_ahead(), OwnProcesses(1) as executor:
+        [ahead] = multiprocessing.active_children()
+        os.kill(ahead.pid or 0, signal.SIGKILL)
+        assert known_ahead() is None
+        with pytest.raises(BrokenExecutor, match="killed"):
+            executor.submit(os.getpid).result()
+
+
+def test_a_map_goes_on_with_its_own_settings(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = Path(shutil.copytree(whole, tmp_path / "map"))
+    told = verb("batch", *logs, "-o", root, "--json").json
+    assert [one["state"] for one in told["drives"]] == ["unchanged", "unchanged"]
+    assert told["warnings"] == []
+    failing: Future[Outcome] = Future()
+    failing.set_result(Outcome("not now"))
+    monkeypatch.setattr(LocalEngine, "start", lambda *_: failing)
+    said = verb("batch", logs[0], "-o", root, "--set", "propose.per_query=2", "--json", "--no-join")
+    assert said.code == 1
+    assert json.loads((root / "map.json").read_text())["settings"]["propose"]["per_query"] == 2
+    assert json.loads((root / "map.json").read_text())["settings"]["features"]["max_features"] == 300
+    assert f"the first is {logs[1]}" in json.loads(said.out)["warnings"][0]
+
+
+def test_a_log_that_cannot_be_asked_for_stops_no_other(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, closed = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "closed.mcap"
+    is_dir = Path.is_dir
+
+    def refused(path: Path) -> bool:
+        if path == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", refused)
+    told = run_batch([closed, *logs], root, load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [
+        ("closed", "failed"), ("drive", "unchanged"), ("drive-2", "unchanged"),
+    ]  # fmt: skip
+    assert str(closed) in told["drives"][0]["error"]
+
+
+def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    with map_store.writing(tmp_path / "map") as store:
+        store.write_failures({"run": {"log": str(tmp_path / "a" / "run.mcap"), "error": "bad"}})
+    known = {drive: {"log": told["log"], "inputs": None} for drive, told in store.failures().items()}
+    names = [str(tmp_path / folder / "run.mcap") for folder in "ba"]
+    assert drive_names(["run", "run"], names, known, [{"run.mcap": "1"}, {"run.mcap": "2"}]) == ["run-2", "run"]
 
 
 def test_engines_that_are_not_there_are_said(logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

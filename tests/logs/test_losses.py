@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import random
 import shutil
+import tempfile
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -16,7 +18,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags import rosbag1
 
-from vplog import logs
+from vplog import logs, scratch
 from vplog.errors import LogError
 from vplog.logs.losses import Account, Runs, merged, runs_of
 from vplog.logs.recorded import RecordedLog
@@ -284,6 +286,26 @@ def test_a_file_packed_as_a_whole_is_the_same_log(storage: str, tmp_path: Path) 
     packed.write_bytes(data[: len(data) * 3 // 4])
     found, losses, _ = opened(folder)
     assert Counter(found) + lost_by_topic(losses, "cut", "damaged_bytes", "unknown_channel") == RECORDED
+
+
+def test_a_file_packed_as_a_whole_is_unpacked_for_as_long_as_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    folder = write_ros2(tmp_path / "drive", ros_messages(DRIVE, 2), "mcap")
+    file = next(folder.glob("*.mcap"))
+    packed = tmp_path / "drive.mcap.zst"
+    packed.write_bytes(zstandard.compress(file.read_bytes()))
+    log = logs.open(packed)
+    frames = log.frames(log.stamps()[:3])
+    del log
+    gc.collect()
+    assert list(scratch.own_folder().glob("log-*"))
+    assert [frame.decode().image.shape for frame in frames] == 3 * [DRIVE.images[0].shape[:2]]
+    del frames
+    gc.collect()
+    assert not list(scratch.own_folder().glob("log-*"))
 
 
 def test_missing_storage_files_are_counted(tmp_path: Path) -> None:

@@ -150,15 +150,57 @@ def test_what_nobody_names_goes_after_a_day(root: Any, monkeypatch: pytest.Monke
     left = root / "runs" / "drive=one" / ("0" * 16) / "run.json"
     objects.put(left, b"{}")
     objects.remove(root / "runs" / "drive=two")
-    with map_store.writing(root):
-        pass
+    with map_store.writing(root) as store:
+        write_rest(store, "1")
     assert left.exists()
     assert any("two" in name for name in names(root))
     monkeypatch.setattr(sending, "_LEFT_OVER", -sending._LEFT_OVER)
+    for _ in range(2):
+        with map_store.writing(root) as store:
+            assert (store.root / "joint.json").read_text() == "1", "which its manifest names"
+    assert not any("0" * 16 in name or "drive=two" in name for name in names(root))
+    assert same_state(root) == {"one": {1}}
+
+
+def write_rest(store: map_store.Store, text: str, *more: str) -> None:
+    for name in ("joins/drive=one/joins.parquet", "joint.json", *more):
+        (store.root / name).parent.mkdir(parents=True, exist_ok=True)
+        (store.root / name).write_text(text)
+
+
+def test_what_joins_drives_is_kept_of_a_writer_that_fails(root: Any) -> None:
+    make_map(root, {"one": 1})
+    with pytest.raises(KeyboardInterrupt), map_store.writing(root) as store:
+        write_rest(store, "1")
+        raise KeyboardInterrupt
+    with map_store.writing(root) as store:
+        assert (store.root / "joint.json").read_text() == "1"
+        write_rest(store, "2")
+        store.keep()
+        assert objects.get(root / "joint.json") == b"2", "before the writer's end"
+        store.keep()
+    assert len([name for name in names(root) if name.startswith("rest/")]) == 2
+
+
+def test_data_sets_of_what_joins_drives_are_as_their_manifest(root: Any) -> None:
+    """A writer is killed right behind the manifest; the next one does the rest."""
+    make_map(root, {"one": 1})
+    with map_store.writing(root) as store:
+        write_rest(store, "1", "joint/component=a/poses.parquet")
+    with pytest.MonkeyPatch.context() as patch, map_store.writing(root) as store:
+        patch.setattr(sending, "_after_rest", lambda *_: None)
+        shutil.rmtree(store.root / "joint")
+        write_rest(store, "2")
+    assert objects.get(root / "joint.json") == b"1"
     with map_store.writing(root):
         pass
-    assert not any("0" * 16 in name or "two" in name for name in names(root))
-    assert same_state(root) == {"one": {1}}
+    assert objects.get(root / "joint.json") == b"2"
+    assert not any(name.startswith("joint/") for name in names(root))
+    assert len([name for name in names(root) if name.startswith("rest/")]) == 2
+    [lost] = {name.split("/")[1] for name in names(root) if name.startswith("rest/")}
+    objects.remove(root / "rest" / lost)
+    with pytest.raises(ResultError, match=r"lost files that rest.json names"), map_store.writing(root):
+        pass
 
 
 def test_a_reader_never_sees_half_a_drive(root: Any) -> None:

@@ -8,7 +8,9 @@ import shutil
 from typing import TYPE_CHECKING, Any
 
 import pyarrow.parquet as pq
+import pytest
 
+from vplog.errors import ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.merge import merge_maps
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    import pytest
     from conftest import Said
 
     Verb = Callable[..., Said]
@@ -85,6 +86,59 @@ def test_a_merge_that_was_stopped_goes_on_to_the_same_end(tmp_path: Path, monkey
     drives = list(map_store.Store(whole).drives())
     assert drives == list(map_store.Store(part).drives()) == ["walk", "walk-2", "walk-3", "walk-4"]
     assert [digests(part, drive) for drive in drives] == [digests(whole, drive) for drive in drives]
+
+
+def test_a_merge_that_was_stopped_while_it_copied_leaves_no_half_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed, or the disk full, with any of the files there."""
+    a, target = make_map(tmp_path / "a", {"one": 1}), tmp_path / "b"
+    copytree, files = shutil.copytree, len(list(map_store.Store(a).run("one").iterdir())) - 1
+    for stop in range(files):
+        left = [stop]
+
+        def copied(source: str, to: str, left: list[int] = left) -> str:
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(28, "No space left on device")
+            return shutil.copyfile(source, to)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                shutil, "copytree", lambda *told, **more: copytree(*told, **{**more, "copy_function": copied})
+            )
+            patch.setattr("vplog.maps.merge._take_library", lambda *_: None)
+            with pytest.raises(ResultError, match="Cannot copy"):
+                merge_maps([a], target)
+        with map_store.writing(target) as store:
+            assert not store.drives()
+    merge_maps([a], target)
+    assert digests(target, "one") == digests(a, "one")
+    for damage in (b"", b"{}", b'{"drive": "two"}'):  # of a worker on another machine
+        with map_store.writing(target) as store:
+            made = store.staging / "made"
+            shutil.copytree(store.run("one"), made)
+            (made / "drive.json").write_bytes(damage)
+            saved = copytree(store.staging, tmp_path / "saved", dirs_exist_ok=True)
+        copytree(saved, store.staging)
+        with map_store.writing(target) as store:
+            assert list(store.drives()) == ["one"]
+
+
+def test_no_drive_of_the_target_gives_way(tmp_path: Path) -> None:
+    """Not where it has two of one content either."""
+    a, b = make_map(tmp_path / "a", {"run": 1, "run-2": 1}), make_map(tmp_path / "b", {"run": 2})
+    assert states(merge_maps([b], a)) == [("run", "run-3", "taken")]
+    assert {drive: seeds(map_store.Store(a).run(drive)) for drive in ("run", "run-2", "run-3")} == {
+        "run": {1}, "run-2": {1}, "run-3": {2},
+    }  # fmt: skip
+
+
+def test_single_drives_are_taken(verb: Verb, tmp_path: Path) -> None:
+    a, b = make_map(tmp_path / "a", {"one": 1, "two": 2}), make_map(tmp_path / "b", {"three": 3})
+    told = verb("map", "merge", a, b, "--drive", "two", "--drive", "three", "-o", tmp_path / "c", "--json").json
+    assert states(told) == [("two", "two", "taken"), ("three", "three", "taken")]
+    assert "Drives: one, three, two" in verb("map", "merge", a, b, "--drive", "four", "-o", tmp_path / "c").error
 
 
 def test_another_library_is_refused_everywhere_and_nothing_is_written(verb: Verb, tmp_path: Path) -> None:

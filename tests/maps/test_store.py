@@ -12,8 +12,9 @@ import pyarrow.dataset as ds
 import pytest
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps import local
+from vplog.maps import local, pairs
 from vplog.maps import store as map_store
+from vplog.results.atomic import replacing
 
 from .runs import PLACES, make_map, put, seeds, write_run
 
@@ -169,6 +170,22 @@ def test_a_killed_removal_is_finished_and_a_half_removed_drive_is_none(root: Pat
     assert {path.name for name in map_store.TABLES for path in (root / name).iterdir()} == {"drive=two"}
     (store.run("two") / "drive.json").unlink()  # `rm -r` takes files in any order
     assert store.drives() == {}
+
+
+@pytest.mark.parametrize("name", ["поездка по городу " * 12, "京都" * 60, "a" * 240, "%" * 100])
+def test_a_drive_may_be_called_anything(tmp_path: Path, name: str) -> None:
+    root = make_map(tmp_path / "map", {name: 1, f"{name}2": 2})
+    store = map_store.Store(root)
+    assert list(store.drives()) == sorted([name, f"{name}2"])
+    assert seeds(store.run(f"{name}2")) == {2}
+    ledger = pairs.ledger_path(store, f"{name}2", name)
+    ledger.parent.mkdir(parents=True)
+    with replacing(ledger) as stream:
+        stream.write(b"ledger")
+    pairs.forget(store, f"{name}2", {name})
+    assert ledger.exists()
+    pairs.forget(store, f"{name}2", set())
+    assert not ledger.exists()
 
 
 def test_the_tables_are_a_data_set_by_drive(root: Path) -> None:
