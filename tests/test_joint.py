@@ -93,6 +93,15 @@ def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Ca
     assert "several drives" in verb("evaluate", joint, "--truth", "gps").error
 
 
+def test_verbs_of_one_drive_say_which_there_are(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    out = str(tmp_path / "out")
+    for asked in (
+        ("export", joint, "--format", "tum", "-o", out), ("report", joint), ("explain", joint, "--worst"),
+        ("map", "export", joint, "-o", out),
+    ):  # fmt: skip
+        assert f"{joint} holds 3 drives. Give one of them: {joint}/before" in verb(*asked).error
+
+
 def test_gps_of_several_drives_is_refused(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
     assert "one drive at a time" in verb("run", drive.log, drive.log, "-o", tmp_path, "--gps").error
 

@@ -13,6 +13,7 @@ import pytest
 
 from vplog import logs
 from vplog.errors import LogError, ResultError, SettingsError
+from vplog.record import library_at, library_of
 from vplog.remote import RemotePath, local_copy, local_output, located
 
 if TYPE_CHECKING:
@@ -147,6 +148,39 @@ def test_what_is_not_there_is_said_in_one_line(bucket: str, tmp_path: Path, verb
     refused = verb("info", "http://127.0.0.1:1/a.mcap")
     assert refused.code == 1
     assert "Cannot read http://127.0.0.1:1/a.mcap" in refused.error
+
+
+def test_a_single_file_is_sent(bucket: str, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    graph = tmp_path / "in.g2o"
+    graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    verb("optimize", graph, "-o", f"{bucket}/solved/out.g2o")
+    verb("optimize", graph, "-o", tmp_path / "out.g2o")
+    with located(f"{bucket}/solved/out.g2o").open("rb") as stream:
+        assert stream.read() == (tmp_path / "out.g2o").read_bytes()
+    for asked in (("map", "export", tmp_path), ("export", tmp_path, "--format", "tum"), ("report", tmp_path)):
+        said = verb(*asked, "-o", f"{bucket}/file")
+        assert said.code == 2
+        assert "must be a local file" in said.err
+
+
+def test_a_copy_is_known_by_what_it_is_of(bucket: str, tmp_path: Path) -> None:
+    (tmp_path / "library.json").write_text("{}")
+    put(tmp_path / "library.json", f"{bucket}/library")
+    with local_copy(located(f"{bucket}/library")) as folder:
+        assert library_of(folder) == f"{bucket}/library"
+        assert library_of(tmp_path) == str(tmp_path)
+    with library_at(tmp_path / "run", {"library": {"from": f"{bucket}/library"}}) as library:
+        assert (library / "library.json").read_text() == "{}"
+    with library_at(tmp_path / "run", {"library": {"from": str(tmp_path)}}) as library:
+        assert library == tmp_path
+    with pytest.raises(ResultError, match=r"library\.from"), library_at(tmp_path, {"library": 3}):
+        pass
+
+
+def test_a_run_by_url_is_begun_again(bucket: str, verb: Callable[..., Said]) -> None:
+    said = verb("run", "--resume", "-o", f"{bucket}/run")
+    assert said.code == 2
+    assert "sent when it is finished" in said.err
 
 
 def test_nothing_is_sent_of_what_failed(bucket: str) -> None:

@@ -29,6 +29,7 @@ from vplog.logs.frames import RecordedFrame
 from vplog.loops.propose import Proposals
 from vplog.parts import compute_part, cut, extract, missing_parts, parts_of, put_part, stored_features
 from vplog.pipeline import Pipeline, load_pipeline, run
+from vplog.record import begin_folder
 from vplog.stage_cache import StageCache, digest_of, inputs_of
 from vplog.stage_codecs import arrays_codec, closures_codec, images_codec
 from vplog.timing import Watch
@@ -457,6 +458,20 @@ print(*[name for name in sys.modules if name.split(".")[0] == "vplog"])
     assert loaded <= files.keys()
     assert {"cv2", "numpy", "mcap"} <= packages
     assert "gtsam" not in packages
+
+
+def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_is_given(tmp_path: Path) -> None:
+    out, pipeline = tmp_path / "out", load_pipeline("default", QUICK)
+    out.mkdir()
+    (out / ".run.json.123.part").write_text("{")
+    begin_folder(out, pipeline, tmp_path / "log", 1)
+    assert {file.name for file in out.iterdir()} == {"run.json"}
+    (out / "library").mkdir()
+    (out / "library" / "library.json").write_text("{}")
+    begin_folder(out, pipeline, tmp_path / "log", 1, out / "library")
+    assert (out / "library" / "library.json").exists()
+    begin_folder(out, pipeline, tmp_path / "log", 1)
+    assert not (out / "library").exists(), "an earlier run's"
 
 
 def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
