@@ -52,7 +52,7 @@ def export_map(arguments: argparse.Namespace) -> None:
 
 
 def merge_maps(arguments: argparse.Namespace) -> None:
-    """Take the drives of maps into another map that has the same library."""
+    """Take drives of maps, or places of exported files, into another map that has the same library."""
     from vplog.maps.merge import merge_maps as merge
 
     with Progress(arguments) as progress:
@@ -227,7 +227,9 @@ def add_maps(
     text = "take the drives of maps into another map"
     sub = maps.add_parser("merge", help=text, description=merge_maps.__doc__, parents=[common])
     sub.set_defaults(verb=merge_maps)
-    sub.add_argument("maps", type=place, nargs="+", metavar="MAP")
+    sub.add_argument(
+        "maps", type=place, nargs="+", metavar="MAP|FILE.parquet", help="maps, or places that `map export` wrote"
+    )
     sub.add_argument("--drive", action="append", default=[], metavar="ID", help="this one alone; may be given again")
     sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP", help="map that they go to")
     text = "what joins the drives of a map"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -17,7 +18,7 @@ from vplog.maps import store as map_store
 from vplog.results import tables
 from vplog.results.places_map import read_map
 
-from .runs import KIND, PLACES, make_map, put, put_library
+from .runs import KIND, LIBRARY, OTHER_LIBRARY, PLACES, make_map, put, put_library
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -125,3 +126,73 @@ def test_what_cannot_be_exported_is_one_line(root: Path, verb: Verb, tmp_path: P
         assert verb("map", "export", root, f"--box={box}", "-o", out).code == 2
     assert "no finished drive" in verb("map", "export", make_map(tmp_path / "empty", {}), "-o", out).error
     assert not out.exists()
+
+
+def test_an_exported_file_goes_into_a_map_with_its_library(root: Path, verb: Verb, tmp_path: Path) -> None:
+    """The same places in the same spots of the earth, found and exported as those of the map that they are from."""
+    out, other = tmp_path / "out.parquet", make_map(tmp_path / "other", {"near": 7})
+    verb("map", "export", root, "-o", out)
+    told = verb("map", "merge", out, "-o", other, "--json").json
+    assert [(one["drive"], one["as"], one["state"]) for one in told["drives"]] == [
+        ("far", "far", "taken"), ("near", "near-2", "taken"), ("nowhere", "nowhere", "taken"),
+    ]  # fmt: skip
+    store = map_store.Store(other)
+    for drive, taken in (("far", "far"), ("near", "near-2"), ("nowhere", "nowhere")):
+        run, own = store.run(taken), root / "runs" / f"drive={drive}"
+        (keyframes, world), (known, there) = (tables.read_keyframes(at / "keyframes.parquet") for at in (run, own))
+        assert keyframes.drive == taken
+        np.testing.assert_array_equal(keyframes.stamp_ns, known.stamp_ns)
+        np.testing.assert_allclose(world, there, atol=1e-12)
+        column, library = tables.read_descriptors(run / "descriptors.parquet")
+        assert column.equals(tables.read_descriptors(own / "descriptors.parquet")[0])
+        assert library == LIBRARY
+        assert len(tables.read_closures(run / "closures.parquet")) == 0
+        assert store.earth(taken) is not None or drive == "nowhere"
+    again = verb("map", "merge", out, root, "-o", other, "--json").json
+    assert {one["state"] for one in again["drives"]} == {"there already"}
+    for folder in (root, other):
+        verb("map", "export", folder, "--format", "geoparquet", "-o", folder / "geo.parquet")
+    np.testing.assert_allclose(points(other / "geo.parquet"), points(root / "geo.parquet"), atol=1e-9)
+    told = verb("map", "info", other, "--json").json
+    assert [one["keyframes"] for one in told["drives"]] == [PLACES] * 4
+    assert "out.parquet" in told["drives"][0]["warnings"][0]
+
+
+def test_a_part_of_a_map_goes_by_file(root: Path, verb: Verb, tmp_path: Path) -> None:
+    whole, out, other = tmp_path / "whole.parquet", tmp_path / "out.parquet", make_map(tmp_path / "other", {"x": 7})
+    verb("map", "export", root, "--format", "geoparquet", "-o", whole)
+    near = np.array([drive == "near" for drive, _ in places(whole)])
+    middle = float(np.median(points(whole)[near, 0]))
+    verb("map", "export", root, f"--box=-90,{middle!r},90,180".replace("np.float64(", ""), "-o", out)
+    inside = [place for place in places(out) if place[0] == "near"]
+    assert 0 < len(inside) < PLACES
+    verb("map", "merge", out, "--drive", "near", "-o", other)
+    store = map_store.Store(other)
+    assert list(store.drives()) == ["near", "x"]
+    assert store.rows("descriptors", "near") == len(inside)
+
+
+def test_files_that_are_no_export_or_of_another_library_are_one_line(root: Path, verb: Verb, tmp_path: Path) -> None:
+    out, other = tmp_path / "out.parquet", make_map(tmp_path / "other", {"x": 7}, OTHER_LIBRARY)
+    verb("map", "export", root, "-o", out)
+    assert "do not compare" in verb("map", "merge", out, "-o", other).error
+    assert "without their library" in verb("map", "merge", out, "-o", tmp_path / "new").error
+    assert not (tmp_path / "new").exists()
+    assert (
+        "not a file of places"
+        in verb("map", "merge", root / "keyframes/drive=near/keyframes.parquet", "-o", root).error
+    )
+    (tmp_path / "text").write_text("no table")
+    assert "cannot be read" in verb("map", "merge", tmp_path / "text", "-o", root).error
+    table = pq.read_table(out)
+    mine = make_map(tmp_path / "mine", {"x": 7})
+    for damaged, why in (
+        (pa.concat_tables([table, table]), "two stretches"), (table.drop_columns(["stamp_ns"]), "cannot be read"),
+        (table.slice(PLACES), "no place of far"), (table.take(list(range(PLACES))[::-1]), "do not increase"),
+    ):  # fmt: skip
+        pq.write_table(damaged, out)
+        assert why in verb("map", "merge", out, "-o", mine).error
+        with map_store.writing(mine) as store:
+            for drive in store.drives():
+                if drive != "x":
+                    map_store.remove(store, drive)

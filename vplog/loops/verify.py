@@ -199,3 +199,14 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
         residual_after=np.full(count, np.nan),
         weight=np.full(count, np.nan),
     )
+
+
+def no_closures() -> Closures:
+    """The ledger of a drive without candidates."""
+    rows, shares, none = np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0)
+    return Closures(
+        query=rows, match=rows, rank=rows, score=shares, support=rows, shared_references=[], shared_overlap=[],
+        matches=rows, landmarks=rows, inliers=rows, spread=shares, reverse_inliers=rows, scale=[],
+        match_from_query=np.empty((0, 4, 4)), information=np.empty((0, 6, 6)), verdict=[], residual_before=none,
+        residual_after=none, weight=none,
+    )  # fmt: skip

@@ -14,7 +14,7 @@ from vplog.maps.earth import earth_of_run, inside
 from vplog.remote import local_copy
 from vplog.results import tables
 from vplog.results.geo import on_earth
-from vplog.results.places_map import names_of, read_places, write_map, write_places
+from vplog.results.places_map import about_run, names_of, read_places, write_map, write_places
 from vplog.results.run_record import read_single_run
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ _PLACES = ("keyframes.parquet", "descriptors.parquet")
 class _Source:
     """The drives that may be written, each read alone."""
 
-    names: Sequence[str]
+    drives: dict[str, dict[str, Any]]
+    """By ID, with what the file's header says of each."""
     earth: Callable[[str], Earth | None]
     """Where on earth a drive is."""
     read: Callable[[str, Callable[[Path], Any], Sequence[str]], Any]
@@ -67,8 +68,13 @@ def export_map(
             unknown = [drive for drive in drives if drive not in known]
             if unknown:
                 raise SettingsError(f"{store} has no drive {unknown[0]!r}. Drives: {', '.join(known)}.")
-            names = [drive for drive in known if drive in drives or not drives]
-            return _write(path, _Source(names, store.earth, store.read, store.forget), box, kind, progress)
+            about = ("inputs", "topics", "earth")
+            chosen = {
+                drive: {name: record[name] for name in about if record.get(name) is not None}
+                for drive, record in known.items()
+                if drive in drives or not drives
+            }
+            return _write(path, _Source(chosen, store.earth, store.read, store.forget), box, kind, progress)
     if drives:
         raise SettingsError("--drive chooses among the drives of a map, and what is given are runs. Leave it out.")
     with ExitStack() as stack:
@@ -79,16 +85,17 @@ def export_map(
             return {**write_map(path, folders), "left_out": []}
         run = dict(zip(names_of(folders), folders, strict=True))
         source = _Source(
-            list(run), lambda drive: earth_of_run(run[drive]), lambda drive, of, _: of(run[drive]), lambda _: None
-        )
+            {drive: about_run(folder) for drive, folder in run.items()}, lambda drive: earth_of_run(run[drive]),
+            lambda drive, of, _: of(run[drive]), lambda _: None,
+        )  # fmt: skip
         return _write(path, source, box, kind, progress)
 
 
 def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Progress) -> dict[str, Any]:
     if box is None and kind == "parquet":
-        return {**write_places(path, source.names, _places(source, {}, box, progress)), "left_out": []}
-    earths = {drive: source.earth(drive) for drive in source.names}
-    left_out = [drive for drive in source.names if earths[drive] is None]
+        return {**write_places(path, source.drives, _places(source, {}, box, progress)), "left_out": []}
+    earths = {drive: source.earth(drive) for drive in source.drives}
+    left_out = [drive for drive in source.drives if earths[drive] is None]
     placed = {drive: earth for drive, earth in earths.items() if earth is not None}
     low, high, written = np.full(3, np.inf), np.full(3, -np.inf), {}
     for drive, earth in placed.items():  # where they are comes first in a file, and takes the poses alone
@@ -102,17 +109,17 @@ def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Pr
             written[drive] = earth
             low, high = np.minimum(low, where.min(0)), np.maximum(high, where.max(0))
     if not written:
-        nowhere = f" {len(left_out)} of {len(source.names)} drives have no place on earth." if left_out else ""
+        nowhere = f" {len(left_out)} of {len(source.drives)} drives have no place on earth." if left_out else ""
         asked = "in the box" if box is not None else "to write"
         raise ResultError(f"There is no place {asked}, so {path} is not written.{nowhere}")
     bounds = (low, high) if kind == "geoparquet" else None
-    found = write_places(path, source.names, _places(source, written, box, progress), bounds)
-    return {**found, "drives": list(written), "left_out": left_out}
+    drives = {drive: source.drives[drive] for drive in written}
+    return {**write_places(path, drives, _places(source, written, box, progress), bounds), "left_out": left_out}
 
 
 def _places(source: _Source, earths: dict[str, Earth], box: Box | None, progress: Progress) -> Iterator[DrivePlaces]:
     """The places of drives, one drive after the other; with their points where they are told where it is."""
-    drives = list(earths or source.names)
+    drives = list(earths or source.drives)
     for number, drive in enumerate(drives):
         places = source.read(drive, lambda run, drive=drive: read_places(run, drive), _PLACES)
         if earths:

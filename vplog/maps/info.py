@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.imports import ALONE
 from vplog.maps.joint_record import components_in
 from vplog.maps.store import other_library
 from vplog.places.stored import read_library_record
@@ -38,7 +39,7 @@ def _describe(store: Store) -> dict[str, Any]:
     for drive, about in abouts.items():
         if about["library"] != head.library:
             problems.append(other_library(store, drive, about["library"], head.library))
-        if (about.get("settings"), about.get("code")) != now:
+        if (about.get("settings"), about.get("code")) != now and ALONE not in about:
             other.append(about["log"])
     with ThreadPoolExecutor(_READ_AT_ONCE if store.mirror else 1) as pool:
         drives = list(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.imports import drives_of_file, library_of_file, take_places
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def merge_maps(
     sources: Sequence[Path], target: Path, progress: Progress = lambda *_: None, chosen: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; what became of
-    each.
+    each. Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
 
     Maps in the order given, the drives of each in order of their IDs. One whose log is in the map already, by its
     content, is left out; one whose ID is taken gets a number. Each is in whole or not at all, so a merge that was
@@ -42,6 +43,9 @@ def merge_maps(
         there = store.drives()
         known, names = {_content(record): drive for drive, record in there.items()}, set(there)
         for number, source in enumerate(sources):
+            if source.is_file():
+                fate += _take_file(store, source, known, names, chosen)
+                continue
             with map_store.reading(source) as other:
                 _, drives = map_store.one_library(other)
                 _take_library(store, other, library)
@@ -58,8 +62,15 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
         with map_store.reading(target) as store:
             wanted = map_store.one_library(store)[0] if store.drives() else store.head().library
     for source in sources:
-        with map_store.reading(source) as other:
-            found, _ = map_store.one_library(other)
+        if source.is_file():
+            found = library_of_file(source)
+        else:
+            with map_store.reading(source) as other:
+                found, _ = map_store.one_library(other)
+        if wanted is None and source.is_file():
+            raise LibraryError(
+                f"{source} holds places without their library {found[:12]}. Name a map that has it first, or as -o."
+            )
         if wanted is None:
             wanted, whose = found, str(source)
         if found != wanted:
@@ -74,6 +85,9 @@ def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
     """Raises SettingsError where no map has a drive that is asked for."""
     known: set[str] = set()
     for source in sources if chosen else ():
+        if source.is_file():
+            known |= drives_of_file(source).keys()
+            continue
         with map_store.reading(source) as other:
             known |= other.drives().keys()
     unknown = [drive for drive in chosen if drive not in known]
@@ -119,6 +133,27 @@ def _take(
     known[_content(record)] = taken
     names.add(taken)
     return {**told, "as": taken, "state": "taken"}
+
+
+def _take_file(
+    store: Store, source: Path, known: dict[str, str], names: set[str], chosen: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The places of an exported file; what became of each drive, as `_take` says it."""
+    fate, wanted = [], dict[str, str]()
+    for drive, record in drives_of_file(source).items():
+        if chosen and drive not in chosen:
+            continue
+        same, taken = known.get(_content(record)), keys.free_name(drive, drive, names)
+        fate.append({"from": str(source), "drive": drive, "as": same or taken, "log": record["log"]})
+        fate[-1]["state"] = "taken" if same is None else "there already"
+        if same is None:
+            wanted[drive] = known[_content(record)] = taken
+            names.add(taken)
+    done = set(take_places(store, source, wanted))
+    lost = [drive for drive in wanted if drive not in done]
+    if lost:
+        raise ResultError(f"{source} has no place of {lost[0]}, which its header names.")
+    return fate
 
 
 def _content(record: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,11 +18,11 @@ import pyarrow.parquet as pq
 
 from vplog import geometry
 from vplog.errors import ResultError
-from vplog.results import geo, tables
+from vplog.results import geo, run_record, tables
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from vplog.data import Floats, Int32s, Ints
@@ -86,13 +86,27 @@ def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:
     Raises ResultError where the descriptors were not made with one library, and so do not compare, or where two
     drives bear one name.
     """
-    return write_places(path, names_of(folders), (read_places(folder) for folder in folders))
+    drives = {name: about_run(folder) for name, folder in zip(names_of(folders), folders, strict=True)}
+    return write_places(path, drives, (read_places(folder) for folder in folders))
+
+
+def about_run(folder: Path) -> dict[str, Any]:
+    """What the header says of a drive: the content of its log, the topics that were asked for, and where it is, as
+    drive.json has it in a map; of a run elsewhere the first two, by run.json."""
+    records = [folder / name for name in ("drive.json", "run.json") if (folder / name).is_file()]
+    account = run_record.read_run_json(records[0]) if records else {}
+    topics = account.get("topics")
+    known = {"inputs": account.get("inputs"), "earth": account.get("earth")}
+    known["topics"] = {k: v for k, v in topics.items() if not k.endswith("_file")} if isinstance(topics, dict) else None
+    return {name: known[name] for name in ("inputs", "topics", "earth") if known[name] is not None}
 
 
 def write_places(
-    path: Path, names: Sequence[str], parts: Iterable[DrivePlaces], bounds: tuple[Floats, Floats] | None = None
-) -> dict[str, Any]:
-    """One row for every place, one drive in memory at a time; what was written. `names` are those of all drives.
+    path: Path, drives: Mapping[str, dict[str, Any]], parts: Iterable[DrivePlaces],
+    bounds: tuple[Floats, Floats] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """One row for every place, one drive in memory at a time; what was written. `drives` are all of them, with what is
+    known of each, which goes into the header.
 
     With the bounds of their points, (3,) each as `where` has them, the file is GeoParquet 1.1 too, whose header comes
     first. Raises ResultError as above, where there is no place at all, and where one is beyond the bounds.
@@ -101,12 +115,14 @@ def write_places(
     first = next(rest, None)
     if first is None:
         raise ResultError("There is no place to write.")
+    names = list(drives)
     kind, library = first.descriptors.type, first.header.get("vplog.library", "")
     described = list(_parts(kind, ""))
     columns = [pa.field(name, _stored(part), False) for name, part in described]
     about = {
         **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
         "vplog.table": "map",
+        "vplog.drives": json.dumps(drives, sort_keys=False),
         "vplog.descriptor": json.dumps([_described(name, part) for name, part in described]),
         **({} if bounds is None else geo.geo_header(*bounds)),
     }
@@ -132,7 +148,7 @@ def write_places(
                 arrays.append(geo.points(part.where))
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=ROWS_PER_GROUP)
             places += len(part.keyframe)
-    return {"written": str(path), "drives": list(names), "places": places, "library": library}
+    return {"written": str(path), "drives": names, "places": places, "library": library}
 
 
 def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
@@ -161,6 +177,80 @@ def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
         )
     columns = iter([_unpacked(table[name].combine_chunks(), part) for name, part in parts])
     return table.select(PLACE.names), _joined(kind, columns)
+
+
+@dataclass(frozen=True)
+class AboutMap:
+    """What the header of a map of places says."""
+
+    library: str
+    settings: dict[str, Any]
+    descriptor: str
+    """How its columns are to be taken, as JSON."""
+    drives: dict[str, dict[str, Any]]
+    """Of each drive, in order, what is known of it: `inputs`, `topics`, `earth`."""
+
+
+def about_map(path: Path) -> AboutMap:
+    """The header of a map of places. Raises ResultError where it is none."""
+    try:
+        header = {key.decode(): value.decode() for key, value in (pq.read_schema(path).metadata or {}).items()}
+        settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
+    except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
+        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+    sound = isinstance(settings, dict) and isinstance(drives, dict)
+    sound = sound and all(isinstance(told, dict) for told in drives.values())
+    if header.get("vplog.table") != "map" or not sound:
+        raise ResultError(
+            f"{path} is not a file of places with its drives. Write one: vplog map export MAP -o FILE.parquet"
+        )
+    return AboutMap(header.get("vplog.library", ""), settings, header.get("vplog.descriptor", ""), drives)
+
+
+def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
+    """The places of a map drive by drive, one of them in memory at a time. Raises ResultError where it is damaged, of
+    another recogniser, or where a drive comes twice."""
+    parts, about = list(_parts(kind, "")), about_map(path)
+    if about.descriptor != json.dumps([_described(*part) for part in parts]):
+        raise ResultError(f"{path} is not a map of places of this recogniser.")
+    schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])
+    done, waiting = set[str](), list[pa.Table]()
+    try:
+        with pq.ParquetFile(path) as file:
+            for number in range(file.num_row_groups):
+                table = file.read_row_group(number, columns=schema.names).cast(schema)
+                for drive, rows in _stretches(table):
+                    if waiting and waiting[0]["drive"][0].as_py() != drive:
+                        yield _places_of(waiting, path, parts, kind)
+                        waiting = []
+                    if drive in done and not waiting:
+                        raise ResultError(f"{path} holds the places of {drive} in two stretches.")
+                    done.add(drive)
+                    waiting.append(rows)
+        if waiting:
+            yield _places_of(waiting, path, parts, kind)
+    except (OSError, ValueError, KeyError, pa.ArrowException) as error:
+        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+
+
+def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
+    """Rows of one drive after the other."""
+    drives = table["drive"].cast(pa.string()).to_pylist()
+    at = 0
+    for drive, rows in groupby(drives):
+        count = sum(1 for _ in rows)
+        yield drive, table.slice(at, count)
+        at += count
+
+
+def _places_of(tables_of_drive: list[pa.Table], path: Path, parts: list[Any], kind: pa.DataType) -> DrivePlaces:
+    table = pa.concat_tables(tables_of_drive).combine_chunks()
+    columns = iter([_unpacked(table[name].combine_chunks(), part) for name, part in parts])
+    values = {name: table[name].to_numpy() for name in PLACE.names if name != "drive"}
+    moved = np.stack([values[f"world_{name}"] for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")], 1)
+    poses = geometry.pose(geometry.rotation(moved[:, 3:]), moved[:, :3])
+    drive = table["drive"][0].as_py()
+    return DrivePlaces(drive, path, values["keyframe"], values["stamp_ns"], poses, _joined(kind, columns), {})
 
 
 def names_of(folders: Sequence[Path]) -> list[str]:

@@ -384,6 +384,14 @@ def read_descriptors(path: Path) -> tuple[pa.Array, str]:
     return column, (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
 
 
+def descriptors_type(path: Path) -> pa.DataType:
+    """The recogniser's own type of a table of descriptors, of which the footer alone is read. Raises ResultError."""
+    try:
+        return pq.read_schema(path).field("descriptor").type
+    except (OSError, KeyError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
+
+
 def read_metadata(path: Path) -> dict[str, str]:
     """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
     try:
