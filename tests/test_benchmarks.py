@@ -62,7 +62,7 @@ def test_search_and_growth() -> None:
 def test_scale(tmp_path: Path) -> None:
     """On a map of two drives, made once."""
     for graphs in (False, True):
-        figures = list(scale(3000, tmp_path, queries=4, threads=2, graphs=graphs))
+        figures = list(scale(3000, tmp_path, queries=4, threads=2, codes=graphs, vectors=graphs))
         assert len(figures) == 3 + 2 * graphs
         assert figures[0].facts["drives"] == 2
         assert figures[1].facts["exact"] is True

@@ -80,7 +80,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--poses", type=int, nargs="+", default=[100_000, 1_000_000], help="of the large pose graphs")
     parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
     parser.add_argument("--folder", type=Path, help="keep the map of `scale` here (default: made anew, then removed)")
-    parser.add_argument("--vectors", action="store_true", help="`scale` beside graphs of codes and vectors, too")
+    parser.add_argument("--codes", action="store_true", help="`scale` beside a graph of codes, too")
+    parser.add_argument("--vectors", action="store_true", help="`scale` beside a graph of vectors, too")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=[], help="parts of `batch`")
     parser.add_argument("--kills", type=int, default=10, help="of a batch, at random moments")
     parser.add_argument("--set", nargs="+", default=[], metavar="A.B=C", help="settings of the drives of `batch`")
@@ -113,7 +114,7 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "scale" in what:
         with tempfile.TemporaryDirectory() as made:
             folder = arguments.folder or Path(made)
-            yield from scale(arguments.places, folder, 20, os.cpu_count() or 1, arguments.vectors)
+            yield from scale(arguments.places, folder, 20, os.cpu_count() or 1, arguments.codes, arguments.vectors)
     if "reading" in what:
         yield from reading(rounds, *READING_BARS, (SMALL_GB, LARGE_GB))
     if "graphs" in what:

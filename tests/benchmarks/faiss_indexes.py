@@ -28,15 +28,16 @@ _TOLD_S = 10.0
 """Between two lines about a graph that is built."""
 
 
-def faiss_indexes(count: int, queries: int, threads: int, graphs: bool) -> Iterator[Figure]:
+def faiss_indexes(count: int, queries: int, threads: int, codes: bool, vectors: bool) -> Iterator[Figure]:
     """What faiss takes. Codes and vectors of a drive change step by step, as places do: unrelated ones are the worst
     that a graph can be given."""
     kinds: dict[str, tuple[Callable[[], Any], int]] = {"IndexBinaryFlat": (lambda: faiss.IndexBinaryFlat(BITS), 1)}
-    if graphs:
+    if codes:
         kinds["IndexBinaryHNSW"] = (lambda: faiss.IndexBinaryHNSW(BITS, _LINKS["IndexBinaryHNSW"]), 1)
+    if vectors:
         fits = count * _bytes_per_place("IndexHNSWFlat", 32) < _ROOM * 1e9 * free_memory_gb()
-        vectors, wide = ("IndexHNSWFlat", 32) if fits else ("IndexHNSWSQ", 16)
-        kinds[vectors] = (lambda: _graph_of_vectors(vectors, count), wide)
+        graph, wide = ("IndexHNSWFlat", 32) if fits else ("IndexHNSWSQ", 16)
+        kinds[graph] = (lambda: _graph_of_vectors(graph, count), wide)
     for name, (make, wide) in kinds.items():
         index = make()
         spent, cpu, asked, best = _filled(index, name, count, queries, threads, wide == 1)
@@ -71,7 +72,8 @@ def _graph_of_vectors(name: str, count: int) -> Any:
     if name == "IndexHNSWFlat":
         index = faiss.IndexHNSWFlat(FLOATS, _LINKS[name], faiss.METRIC_INNER_PRODUCT)
     else:
-        index = faiss.IndexHNSWSQ(FLOATS, faiss.ScalarQuantizer.QT_fp16, _LINKS[name], faiss.METRIC_INNER_PRODUCT)
+        half: Any = faiss.ScalarQuantizer.QT_fp16  # the stubs know another constructor
+        index = faiss.IndexHNSWSQ(FLOATS, half, _LINKS[name], faiss.METRIC_INNER_PRODUCT)
         index.is_trained = True  # nothing is learned for these
     storage = cast("Any", faiss.downcast_index(index.storage))
     storage.codes.resize(storage.code_size * count)

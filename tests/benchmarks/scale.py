@@ -41,9 +41,10 @@ _CHECKED = 4
 """Queries whose best places are compared with those of a full sort."""
 
 
-def scale(count: int, folder: Path, queries: int, threads: int, graphs: bool) -> Iterator[Figure]:
+def scale(count: int, folder: Path, queries: int, threads: int, codes: bool, vectors: bool) -> Iterator[Figure]:
     """Build time, bytes, latency and exactness of a map of `count` places, made in `folder` unless it is there, and
-    what scans and graphs of codes and vectors take on the same machine. `graphs` are slow to build: of 10^6 minutes."""
+    what a scan of codes takes on the same machine, and graphs of `codes` and `vectors`, slow to build: of 10^6 minutes.
+    """
     settings = BobbSettings()
     state = made_up_library(settings)
     store = Store(folder / f"map-{count}")
@@ -54,7 +55,7 @@ def scale(count: int, folder: Path, queries: int, threads: int, graphs: bool) ->
     parts = _parts(store, state, threads)
     exact = are_exact(store, state, parts, asked[:_CHECKED])
     yield _searching(state, parts, asked, threads, {"cold_ms": cold, "checked": _CHECKED, "exact": exact})
-    yield from faiss_indexes(count, queries, threads, graphs)
+    yield from faiss_indexes(count, queries, threads, codes, vectors)
 
 
 def made_up_library(settings: BobbSettings, references: int = LIBRARY) -> BobbState:
