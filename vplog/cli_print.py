@@ -178,7 +178,11 @@ def print_map(found: dict[str, Any]) -> None:
         f"{found['map']}: {len(found['drives'])} drives, {found['places']} places{each}, {found['bytes'] / 1e6:.1f} MB"
     )
     print(f"library   {known['hash'] or 'none yet'}, {known['references'] or 0} references")
-    print(f"on earth  {found['on_earth']} of {len(found['drives'])} drives")
+    boxes = [drive["bounds"] for drive in found["drives"] if drive["bounds"]]
+    sides = zip((min, min, max, max), zip(*boxes, strict=True), strict=False)  # no side where there is no box
+    where = ",".join(f"{most(side):.5f}" for most, side in sides)
+    around = f", within {where} (south, west, north, east)" if boxes else ""
+    print(f"on earth  {found['on_earth']} of {len(found['drives'])} drives{around}")
     if found["components"] is not None:
         joined = sum(len(one["drives"]) for one in found["components"])
         groups = len(found["components"])

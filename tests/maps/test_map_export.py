@@ -148,6 +148,16 @@ def test_an_exported_file_goes_into_a_map_with_its_library(root: Path, verb: Ver
         assert library == LIBRARY
         assert len(tables.read_closures(run / "closures.parquet")) == 0
         assert store.earth(taken) is not None or drive == "nowhere"
+    about = {one["drive"]: one["bounds"] for one in verb("map", "info", root, "--json").json["drives"]}
+    assert about["nowhere"] is None
+    west = {drive: bounds[1] for drive, bounds in about.items() if bounds}
+    assert west["far"] > west["near"] + 0.03
+    drives = verb("map", "info", other, "--json").json["drives"]
+    assert {one["drive"]: one["bounds"] for one in drives if one["drive"] != "near"} == {
+        "far": about["far"], "near-2": about["near"], "nowhere": None,
+    }  # fmt: skip
+    verb("map", "export", root, "--box=" + ",".join(map(str, about["near"])), "-o", tmp_path / "near.parquet")
+    assert {drive for drive, _ in places(tmp_path / "near.parquet")} == {"near"}
     again = verb("map", "merge", out, root, "-o", other, "--json").json
     assert {one["state"] for one in again["drives"]} == {"there already"}
     for folder in (root, other):

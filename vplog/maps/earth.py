@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.results import mcap_read, run_record, tables
+from vplog.results.geo import on_earth
 from vplog.results.shown import Earth
 from vplog.show import earth_of
 
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
 
     Box = tuple[float, float, float, float]
     """South, west, north, east in degrees; west of more than east crosses the antimeridian."""
+
+
+_DECIMALS = 7
+"""Of a degree: a centimetre."""
 
 
 def earth_of_run(folder: Path) -> Earth | None:
@@ -36,9 +41,28 @@ def earth_of_run(folder: Path) -> Earth | None:
     return earth_of(trajectory, fixes, known)
 
 
-def earth_as_plain(earth: Earth | None) -> dict[str, Any] | None:
-    """As drive.json has it."""
-    return None if earth is None else {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
+def earth_as_plain(earth: Earth | None, world_from_body: Floats) -> dict[str, Any] | None:
+    """As drive.json has it; with the bounds of a drive's poses (N, 4, 4), south, west, north, east in degrees."""
+    if earth is None:
+        return None
+    told = {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
+    if not len(world_from_body):
+        return told
+    where = on_earth(earth, world_from_body)[:, [1, 0]]
+    return {**told, "bounds": np.round([*where.min(0), *where.max(0)], _DECIMALS).tolist()}
+
+
+def earth_of_made(folder: Path) -> dict[str, Any] | None:
+    """Of a finished run folder what its drive.json says. Raises ResultError."""
+    earth = earth_of_run(folder)
+    return None if earth is None else earth_as_plain(earth, tables.read_keyframes(folder / "keyframes.parquet")[1])
+
+
+def bounds_of(told: Any) -> list[float] | None:
+    """South, west, north, east by drive.json; None where it does not say."""
+    bounds = told.get("bounds") if isinstance(told, dict) else None
+    sound = isinstance(bounds, list) and len(bounds) == 4 and all(isinstance(one, float | int) for one in bounds)
+    return bounds if sound else None
 
 
 def earth_from_plain(told: Any) -> Earth | None:

@@ -18,6 +18,7 @@ from vplog.errors import LibraryError, ResultError
 from vplog.loops.verify import no_closures
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.earth import earth_as_plain, earth_from_plain
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.places_map import about_map, read_drives
@@ -60,8 +61,9 @@ def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[st
         made.mkdir()
         record = _record(path, about, places.drive, about.drives.get(places.drive, {}))
         _write_run(made, places, taken, about, kind)
-        record = {**record, "drive": taken}
-        run_record.write_run_json(made / "drive.json", {**record, "key": keys.key_of(record)})
+        earth = earth_as_plain(earth_from_plain(record["earth"]), places.world_from_body)
+        record = {**record, "drive": taken, "earth": earth}
+        run_record.write_run_json(made / "drive.json", {**record, "key": keys.key_of(record | {"earth": None})})
         map_store.publish(store, taken, made)
         yield places.drive
 

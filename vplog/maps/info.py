@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.earth import bounds_of
 from vplog.maps.imports import ALONE
 from vplog.maps.joint_record import components_in
 from vplog.maps.store import other_library
@@ -87,6 +88,7 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
             "candidates": store.rows("closures", drive),
             "accepted": record.get("counts", {}).get("verdicts", {}).get("accepted", 0),
             "on_earth": store.earth(drive) is not None,
+            "bounds": bounds_of(about.get("earth")),
             "descriptor_bytes": sizes.get("descriptors.parquet", 0),
             "descriptor_bits": record.get("descriptor_bits"),
             "bytes": sum(sizes.values()),

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 import vplog
 from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps import local
-from vplog.maps.earth import earth_as_plain, earth_from_plain, earth_of_run
+from vplog.maps.earth import earth_from_plain, earth_of_made, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
@@ -277,7 +277,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
     """
     about = drive_record(made)
     if "earth" not in about:
-        run_record.write_run_json(made / "drive.json", {**about, "earth": earth_as_plain(earth_of_run(made))})
+        run_record.write_run_json(made / "drive.json", {**about, "earth": earth_of_made(made)})
     if store.mirror is None:
         local.publish(store, drive, made)
         return
