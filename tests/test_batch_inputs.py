@@ -5,16 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from vplog import batch_inputs
 from vplog.batch_inputs import known_hashes
 from vplog.logs import TopicChoice
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture
@@ -113,6 +111,25 @@ def test_the_record_forgets_logs_that_are_gone(logs: dict[str, Path], tmp_path: 
         str(tmp_path / name) for name in ("two.mcap", "folder", "three.mcap")
     }
     assert read[3:] == ["three.mcap"]
+
+
+def test_a_log_of_the_record_that_cannot_be_asked_for_stops_nothing(
+    logs: dict[str, Path], tmp_path: Path, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is in a folder that is closed now."""
+    record, closed = tmp_path / ".inputs.json", logs.pop("one.mcap")
+    asked({"one.mcap": closed}, record)
+    stat = Path.stat
+
+    def refused(path: Path, **how: Any) -> Any:
+        if path == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, **how)
+
+    monkeypatch.setattr(Path, "stat", refused)
+    assert asked(logs, record)[1] == {}
+    assert len(json.loads(record.read_text())) == 3
+    assert read == ["one.mcap", "two.mcap", "folder"]
 
 
 def test_a_record_that_cannot_be_written_is_done_without(logs: dict[str, Path], tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from vplog.engine import RETRIES, LocalEngine, computed, opened
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.imports import ALONE
 from vplog.maps.join import join as join_drives
 from vplog.maps.join import load_places
 from vplog.maps.layout import folder_name
@@ -80,7 +81,12 @@ def settings_for(root: Path, name: str | None = None, assignments: Sequence[str]
     `a.b=c` overrides. Raises SettingsError, ResultError."""
     if name is None and (root / "map.json").exists():
         with map_store.reading(root) as store:
-            return pipeline_from(store.head().settings, f"{store}/map.json", assignments)
+            head = store.head()
+        if head.library is not None:  # there may be drives
+            try:
+                return pipeline_from(head.settings, f"{root}/map.json", assignments)
+            except SettingsError as error:
+                raise SettingsError(f"{error} Or choose other settings than the map's: --pipeline default.") from None
     return load_pipeline(name or "default", assignments)
 
 
@@ -194,7 +200,8 @@ def tell_failures(store: Store, done: Mapping[str, Drive]) -> None:
 
 def _mixed(others: Sequence[dict[str, Any]], alike: dict[str, Any]) -> list[str]:
     """A warning where drives that are no part of this batch were made with other settings."""
-    other = [about["log"] for about in others if about.get("settings") != alike["settings"]]
+    made = [about for about in others if ALONE not in about]
+    other = [about["log"] for about in made if about.get("settings") != alike["settings"]]
     return [_OTHER.format(count=len(other), first=other[0])] if other else []
 
 

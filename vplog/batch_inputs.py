@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
@@ -16,6 +16,7 @@ from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from vplog.logs import TopicChoice
 
@@ -89,6 +90,6 @@ def _read(record: Path) -> dict[str, dict[str, Any]]:
 
 def _write(record: Path, known: dict[str, dict[str, Any]]) -> None:
     """Of all logs that are still there."""
-    there = {name: about for name, about in sorted(known.items()) if Path(name).exists()}
+    there = {name: about for name, about in sorted(known.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
     with suppress(ResultError), replacing(record) as stream:
         stream.write(json.dumps(there, separators=(",", ":")).encode())

@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except KeyboardInterrupt:
-        say("interrupted; what was finished is kept, and the same command goes on from there")
+        say("interrupted; nothing is lost of what was finished in the output folder")
         sys.exit(130)
     except VplogError as error:
         _fail(arguments, str(error))

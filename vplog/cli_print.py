@@ -221,9 +221,9 @@ def print_merge(found: dict[str, Any]) -> None:
     for one in found["drives"]:
         other = "" if one["as"] == one["drive"] else f" as {one['as']}"
         print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
-    taken = sum(one["state"] == "taken" for one in found["drives"])
+    taken = sum(one["state"] != "there already" for one in found["drives"])
     print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
-    if taken:
+    if any(one["state"] == "taken" for one in found["drives"]):
         print(f"What joins them: vplog map join {found['map']}")
 
 

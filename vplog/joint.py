@@ -103,7 +103,7 @@ def run_joint(
             **record.head(pipeline, paths[0], threads),
             **record.logs_of(paths),
             "finished": True,
-            "library": {"hash": state.hash, "from": str(library)},
+            "library": {"hash": state.hash, "from": record.library_of(library)},
             **_told(drives, pairs, judged, joined),
             "stages": watch.stages,
             "totals": watch.totals(),

@@ -34,9 +34,13 @@ class OwnProcess:
         self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _end_with_parent)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._loaded = self._pool.submit(_load)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            try:
+                self._loaded = self._pool.submit(_load)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)  # where a Ctrl-C that waited is raised
+        except BaseException:
+            self.end()
+            raise
 
     def run(self, function: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
         """Call it there, and end the process. Raises BrokenExecutor where that was killed."""
@@ -57,7 +61,7 @@ class OwnProcess:
 
     def end(self) -> None:
         """Without a task."""
-        for child in list(self._pool._processes.values()):  # kill_workers of Python 3.14
+        for child in list((self._pool._processes or {}).values()):  # kill_workers of Python 3.14
             child.kill()
         self._pool.shutdown()
 
@@ -86,8 +90,7 @@ class OwnProcesses(ThreadPoolExecutor):
         self._unfinished: set[Future[Any]] = set()
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        future = super().submit(self._run, fn, args, kwargs)
-        self._unfinished.add(future)
+        self._unfinished.add(future := super().submit(self._run, fn, args, kwargs))
         future.add_done_callback(self._unfinished.discard)
         return future
 

@@ -14,6 +14,7 @@ from vplog.engine import RETRIES
 from vplog.errors import SettingsError
 from vplog.libraries import build_library
 from vplog.maps import store as map_store
+from vplog.maps.imports import ALONE
 from vplog.maps.merge import in_order
 from vplog.pipeline import Pipeline
 from vplog.places.stored import read_library_record
@@ -60,7 +61,11 @@ def redescribe_map(
         if located(log).exists():
             groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
         else:
-            why = f"Its log {log} is not there any more. Put it back, and give the same command again."
+            why = (
+                "Places alone are known of it. Put its log into the map first: vplog batch LOG"
+                if ALONE in drives[drive]
+                else f"Its log {log} is not there any more. Put it back, and give the same command again."
+            )
             missing[drive] = Drive(drive, log, "failed", error=why)
     with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), threads, progress) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
@@ -77,9 +82,9 @@ def redescribe_map(
             fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
         digest = read_library_record(folder)["hash"]
     fate += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
-    if missing:
+    if missing and groups:  # else there is no map yet
         with map_store.writing(target) as store:
-            tell_failures(store, missing)
+            tell_failures(store, {drive: lost for drive, lost in missing.items() if drive not in store.drives()})
     return {
         "map": str(target),
         "from": str(root),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 import duckdb
@@ -134,7 +137,7 @@ def test_an_exported_file_goes_into_a_map_with_its_library(root: Path, verb: Ver
     verb("map", "export", root, "-o", out)
     told = verb("map", "merge", out, "-o", other, "--json").json
     assert [(one["drive"], one["as"], one["state"]) for one in told["drives"]] == [
-        ("far", "far", "taken"), ("near", "near-2", "taken"), ("nowhere", "nowhere", "taken"),
+        ("far", "far", "places taken"), ("near", "near-2", "places taken"), ("nowhere", "nowhere", "places taken"),
     ]  # fmt: skip
     store = map_store.Store(other)
     for drive, taken in (("far", "far"), ("near", "near-2"), ("nowhere", "nowhere")):
@@ -158,7 +161,7 @@ def test_an_exported_file_goes_into_a_map_with_its_library(root: Path, verb: Ver
     }  # fmt: skip
     verb("map", "export", root, "--box=" + ",".join(map(str, about["near"])), "-o", tmp_path / "near.parquet")
     assert {drive for drive, _ in places(tmp_path / "near.parquet")} == {"near"}
-    again = verb("map", "merge", out, root, "-o", other, "--json").json
+    again = verb("map", "merge", out, "-o", other, "--json").json
     assert {one["state"] for one in again["drives"]} == {"there already"}
     for folder in (root, other):
         verb("map", "export", folder, "--format", "geoparquet", "-o", folder / "geo.parquet")
@@ -166,6 +169,11 @@ def test_an_exported_file_goes_into_a_map_with_its_library(root: Path, verb: Ver
     told = verb("map", "info", other, "--json").json
     assert [one["keyframes"] for one in told["drives"]] == [PLACES] * 4
     assert "out.parquet" in told["drives"][0]["warnings"][0]
+    whole = verb("map", "merge", root, out, "-o", other, "--json").json
+    assert [one["state"] for one in whole["drives"]] == ["taken"] * 3 + ["there already"] * 3
+    assert [one["as"] for one in whole["drives"]] == ["far", "near-2", "nowhere"] * 2
+    assert len(tables.read_closures(store.run("far") / "closures.parquet")) > 0
+    assert set(store.drives()) == {"far", "near", "near-2", "nowhere"}
 
 
 def test_a_part_of_a_map_goes_by_file(root: Path, verb: Verb, tmp_path: Path) -> None:
@@ -180,6 +188,38 @@ def test_a_part_of_a_map_goes_by_file(root: Path, verb: Verb, tmp_path: Path) ->
     store = map_store.Store(other)
     assert list(store.drives()) == ["near", "x"]
     assert store.rows("descriptors", "near") == len(inside)
+    for source, state, count in (
+        (out, "there already", len(inside)),
+        (whole, "places taken", PLACES),
+        (out, "there already", PLACES),
+    ):
+        told = verb("map", "merge", source, "--drive", "near", "-o", other, "--json").json
+        assert [one["state"] for one in told["drives"]] == [state]
+        assert store.rows("descriptors", "near") == count
+
+
+def test_an_export_goes_from_server_to_map(root: Path, verb: Verb, tmp_path: Path) -> None:
+    out, other = tmp_path / "served" / "out.parquet", make_map(tmp_path / "other", {"x": 7})
+    out.parent.mkdir()
+    verb("map", "export", root, "-o", out)
+    handler = partial(SimpleHTTPRequestHandler, directory=str(out.parent))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_address[1]}/out.parquet"
+        told = verb("map", "merge", url, "-o", other, "--json").json
+        server.shutdown()
+    assert {one["from"] for one in told["drives"]} == {url}
+    assert map_store.Store(other).drives()["far"]["log"] == f"{url}#far"
+
+
+def test_a_drive_of_an_older_map_is_exported_with_its_place_on_earth(root: Path, verb: Verb, tmp_path: Path) -> None:
+    record = root / "runs" / "drive=near" / "drive.json"
+    about = json.loads(record.read_text())
+    record.write_text(json.dumps({name: about[name] for name in about if name != "earth"}))
+    out, other = tmp_path / "out.parquet", make_map(tmp_path / "other", {"x": 7})
+    verb("map", "export", root, "--format", "geoparquet", "-o", out)
+    verb("map", "merge", out, "-o", other)
+    assert map_store.Store(other).earth("near") is not None
 
 
 def test_files_that_are_no_export_or_of_another_library_are_one_line(root: Path, verb: Verb, tmp_path: Path) -> None:
@@ -195,6 +235,11 @@ def test_files_that_are_no_export_or_of_another_library_are_one_line(root: Path,
     (tmp_path / "text").write_text("no table")
     assert "cannot be read" in verb("map", "merge", tmp_path / "text", "-o", root).error
     table = pq.read_table(out)
+    deep = table.replace_schema_metadata(
+        {**table.schema.metadata, b"vplog.settings": b'{"a":' * 900 + b"1" + b"}" * 900}
+    )
+    pq.write_table(deep, tmp_path / "deep")
+    assert "cannot be read" in verb("map", "merge", tmp_path / "deep", "-o", root).error
     mine = make_map(tmp_path / "mine", {"x": 7})
     for damaged, why in (
         (pa.concat_tables([table, table]), "two stretches"), (table.drop_columns(["stamp_ns"]), "cannot be read"),

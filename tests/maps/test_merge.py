@@ -168,7 +168,9 @@ def test_another_library_is_refused_everywhere_and_nothing_is_written(verb: Verb
 
 def test_what_cannot_be_merged_is_one_line(verb: Verb, tmp_path: Path) -> None:
     a = make_map(tmp_path / "a", {"one": 1})
-    assert "is not a map" in verb("map", "merge", a, tmp_path / "none", "-o", tmp_path / "c").error
+    assert "neither a map nor" in verb("map", "merge", a, tmp_path / "none", "-o", tmp_path / "c").error
+    (tmp_path / "folder").mkdir()
+    assert "is not a map" in verb("map", "merge", a, tmp_path / "folder", "-o", tmp_path / "c").error
     assert "own" in verb("map", "merge", a, "-o", a).error or "target" in verb("map", "merge", a, "-o", a).error
     assert "given twice" in verb("map", "merge", a, a, "-o", tmp_path / "c").error
     assert not (tmp_path / "c").exists()

@@ -10,7 +10,7 @@ import numpy as np
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import store as map_store
-from vplog.maps.earth import earth_of_run, inside
+from vplog.maps.earth import earth_as_plain, earth_of_run, inside
 from vplog.remote import local_copy
 from vplog.results import tables
 from vplog.results.geo import on_earth
@@ -113,7 +113,8 @@ def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Pr
         asked = "in the box" if box is not None else "to write"
         raise ResultError(f"There is no place {asked}, so {path} is not written.{nowhere}")
     bounds = (low, high) if kind == "geoparquet" else None
-    drives = {drive: source.drives[drive] for drive in written}
+    nowhere = np.empty((0, 4, 4))
+    drives = {drive: {"earth": earth_as_plain(at, nowhere), **source.drives[drive]} for drive, at in written.items()}
     return {**write_places(path, drives, _places(source, written, box, progress), bounds), "left_out": left_out}
 
 

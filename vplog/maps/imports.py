@@ -20,6 +20,7 @@ from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.earth import earth_as_plain, earth_from_plain
 from vplog.pipeline import Pipeline
+from vplog.remote import original
 from vplog.results import run_record, tables
 from vplog.results.places_map import about_map, read_drives
 
@@ -72,7 +73,7 @@ def _record(path: Path, about: AboutMap, drive: str, told: dict[str, Any]) -> di
     inputs, topics = told.get("inputs"), told.get("topics")
     return {
         "drive": drive,
-        "log": f"{path.absolute()}#{drive}",
+        "log": f"{_where(path)}#{drive}",
         "inputs": inputs if isinstance(inputs, dict) else {},
         "topics": topics if isinstance(topics, dict) else {},
         "settings": keys.key_of(about.settings),
@@ -80,6 +81,12 @@ def _record(path: Path, about: AboutMap, drive: str, told: dict[str, Any]) -> di
         "earth": told.get("earth"),
         ALONE: path.name,
     }
+
+
+def _where(path: Path) -> str:
+    """Of a copy where it was."""
+    known = original(path)
+    return str(known.absolute() if known is path else known)
 
 
 def _kind(store: Store, path: Path) -> pa.DataType:
@@ -111,10 +118,10 @@ def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap, k
         folder / "trajectory.parquet", Trajectory(stamps, poses), Odometry(stamps, poses, None), header
     )
     account = {
-        "log": f"{places.source.absolute()}#{drive}",
+        "log": f"{_where(places.source)}#{drive}",
         "finished": True,
         "settings": about.settings,
-        "library": {"hash": about.library, "from": str(places.source.absolute())},
+        "library": {"hash": about.library, "from": _where(places.source)},
         "counts": {"keyframes": len(stamps), "candidates": 0, "verdicts": {}},
         "warnings": [f"Places alone, from {places.source.name}."],
     }

@@ -23,8 +23,8 @@ HASH = re.compile(r"[0-9a-f]{64}")
 """How a library is called: the sha256 of all that descriptors depend on."""
 
 
-_MOST_NAME = 120
-"""Characters of a drive's name in a file's; what stands around them takes up to forty more."""
+_MOST_NAME = 200
+"""Characters of a drive's name in a file's; what stands around them takes up to thirty more."""
 
 
 def folder_name(drive: str) -> str:

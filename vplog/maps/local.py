@@ -6,7 +6,7 @@ import ctypes
 import fcntl
 import os
 import shutil
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
@@ -52,10 +52,9 @@ def settle(store: Store) -> None:
     of drives that it was removing: their tables without a run folder."""
     for file in sorted(store.staging.glob("*/drive.json")):
         if not file.parent.name.startswith(_REMOVED):
-            with suppress(ResultError):  # it is not whole, and goes
-                record = drive_record(file.parent)
-                if _has_tables(file.parent) and not store.run(record["drive"]).exists():
-                    publish(store, record["drive"], file.parent)
+            drive = _whole(file.parent)
+            if drive is not None and not store.run(drive).exists():
+                publish(store, drive, file.parent)
     shutil.rmtree(store.staging, ignore_errors=True)
     store.staging.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
@@ -66,8 +65,13 @@ def settle(store: Store) -> None:
         link_tables(store, drive)
 
 
-def _has_tables(made: Path) -> bool:
-    return all((made / f"{name}.parquet").is_file() for name in TABLES)
+def _whole(made: Path) -> str | None:
+    """The drive of a folder that a writer had finished; None of one that it had not."""
+    try:
+        record = drive_record(made)
+    except ResultError:
+        return None
+    return record["drive"] if all((made / f"{name}.parquet").is_file() for name in TABLES) else None
 
 
 def clear(store: Store) -> None:

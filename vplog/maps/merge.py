@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.maps.imports import drives_of_file, library_of_file, take_places
+from vplog.maps.imports import ALONE, drives_of_file, library_of_file, take_places
+from vplog.remote import local_copy, original
 from vplog.results import run_record
+from vplog.results.places_map import places_by_drive
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from vplog.maps.store import Store
@@ -36,21 +39,26 @@ def merge_maps(
         raise SettingsError(f"{target} is given as a source and as the target. Choose another map with -o.")
     if len({str(source.resolve()) for source in sources}) < len(sources):
         raise SettingsError("A map is given twice. Give each once.")
+    with ExitStack() as stack:
+        here = [stack.enter_context(local_copy(one)) if one.is_file() else one for one in sources]
+        return _merge(here, target, progress, chosen)
+
+
+def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Sequence[str]) -> dict[str, Any]:
     library = _check_libraries(sources, target)
     _check_chosen(sources, chosen)
     fate: list[dict[str, Any]] = []
     with map_store.writing(target) as store:
-        there = store.drives()
-        known, names = {_content(record): drive for drive, record in there.items()}, set(there)
+        there = _There(store.drives())
         for number, source in enumerate(sources):
             if source.is_file():
-                fate += _take_file(store, source, known, names, chosen)
+                fate += _take_file(store, source, there, chosen)
                 continue
             with map_store.reading(source) as other:
                 _, drives = map_store.one_library(other)
                 _take_library(store, other, library)
                 for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
-                    fate.append(_take(store, other, drives[drive], known, names, f"{os.getpid()}-{len(fate)}"))
+                    fate.append(_take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}"))
                     progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
         return {"map": str(store), "library": library, "drives": fate}
 
@@ -62,6 +70,8 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
         with map_store.reading(target) as store:
             wanted = map_store.one_library(store)[0] if store.drives() else store.head().library
     for source in sources:
+        if not source.exists():
+            raise ResultError(f"There is neither a map nor an exported file at {source}.")
         if source.is_file():
             found = library_of_file(source)
         else:
@@ -69,10 +79,16 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
                 found, _ = map_store.one_library(other)
         if wanted is None and source.is_file():
             raise LibraryError(
-                f"{source} holds places without their library {found[:12]}. Name a map that has it first, or as -o."
+                f"{original(source)} holds places without their library {found[:12]}. Name a map that has it first, or "
+                "as -o."
             )
         if wanted is None:
             wanted, whose = found, str(source)
+        if found != wanted and source.is_file():
+            raise LibraryError(
+                f"{original(source)} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their "
+                "places do not compare. Describe the map that it is from anew (vplog map redescribe), and export that."
+            )
         if found != wanted:
             raise LibraryError(
                 f"{source} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do not "
@@ -106,15 +122,38 @@ def _take_library(store: Store, other: Store, library: str) -> None:
     store.write_head(map_store.Head(library, other.head().settings))
 
 
-def _take(
-    store: Store, other: Store, record: dict[str, Any], known: dict[str, str], names: set[str], staged: str
-) -> dict[str, Any]:
-    """One drive; what became of it. `known` are IDs in the map by content, `names` all of them; both get this one."""
+class _There:
+    """The drives of the target, and those that come."""
+
+    def __init__(self, records: Mapping[str, dict[str, Any]]) -> None:
+        self._by_content: dict[str, str] = {}
+        self._names: set[str] = set()
+        self._alone: set[str] = set()
+        for drive, record in records.items():
+            self.add(drive, record)
+
+    def add(self, drive: str, record: dict[str, Any]) -> None:
+        self._by_content[_content(record)] = drive
+        self._names.add(drive)
+        (self._alone.add if ALONE in record else self._alone.discard)(drive)
+
+    def same(self, record: dict[str, Any]) -> tuple[str | None, bool]:
+        """The drive of this content, and whether places alone are known of it."""
+        drive = self._by_content.get(_content(record))
+        return drive, drive in self._alone
+
+    def free_name(self, drive: str, log: str) -> str:
+        return keys.free_name(drive, log, self._names)
+
+
+def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any]:
+    """One drive; what became of it. A whole one comes in place of its places alone."""
     drive = record["drive"]
     told = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
-    if (same := known.get(_content(record))) is not None:
+    same, alone = there.same(record)
+    if same is not None and (not alone or ALONE in record):
         return {**told, "as": same, "state": "there already"}
-    taken, made = keys.free_name(drive, record["log"], names), store.staging / staged
+    taken, made = same or there.free_name(drive, record["log"]), store.staging / staged
 
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
@@ -130,25 +169,25 @@ def _take(
     run_record.write_run_json(made / "drive.json", record if taken == drive else keys.renamed(record, taken))
     map_store.publish(store, taken, made)
     other.forget(drive)
-    known[_content(record)] = taken
-    names.add(taken)
+    there.add(taken, record)
     return {**told, "as": taken, "state": "taken"}
 
 
-def _take_file(
-    store: Store, source: Path, known: dict[str, str], names: set[str], chosen: Sequence[str]
-) -> list[dict[str, Any]]:
-    """The places of an exported file; what became of each drive, as `_take` says it."""
-    fate, wanted = [], dict[str, str]()
+def _take_file(store: Store, source: Path, there: _There, chosen: Sequence[str]) -> list[dict[str, Any]]:
+    """The places of an exported file; what became of each drive, as `_take` says it. Those that have more of a drive
+    come in place of others alone."""
+    fate, wanted, counts = [], dict[str, str](), places_by_drive(source)
     for drive, record in drives_of_file(source).items():
         if chosen and drive not in chosen:
             continue
-        same, taken = known.get(_content(record)), keys.free_name(drive, drive, names)
-        fate.append({"from": str(source), "drive": drive, "as": same or taken, "log": record["log"]})
-        fate[-1]["state"] = "taken" if same is None else "there already"
-        if same is None:
-            wanted[drive] = known[_content(record)] = taken
-            names.add(taken)
+        same, alone = there.same(record)
+        more = same is None or (alone and counts.get(drive, 0) > store.rows("descriptors", same))
+        taken = same or there.free_name(drive, drive)
+        fate.append({"from": str(original(source)), "drive": drive, "as": taken, "log": record["log"]})
+        fate[-1]["state"] = "places taken" if more else "there already"
+        if more:
+            wanted[drive] = taken
+            there.add(taken, record)
     done = set(take_places(store, source, wanted))
     lost = [drive for drive in wanted if drive not in done]
     if lost:
@@ -160,7 +199,8 @@ def _content(record: dict[str, Any]) -> str:
     """What a drive is of: the content of its log and what of that was used; without that, all that is known of it."""
     if record["inputs"]:
         return run_record.canonical_json([record["inputs"], record.get("topics")])
-    return run_record.canonical_json({name: value for name, value in record.items() if name != "earth"})
+    own = ("earth", "key", "drive")
+    return run_record.canonical_json({name: value for name, value in record.items() if name not in own})
 
 
 def in_order(drives: Iterable[str]) -> list[str]:

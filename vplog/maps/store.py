@@ -141,11 +141,15 @@ class Store:
         return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
 
     def keep(self) -> None:
-        """Of a map on an object store, send what was made so far beside drives; a folder has it already."""
+        """Of a map on an object store, send what was made so far beside drives; a folder has it already. Where that
+        fails it is sent another time; raises SettingsError where another writer has the map now."""
         if self.mirror is not None:
             from vplog.maps.sending import send_rest
 
-            send_rest(self.mirror)
+            if self.mirror.lock is not None:
+                self.mirror.lock.check()
+            with suppress(ResultError):
+                send_rest(self.mirror)
 
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order. Raises ResultError where one cannot be read."""
@@ -265,7 +269,7 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
         try:
             yield store
         except BaseException:  # what was verified of closures stays
-            with suppress(VplogError):
+            with suppress(VplogError, OSError):
                 sending.send_rest(mirror)
             raise
         sending.send_rest(mirror)

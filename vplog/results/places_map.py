@@ -31,6 +31,10 @@ ROWS_PER_GROUP = 16_384
 """Places of a row group: 2 MB of the default's descriptors."""
 ZSTD_LEVEL = 3
 """Level 1 is 1 % larger and no faster; 9 is 1 % smaller and takes twice as long to write."""
+_MOST_TOLD = 2**25
+"""Bytes of a header's list of drives: it is in the file twice."""
+_MOST_ROWS = 2**20
+"""Rows of a group that is read at once: as many as other writers put into one."""
 PLACE = pa.schema(
     [
         tables.KEYFRAMES.field("drive").with_type(pa.dictionary(pa.int32(), pa.string())),
@@ -122,7 +126,7 @@ def write_places(
     about = {
         **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
         "vplog.table": "map",
-        "vplog.drives": json.dumps(drives, sort_keys=False),
+        "vplog.drives": _told_drives(drives),
         "vplog.descriptor": json.dumps([_described(name, part) for name, part in described]),
         **({} if bounds is None else geo.geo_header(*bounds)),
     }
@@ -149,6 +153,12 @@ def write_places(
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=ROWS_PER_GROUP)
             places += len(part.keyframe)
     return {"written": str(path), "drives": names, "places": places, "library": library}
+
+
+def _told_drives(drives: Mapping[str, dict[str, Any]]) -> str:
+    """The header's list of drives; of very many the IDs alone, as readers take headers of up to 100 MB."""
+    told = json.dumps(drives)
+    return told if len(told) <= _MOST_TOLD else json.dumps({drive: {} for drive in drives})
 
 
 def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
@@ -196,6 +206,7 @@ def about_map(path: Path) -> AboutMap:
     try:
         header = {key.decode(): value.decode() for key, value in (pq.read_schema(path).metadata or {}).items()}
         settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
+        run_record.canonical_json([settings, drives])  # not nested deeper than can be written again
     except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
         raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
     sound = isinstance(settings, dict) and isinstance(drives, dict)
@@ -207,6 +218,20 @@ def about_map(path: Path) -> AboutMap:
     return AboutMap(header.get("vplog.library", ""), settings, header.get("vplog.descriptor", ""), drives)
 
 
+def places_by_drive(path: Path) -> dict[str, int]:
+    """How many places of each drive are in a map. Raises ResultError."""
+    found: dict[str, int] = {}
+    try:
+        with pq.ParquetFile(path, read_dictionary=["drive"]) as file:
+            for batch in file.iter_batches(ROWS_PER_GROUP, columns=["drive"]):
+                for value in batch.column(0).value_counts():
+                    drive = str(value["values"])
+                    found[drive] = found.get(drive, 0) + value["counts"].as_py()
+    except (OSError, KeyError, pa.ArrowException) as error:
+        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+    return found
+
+
 def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
     """The places of a map drive by drive, one of them in memory at a time. Raises ResultError where it is damaged, of
     another recogniser, or where a drive comes twice."""
@@ -216,8 +241,10 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
     schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])
     done, waiting = set[str](), list[pa.Table]()
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, read_dictionary=["drive"]) as file:
             for number in range(file.num_row_groups):
+                if (rows := file.metadata.row_group(number).num_rows) > _MOST_ROWS:
+                    raise ResultError(f"{path} has {rows} places in a row group; write it with at most {_MOST_ROWS}.")
                 table = file.read_row_group(number, columns=schema.names).cast(schema)
                 for drive, rows in _stretches(table):
                     if waiting and waiting[0]["drive"][0].as_py() != drive:
@@ -235,11 +262,13 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
 
 def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
     """Rows of one drive after the other."""
-    drives = table["drive"].cast(pa.string()).to_pylist()
+    drives = table["drive"].combine_chunks()
+    if drives.null_count:
+        raise ValueError("there are places of no drive")
     at = 0
-    for drive, rows in groupby(drives):
+    for number, rows in groupby(drives.indices.to_pylist()):
         count = sum(1 for _ in rows)
-        yield drive, table.slice(at, count)
+        yield drives.dictionary[number].as_py(), table.slice(at, count)
         at += count
 
 
