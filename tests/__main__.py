@@ -16,8 +16,8 @@ TOP = Path(__file__).parents[1]
 CHECKS = {
     "lint": ["-m", "ruff", "check", "."],
     "format": ["-m", "ruff", "format", "--check", "."],
-    # a file stays with one worker, so that what its tests share is made once
-    "tests": ["-m", "pytest", "--numprocesses", "auto", "--dist", "loadfile", *sys.argv[1:]],
+    # a file stays with one worker, so that what its tests share is made once; they come in the order of conftest.py
+    "tests": ["-m", "pytest", "--numprocesses", "auto", "--dist", "loadfile", "--no-loadscope-reorder", *sys.argv[1:]],
 }
 TYPES = ["-m", "pyright", "--pythonpath", sys.executable]
 
