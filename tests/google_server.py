@@ -52,5 +52,5 @@ def serving() -> Iterator[str]:
             yield address
     finally:
         process.stdin.close()
-        process.wait(10)
+        process.wait(60)
         process.stdout.close()

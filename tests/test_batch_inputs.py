@@ -66,6 +66,8 @@ def test_what_has_not_changed_is_not_read_again(logs: dict[str, Path], tmp_path:
     now = logs["two.mcap"].stat()
     logs["two.mcap"].write_bytes(b"TWO.mcap")
     os.utime(logs["two.mcap"], ns=(now.st_atime_ns, now.st_mtime_ns))  # a copy may bring its time of writing along
+    while logs["two.mcap"].stat().st_ctime_ns == now.st_ctime_ns:  # clocks of file systems tick every 10 ms
+        os.utime(logs["two.mcap"], ns=(now.st_atime_ns, now.st_mtime_ns))
     found, _ = asked(logs, record, odometry_file=odometry)
     assert sorted(read) == ["folder", "two.mcap"]  # one a thread, in any order
     assert found[0] == first[0][0]
@@ -129,7 +131,7 @@ def test_a_log_of_the_record_that_cannot_be_asked_for_stops_nothing(
     monkeypatch.setattr(Path, "stat", refused)
     assert asked(logs, record)[1] == {}
     assert len(json.loads(record.read_text())) == 3
-    assert read == ["one.mcap", "two.mcap", "folder"]
+    assert (read[0], sorted(read[1:])) == ("one.mcap", ["folder", "two.mcap"])
 
 
 def test_a_record_that_cannot_be_written_is_done_without(logs: dict[str, Path], tmp_path: Path) -> None:

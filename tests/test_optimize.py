@@ -146,3 +146,21 @@ def test_real_false_closures_do_not_bend_the_map(tmp_path: Path) -> None:
     done = optimize(public("rrr/B25b/B25b_0.300.g2o"), tmp_path / "out.g2o")
     assert done.record["rejected"] > 32  # so many are false by the GPS
     assert not done.record["odometry_kept"]
+
+
+def test_a_graph_of_many_parts_takes_no_longer_than_one(tmp_path: Path) -> None:
+    """Each part by itself: with a look at all poses for each it would take hours."""
+    count = 30_000
+    lines = [f"VERTEX_SE2 {at} {at} 0 0" for at in range(count)]
+    lines += [f"EDGE_SE2 {at} {at + 1} 1 0 0 1 0 0 1 0 1" for at in (0, 1, 5)]
+    (tmp_path / "parts.g2o").write_text("\n".join(lines))
+    found = optimize(tmp_path / "parts.g2o", tmp_path / "out.g2o", "lm")
+    assert any("29995 poses have no edge" in text for text in found.record["warnings"])
+    assert len(found.solution.world_from_body) == count
+
+
+def test_information_beyond_what_a_double_squares_is_refused(tmp_path: Path) -> None:
+    graph = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1e300 0 0 1 0 1\n"
+    (tmp_path / "graph.g2o").write_text(graph)
+    with pytest.raises(GraphError, match=r"holds 1e\+300; it must be finite .* at most 1e\+30"):
+        optimize(tmp_path / "graph.g2o", tmp_path / "out.g2o")

@@ -90,13 +90,15 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
 ) -> None:
     """Then a drive that is longer is added, its frames split over both nodes."""
     monkeypatch.setattr("vplog.engine_ray.RayEngine.look_for", lambda *_: None)  # nobody sees the map but the batch
+    monkeypatch.setattr("vplog.ray_cluster._ANSWER_S", 600.0)
     (cluster, places), pipeline, root = nodes, load_pipeline("default", SETTINGS), tmp_path / "map"
     [library], (first_log, bad_log, second_log, long_log) = (alone / "libraries").iterdir(), logs
     killed: list[int] = []
     watch = threading.Thread(target=kill_one_at_work, args=(places, killed), daemon=True)
     watch.start()
     told = run_batch([first_log, bad_log, second_log], root, pipeline, library, engine="ray", address=cluster.address)
-    watch.join()
+    watch.join(300)
+    assert killed
     assert [one["state"] for one in told["drives"]] == ["computed", "failed", "computed"], told
     first, bad, second = told["drives"]
     assert sorted([first["attempts"], second["attempts"]]) == [1, 2], "one was killed and tried again"
@@ -113,6 +115,7 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     assert not [path for place in places for path in place.glob("vplog-*/run-*")]
     assert not list(root.glob(".cache"))
 
+    monkeypatch.setattr("vplog.engine_ray._PROBE_S", 600.0)  # a machine that is slow to tell is not refused here
     monkeypatch.setattr("vplog.engine_ray.made_by", lambda: {"code": "other", "versions": {}})
     with pytest.raises(SettingsError, match="has vplog's code"):
         run_batch(logs, root, pipeline, engine="ray", address=cluster.address)

@@ -91,3 +91,12 @@ def test_what_one_drive_explains_the_other_need_not(drive: Drive, tmp_path: Path
     stamps = [reference.stamp_ns for reference in load_references(tmp_path / "twice")]
     assert len(stamps) == 12
     assert len(set(stamps)) == 12, "two equal drives, and no view of them twice"
+
+
+def test_a_library_without_keypoints_serves_other_drives(drive: Drive, tmp_path: Path) -> None:
+    """Places described by patches alone, as `quick` has them."""
+    pipeline = load_pipeline("quick", ["pictures.megapixels=0", "library.size=12"])
+    build_library([drive.log], tmp_path / "library", pipeline)
+    done = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", threads=2)
+    assert done.record["library"]["coverage"]["frames"] == 0, "nothing tells"
+    assert not any("The library explains" in text for text in done.record["warnings"])

@@ -27,7 +27,7 @@ from vplog.cli_print import Progress, print_evaluation, print_info, print_joint,
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
 from vplog.cores import available, limited
-from vplog.errors import VplogError
+from vplog.errors import VplogError, was_interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -59,8 +59,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except KeyboardInterrupt:
-        say("interrupted; nothing is lost of what was finished in the output folder")
-        sys.exit(130)
+        _interrupted()
     except VplogError as error:
         _fail(arguments, str(error))
     except MemoryError:
@@ -68,6 +67,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     except OSError as error:  # a full disk, a drive that went away
         _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
     except Exception as error:  # a fault of ours: still one line, and how to see more
+        if was_interrupted(error):
+            _interrupted()
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
@@ -91,6 +92,11 @@ def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
             else:
                 setattr(arguments, name, stack.enter_context((local_output if name == "output" else local_copy)(place)))
         yield
+
+
+def _interrupted() -> NoReturn:
+    say("interrupted; nothing is lost of what was finished in the output folder")
+    sys.exit(130)
 
 
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:

@@ -27,3 +27,14 @@ class TruthError(VplogError):
 
 class ResultError(VplogError):
     """A run folder cannot be written or read back."""
+
+
+def was_interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: compiled code and imports that it stops raise others in its place."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        seen.add(id(error))
+        error = error.__cause__ or error.__context__
+    return False

@@ -66,6 +66,7 @@ def run_joint(
     check_library(library, pipeline)
     watch = Watch()
     record.begin_folder(out, pipeline, paths[0], threads, library, topics, paths)
+    _remove_joint_results(out)
     with ExitStack() as stack:
         if library is None:
             library = out / "library"
@@ -110,6 +111,13 @@ def run_joint(
         }
         run_record.write_run_json(out / "run.json", account)
     return account
+
+
+def _remove_joint_results(out: Path) -> None:
+    """What an earlier run put together: drives may be apart now, or others."""
+    for name in ("map*.g2o", "joins.parquet", "*/joint_keyframes.parquet", "*/joint_trajectory.*"):
+        for file in out.glob(name):
+            file.unlink(missing_ok=True)
 
 
 def _ledgers(

@@ -36,7 +36,7 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor
         information=said.information[kept],
         kind=[graph.kind[edge] for edge in kept.tolist()],
     )
-    return graph_joint.Drive(own, of_odometry[kept])
+    return graph_joint.Drive(own, of_odometry[kept], sigma_factor)
 
 
 def between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:

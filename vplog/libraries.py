@@ -88,7 +88,10 @@ def cover(
     features: FeaturesOf,
     threads: int,
 ) -> tuple[Coverage, list[str]]:
-    """How far the references explain the drive, and what to do where that is little."""
+    """How far the references explain the drive, and what to do where that is little; of no frames where the library
+    keeps no features that could tell (`places.features: 0`)."""
+    if not any(len(one.features) for one in references):
+        return Coverage(0.0, 0.0, 0), []
     library = index_words(references, WordSettings(), threads, own=False)
     coverage = measure_coverage(len(features), features.__getitem__, keyframes.stamp_ns, drive, library, threads)
     doubt = coverage_warning(coverage, len(features), given, len(library))

@@ -18,6 +18,7 @@ from vplog.results.g2o import read_g2o, write_g2o
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from vplog.data import Ints
@@ -73,10 +74,10 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
     """The solution of each part (N,) of a graph by itself, put together, and warnings of what was repaired."""
     poses, weight = np.array(graph.world_from_body), np.ones(len(graph.a))
     solutions, warnings = [], []
-    for number in range(int(part.max()) + 1):
-        rows, edges = np.flatnonzero(part == number), np.flatnonzero(part[graph.a] == number)
-        if len(rows) == 1:
-            continue
+    size = np.bincount(part)
+    rows_of, edges_of = _by_part(part, len(size)), _by_part(part[graph.a], len(size))
+    for number in np.flatnonzero(size > 1).tolist():
+        rows, edges = rows_of(number), edges_of(number)
         alone = PoseGraph(
             graph.world_from_body[rows],
             np.searchsorted(rows, graph.a[edges]).astype(np.int32),
@@ -88,7 +89,7 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
         )
         alone, repairs = checked(alone)
         solution = keep_odometry_if_worse(alone, optimiser(alone))
-        where = f"Part from {ids[rows[0]]} on: " if (np.bincount(part) > 1).sum() > 1 else ""
+        where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
         warnings += [where + text for text in repairs]
         poses[rows], weight[edges] = solution.world_from_body, solution.weight
         solutions.append(replace(solution, reason=where + solution.reason))
@@ -103,6 +104,13 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
         all(one.converged for one in solutions),
         " ".join(one.reason for one in solutions),
     ), warnings
+
+
+def _by_part(part: Ints, parts: int) -> Callable[[int], Ints]:
+    """The rows of each part, in order, of the part that each row (N,) is of."""
+    order = np.argsort(part, kind="stable")
+    first = np.searchsorted(part[order], np.arange(parts + 1))
+    return lambda number: order[first[number] : first[number + 1]]
 
 
 def _holding(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:

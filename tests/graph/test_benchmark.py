@@ -67,7 +67,7 @@ def test_drives_are_joined_by_closures_alone() -> None:
 
 
 def test_a_call_is_ended_at_its_limit() -> None:
-    spent, told = benchmark.apart(sorted, ([3, 1, 2],), 60.0)
+    spent, told = benchmark.apart(sorted, ([3, 1, 2],), 600.0)
     assert told == [1, 2, 3]
-    assert spent < 60.0
+    assert spent < 600.0
     assert benchmark.apart(time.sleep, (60.0,), 0.1) == (0.1, None)

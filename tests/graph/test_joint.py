@@ -94,3 +94,58 @@ def test_no_ties_no_maps() -> None:
     found = join([first, first], [], GncSettings(), JoinSettings(), RefineSettings())
     assert found.maps == [(0,), (1,)]
     assert found.solved == {}
+
+
+def mistold(seed: int, factor: float) -> tuple[Drive, np.ndarray]:
+    """A lap whose odometry is worse than it says."""
+    (first, true), random = lap(seed), np.random.default_rng(seed)
+    graph, odometry = first.graph, first.of_odometry
+    noise = random.normal(size=(odometry.sum(), 6)) * drives.ODOMETRY_SIGMA * factor
+    measured = np.array(graph.a_from_b)
+    measured[odometry] = geometry.between(true[graph.a[odometry]], true[graph.b[odometry]]) @ geometry.exp(noise)
+    return replace(first, graph=replace(graph, a_from_b=measured)), true
+
+
+def test_noise_that_is_somewhat_mistold_parts_no_drives() -> None:
+    """The more closures, the more surely a test of all of odometry tells 1.3 from 1."""
+    laps = [mistold(seed, 1.3) for seed in range(4)]
+    true = [one for _, one in laps]
+    ties = [between(j, i, true, 30, 10 * i + j) for j in range(4) for i in range(j)]
+    shifted = [drive if at == 0 else moved(drive, SHIFT) for at, (drive, _) in enumerate(laps)]
+    found = join(shifted, ties, GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0, 1, 2, 3)]
+    assert sum(weight.sum() for weight in found.weight) > 0.9 * 30 * len(ties)
+    assert joint_error(found.world_from_body, true) < 0.3
+
+
+def test_noise_that_own_closures_show_is_believed() -> None:
+    """Else the robust solve takes true closures for false ones."""
+    laps = [mistold(seed, 6.0) for seed in (1, 2)]
+    true = [one for _, one in laps]
+    ties = [between(1, 0, true, 40, 0)]
+    drives_of = [replace(drive, sigma_factor=6.0) for drive, _ in laps]
+    assert join([laps[0][0], laps[1][0]], ties, GncSettings(), JoinSettings(), RefineSettings()).maps == [(0,), (1,)]
+    found = join(drives_of, ties, GncSettings(), JoinSettings(), RefineSettings())
+    assert (found.maps, found.weight[0].sum()) == ([(0, 1)], 40)
+
+
+def test_one_view_that_looks_like_others_joins_nothing() -> None:
+    laps = [lap(seed) for seed in (1, 2)]
+    tie = between(1, 0, [true for _, true in laps], 12, 0)
+    rows = np.array([3, 3, 3, 3])
+    one = replace(
+        tie, query=tie.query[rows], match=tie.match[rows] + np.arange(-1, 3), of_odometry=tie.of_odometry[rows],
+        match_from_query=tie.match_from_query[rows], information=tie.information[rows],
+    )  # fmt: skip
+    found = join([drive for drive, _ in laps], [one], GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0,), (1,)]
+
+
+def test_few_closures_of_drives_that_others_join_are_kept() -> None:
+    laps = [lap(seed) for seed in (1, 2, 3)]
+    true = [one for _, one in laps]
+    ties = [between(1, 0, true, 10, 0), between(2, 1, true, 10, 1), between(2, 0, true, 2, 2)]
+    found = join([drive for drive, _ in laps], ties, GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0, 1, 2)]
+    assert found.weight[2].tolist() == [1.0, 1.0]
+    assert np.isfinite(found.residual[2]).all()

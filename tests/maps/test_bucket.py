@@ -208,10 +208,12 @@ def test_a_reader_never_sees_half_a_drive(root: Any) -> None:
     over = threading.Event()
 
     def replace_often() -> None:
-        with map_store.writing(root) as store:
-            for seed in range(2, 6):
-                put(store, "one", seed)
-        over.set()
+        try:
+            with map_store.writing(root) as store:
+                for seed in range(2, 6):
+                    put(store, "one", seed)
+        finally:
+            over.set()
 
     writer, said = threading.Thread(target=replace_often), []
     writer.start()
@@ -247,7 +249,7 @@ def test_a_reader_that_comes_late_takes_the_new_drive(root: Any) -> None:
 def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One gets in; where it dies on another machine the next one waits for its lease, and the dead may not go on."""
     make_map(root, {"one": 1})
-    entered, refused, both = list[int](), list[str](), threading.Barrier(4)
+    entered, refused, both = list[int](), list[str](), threading.Barrier(4, timeout=300)
 
     def enter(number: int) -> None:
         both.wait()
@@ -289,6 +291,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_store_that_decides_nothing(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lock is a name that stays; nothing breaks even where two write the same drive at once."""
+    monkeypatch.setattr(bucket_lock, "LEASE_S", 36_000.0)  # whose renewal would see that the lock is another's
     monkeypatch.setattr(bucket_lock, "_SETTLE_S", 0.0)
     monkeypatch.setattr(objects, "decides", lambda _: False)
     make_map(root, {"one": 1})

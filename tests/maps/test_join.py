@@ -22,6 +22,7 @@ from vplog.maps import candidates, pairs, together
 from vplog.maps import join as map_join
 from vplog.maps import store as map_store
 from vplog.maps.joint_record import components_of
+from vplog.maps.merge import merge_maps
 from vplog.maps.roster import read_drives
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
@@ -178,10 +179,19 @@ def test_a_drive_that_is_removed_is_out_of_the_joint_graph(copy: Path) -> None:
     for folder in copy.glob("*/drive=after"):
         shutil.rmtree(folder)
     told = joined(copy)
-    assert (told["searched"], told["components"]) == ([], [])
+    assert told["searched"] == ["before", "drive"], "candidates that were in it may be in others now"
+    assert (told["pairs_computed"], told["components"]) == (1, [])
+    assert joined(copy)["searched"] == []
     assert not list(copy.glob("joint/*"))
     assert not list(copy.glob("joins/*/match=after.parquet"))
     assert (copy / "joins" / "drive=drive" / "match=before.parquet").exists()
+
+
+def test_a_merged_map_is_joined_without_logs(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    merge_maps([whole], tmp_path / "other")
+    monkeypatch.setattr("vplog.maps.members.located", lambda _: tmp_path / "gone.mcap")
+    told = joined(tmp_path / "other")
+    assert (told["warnings"], [one["drives"] for one in told["components"]]) == ([], [["after", "before"]])
 
 
 def test_a_pair_without_its_log_is_left_out_and_tried_again(copy: Path) -> None:

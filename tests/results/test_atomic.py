@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import errno
+import os
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +22,6 @@ from .example import METADATA, make_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 
 def test_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
@@ -40,6 +41,27 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
         stream.write(b"half")
         raise ZeroDivisionError
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("file", b"old")]
+
+
+def test_what_is_no_file_stays_what_it_is(tmp_path: Path) -> None:
+    """Renaming would put a file in the place of a device, and of what a link is."""
+    (tmp_path / "link").symlink_to("to")
+    with replacing(tmp_path / "link") as stream:
+        stream.write(b"new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "to").read_bytes() == b"new"
+    (tmp_path / "null").symlink_to(os.devnull)
+    with replacing(tmp_path / "null") as stream:
+        stream.write(b"new")
+    assert not Path(os.devnull).is_file()
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    with replacing(tmp_path / "pipe") as stream:
+        stream.write(b"new")
+    assert os.read(reader, 9) == b"new"
+    os.close(reader)
+    with pytest.raises(ResultError, match="is empty"), replacing(Path()):
+        pass
 
 
 def test_full_disk_is_one_line(tmp_path: Path) -> None:

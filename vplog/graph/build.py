@@ -23,6 +23,8 @@ AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 """Rows and columns of (6, 6) matrices that a graph of this dimension uses."""
 _FURTHEST_M = 1e8
 """m; frames of drives (UTM, ECEF) stay below 1e7, and from 1e8 on the last bit of a double is coarser than 10 nm."""
+_SUREST = 1e30
+"""Most information, of m or rad: a millionth of a nanometre. Beyond it, squares and determinants leave a double."""
 _LEAST_SHARE = 1e-10
 """Least eigenvalue of an information matrix as a share of its largest: GTSAM factorises them, so none may be zero."""
 _CLEARLY = 0.01
@@ -173,14 +175,17 @@ def _check_poses(poses: Floats, name: str, dimension: int) -> None:
 def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | Ints) -> None:
     finite: Bools = np.asarray(np.isfinite(matrices).all((1, 2)))
     diagonal = np.diagonal(np.where(finite[:, None, None], matrices, 0.0), axis1=1, axis2=2)
-    bad = np.flatnonzero(~finite | (diagonal < 0).any(1) | (diagonal <= 0).all(1))
+    least: Bools = np.asarray((diagonal < 0).any(1) | (diagonal <= 0).all(1))
+    most: Bools = np.asarray((diagonal > _SUREST).any(1))
+    bad = np.flatnonzero(~finite | least | most)
     if len(bad):
         edge = bad[0]
         entries = np.diagonal(matrices[edge])
-        value = matrices[edge][~np.isfinite(matrices[edge])][0] if not finite[edge] else entries.min()
+        value = entries.min() if least[edge] else entries.max()
+        value = value if finite[edge] else matrices[edge][~np.isfinite(matrices[edge])][0]
         raise GraphError(
             f"The {name} of edge {edge} ({a[edge]} to {b[edge]}) holds {value:.6g}; "
-            "it must be finite with a positive diagonal."
+            f"it must be finite with a positive diagonal of at most {_SUREST:g}."
         )
 
 

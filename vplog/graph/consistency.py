@@ -220,13 +220,16 @@ def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain
     return np.asarray(np.nan_to_num(residual_before(graph, chain)) ** 2 > bound)
 
 
-def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
+def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int | None = None) -> Solution:
     """The solution, or the odometry poses where the solution bends the odometry more than its noise allows.
 
     Odometry alone has no residual. If all closures that were kept are true, the sum of chi-squares over the odometry
     edges is chi-square with as many degrees of freedom as the closures check them with: each edge's own, less what
     the solution leaves open of it (its redundancy; Foerstner 1979). Beyond the 0.999999 quantile either false closures
     were believed or the noise is far too small: in both cases the poses cannot be trusted.
+
+    The more closures there are, the less of an error in the noise itself this bears. With `known_to` degrees of freedom
+    as those from which the noise is known at best, it bears the same share of it from so many on.
     """
     odometry = ~is_loop(graph)
     kept = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
@@ -240,9 +243,12 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution) -> Solution:
     if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
         return solution
     try:
-        bound = chi2_quantile(_SURE, max(round(_redundancy(graph, kept, solution.world_from_body, odometry)), 1))
+        checks = max(round(_redundancy(graph, kept, solution.world_from_body, odometry)), 1)
     except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
-        bound = chi2_quantile(_SURE, degrees_of_freedom(graph) * min(closures, int(odometry.sum())))
+        checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))
+    bound = chi2_quantile(_SURE, checks)
+    if known_to is not None and checks > known_to:
+        bound = chi2_quantile(_SURE, known_to) / known_to * checks
     if chi2 <= bound:
         return solution
     return replace(

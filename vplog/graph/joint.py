@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import Field
 from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
 from vplog.graph.build import parts
-from vplog.graph.consistency import keep_odometry_if_worse, residual_sigma
+from vplog.graph.consistency import is_loop, keep_odometry_if_worse, residual_sigma
 from vplog.graph.refine import RefineSettings, refine
 from vplog.settings import Settings
 
@@ -27,12 +27,18 @@ if TYPE_CHECKING:
     Bools = NDArray[np.bool_]
 
 
+_KNOWN_TO = 30
+"""Degrees of freedom from which the noise of odometry is known at best, as `refine.least_redundancy` has it. Joint
+graphs check it with as many as they are large, by which every real covariance would be found wrong."""
+
+
 class JoinSettings(Settings):
     """When closures between two drives are enough to put them into one map."""
 
     least_closures: int = Field(default=3, ge=1)
-    """Closures between two drives that the solve must keep. Nothing but another one can speak against a closure that
-    alone joins two drives; a second may be of the same mistake, seldom a third at another keyframe."""
+    """Closures between two drives that the solve must keep, each at keyframes of its own in both. Nothing but another
+    one can speak against a closure that alone joins two drives; a second may be of the same mistake, seldom a third at
+    another keyframe."""
     most_drives: int = Field(default=32, ge=1)
     """Drives that one is verified against: those whose places are most like its own. With `propose.per_query`, which
     bounds the candidates of a keyframe in all drives together, what a drive costs does not grow with their number."""
@@ -57,6 +63,8 @@ class Drive:
     """Its odometry and its own closures that were kept, from its own first pose on; 3D."""
     of_odometry: Bools
     """(E,) edges whose metres are the odometry's."""
+    sigma_factor: float = 1.0
+    """What its own closures made of the sigma that its odometry claims, which the graph has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +113,12 @@ def join(
 ) -> Joined:
     """The maps that the drives make. Raises GraphError where a graph cannot be solved.
 
-    What is joined by enough closures is solved as one. Pairs of which too few are kept are taken apart, and what is
-    left is solved again, until every join is held by enough: so a drive that joins nothing keeps its own poses.
+    What is joined by enough closures is solved as one, with all closures between its drives. Pairs of which too few are
+    kept are taken apart, and what is left is solved again, until every join is held by enough: so a drive that joins
+    nothing keeps its own poses. Where odometry bends more than its noise allows, the half of the pairs that closures
+    speak least for goes first, so that one drive does not part all others.
     """
-    joined = [len(one.query) >= settings.least_closures for one in between]
+    joined = [_places(one) >= settings.least_closures for one in between]
     weight = [np.zeros(len(one.query)) for one in between]
     residual = [np.full(len(one.query), np.nan) for one in between]
     poses = [drive.graph.world_from_body for drive in drives]
@@ -116,12 +126,23 @@ def join(
     apart: dict[int, str] = {}
     while pending := [map_ for map_ in _maps(len(drives), between, joined) if len(map_) > 1 and map_ not in solved]:
         members = pending[0]
-        ties = [at for at, one in enumerate(between) if joined[at] and one.later in members]
-        graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
-        solution = keep_odometry_if_worse(graph, solve(graph))
-        loose = [
-            at for at, part in zip(ties, rows, strict=True) if solution.weight[part].sum() < settings.least_closures
+        inside = set(members)
+        ties = [
+            at
+            for at, one in enumerate(between)
+            if at not in apart and len(one.query) and one.later in inside and one.earlier in inside
         ]
+        graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
+        believed = _as_found(drives, members, graph)
+        tried = solve(believed)
+        solution = keep_odometry_if_worse(believed, tried, _KNOWN_TO)
+        held = dict(zip(ties, rows, strict=True))
+        loose = [
+            at for at in ties if joined[at] and _places(between[at], tried.weight[held[at]]) < settings.least_closures
+        ]
+        if not loose and solution is not tried:  # each by itself holds, and together they do not
+            loose = sorted((at for at in ties if joined[at]), key=lambda at: (tried.weight[held[at]].sum(), at))
+            loose = loose[: -(-len(loose) // 2)]
         if loose:
             for at in loose:
                 joined[at] = False
@@ -135,6 +156,21 @@ def join(
             count = len(drives[member].graph.world_from_body)
             poses[member] = refined.solution.world_from_body[start : start + count]
     return Joined(_maps(len(drives), between, joined), poses, solved, weight, residual, apart)
+
+
+def _places(one: Between, weight: Floats | None = None) -> int:
+    """Closures at keyframes of their own, of those with weight (L,): the keyframes of the drive that has fewer."""
+    kept = slice(None) if weight is None else weight > 0.5
+    return min(len(np.unique(one.query[kept])), len(np.unique(one.match[kept])))
+
+
+def _as_found(drives: Sequence[Drive], members: Sequence[int], graph: PoseGraph) -> PoseGraph:
+    """The graph with the noise of odometry as the drives' own closures found it, where it was claimed to be less."""
+    factor = np.concatenate([np.full(len(drives[one].graph.a), max(drives[one].sigma_factor, 1.0)) for one in members])
+    odometry = ~is_loop(graph)[: len(factor)]
+    information = graph.information.copy()
+    information[: len(factor)][odometry] /= factor[odometry, None, None] ** 2
+    return replace(graph, information=information)
 
 
 def _maps(count: int, between: Sequence[Between], joined: Sequence[bool]) -> list[tuple[int, ...]]:
@@ -201,7 +237,9 @@ def _placed(drives: Sequence[Drive], members: Sequence[int], between: Sequence[B
 
 
 def _middle(poses: Floats) -> Floats:
-    """The one of the poses (L, 4, 4) with the least sum of distances to the others, a rad counting as 10 m."""
+    """The one of the poses (L, 4, 4) with the least sum of distances to the others, a rad counting as 10 m; of many,
+    among 500 evenly spread."""
+    poses = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 500)).astype(int))]
     apart = [
         np.linalg.norm(geometry.log(geometry.between(pose, poses)) * [10, 10, 10, 1, 1, 1], axis=1).sum()
         for pose in poses

@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import shutil
+import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -75,7 +76,7 @@ class Cache:
     def keep(self, digest: str, source: Path) -> None:
         """Keep a file that has this sha256. Where that cannot be it is read from afar another time."""
         kept = self.root / "objects" / digest
-        part = kept.with_name(f".{digest}.{os.getpid()}.part")
+        part = kept.with_name(f".{digest}.{os.getpid()}-{threading.get_ident()}.part")
         with suppress(OSError):
             kept.parent.mkdir(parents=True, exist_ok=True)
             _link(source, part)
@@ -105,7 +106,7 @@ class Cache:
         record = self._record(digest)
         with suppress(OSError):
             record.parent.mkdir(parents=True, exist_ok=True)
-            part = record.with_name(f".{record.name}.{os.getpid()}.part")
+            part = record.with_name(f".{record.name}.{os.getpid()}-{threading.get_ident()}.part")
             part.write_text(json.dumps({"files": files}))
             part.replace(record)
 
@@ -174,7 +175,7 @@ def _users() -> Path | None:
 def seal(path: Path, checksum: str) -> None:
     """Write down what a part of an index says if it is whole, before it is there. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     part.write_text(checksum)
     part.replace(seal_of(path))
 

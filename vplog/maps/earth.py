@@ -71,7 +71,7 @@ def earth_from_plain(told: Any) -> Earth | None:
         return None
     try:
         origin, enu_from_world = np.array(told["origin"], np.float64), np.array(told["enu_from_world"], np.float64)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
     if origin.shape != (3,) or enu_from_world.shape != (4, 4) or not np.isfinite(enu_from_world).all():
         return None

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from vplog.maps.store import other_library
 from vplog.results import tables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from vplog.data import Int32s
@@ -198,7 +199,25 @@ def _build(store: Store, group: Sequence[Content], library: str, state: BobbStat
     with ThreadPoolExecutor(threads) as pool:
         columns = list(pool.map(read, group))
     first = np.array(list(accumulate(map(len, columns), initial=0)), np.int64)
-    return Segment(library, tuple(group), first, state.lists(*columns))
+    try:
+        lists = state.lists(*columns)
+    except LibraryError:
+        for one, column in zip(group, columns, strict=True):  # whose they are
+            with of_drive(store, one.drive):
+                state.lists(column)
+        raise
+    return Segment(library, tuple(group), first, lists)
+
+
+@contextmanager
+def of_drive(store: Store, drive: str) -> Iterator[None]:
+    """Raises what is wrong with the places of a drive with its name, and what to do."""
+    try:
+        yield
+    except LibraryError as error:
+        raise LibraryError(
+            f"The places of {drive} are damaged. {error} Take the drive out: vplog map remove {store} {drive}"
+        ) from None
 
 
 def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.Array:
@@ -213,9 +232,12 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
 
 def _remove(paths: Sequence[Path], store: Store) -> None:
     """Who has them open keeps them. A file that cannot be removed does no harm."""
-    old = [path for path in store.index.glob(".*.part") if path.stat().st_mtime < time.time() - _LEFT_OVER_S]
-    for path in [*paths, *map(seal_of, paths), *old]:
+    parts = list(store.index.glob(".*.part"))
+    for path in [*paths, *map(seal_of, paths), *parts]:
         try:
-            path.unlink(missing_ok=True)
+            if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
+                path.unlink(missing_ok=True)
+        except FileNotFoundError:  # whoever wrote it has just renamed it
+            continue
         except OSError:
             return

@@ -86,7 +86,7 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
             "log": about["log"],
             "keyframes": store.rows("descriptors", drive),
             "candidates": store.rows("closures", drive),
-            "accepted": record.get("counts", {}).get("verdicts", {}).get("accepted", 0),
+            "accepted": _accepted(record.get("counts")),
             "on_earth": store.earth(drive) is not None,
             "bounds": bounds_of(about.get("earth")),
             "descriptor_bytes": sizes.get("descriptors.parquet", 0),
@@ -98,6 +98,12 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
         }
 
     return store.read(drive, read, ())
+
+
+def _accepted(counts: Any) -> int:
+    verdicts = counts.get("verdicts") if isinstance(counts, dict) else None
+    found = verdicts.get("accepted", 0) if isinstance(verdicts, dict) else 0
+    return found if isinstance(found, int) else 0
 
 
 def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> list[dict[str, Any]] | None:

@@ -12,6 +12,8 @@ from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.imports import ALONE, drives_of_file, library_of_file, take_places
+from vplog.maps.layout import folder_name
+from vplog.maps.pairs import KEPT
 from vplog.remote import local_copy, original
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive
@@ -167,10 +169,24 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
     if taken != drive:
         keys.name_keyframes(made / "keyframes.parquet", taken)
     run_record.write_run_json(made / "drive.json", record if taken == drive else keys.renamed(record, taken))
+    _link_kept(other, drive, store, taken)
     map_store.publish(store, taken, made)
     other.forget(drive)
     there.add(taken, record)
     return {**told, "as": taken, "state": "taken"}
+
+
+def _link_kept(other: Store, drive: str, store: Store, taken: str) -> None:
+    """What closures to drives that come later are checked by, so that they need the logs no more than there."""
+    source, target = (one.root / "joins" / folder_name(name) for one, name in ((other, drive), (store, taken)))
+    for name in KEPT:
+        if (source / name).is_file():
+            try:
+                target.mkdir(parents=True, exist_ok=True)
+                (target / name).unlink(missing_ok=True)
+                _linked(str(source / name), str(target / name))
+            except OSError as error:
+                raise ResultError(f"Cannot copy {source / name}: {error.strerror or error}.") from None
 
 
 def _take_file(store: Store, source: Path, there: _There, chosen: Sequence[str]) -> list[dict[str, Any]]:

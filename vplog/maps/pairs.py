@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 _CODE = ("vplog.between", "vplog.extract", "vplog.features.sift", "vplog.results.tables")
 """Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
 less than another search of all drives is worth, and drive.json has them."""
+KEPT = ("camera.json", "features.parquet")
+"""Of a drive by itself, whatever it is called and whichever drives it is with."""
 _SEARCH = "vplog.maps.candidates"
 """What chooses the drives that one is searched in."""
 

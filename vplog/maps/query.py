@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from vplog import logs
 from vplog.errors import LogError, ResultError
@@ -61,13 +60,15 @@ def query_map(
     """
     if out is not None and not out.parent.is_dir():  # before any work
         raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
+    if out is not None and out.is_dir():
+        raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
     with map_store.reading(root, cache) as store:
         drives, pipeline, state = open_map(store, threads)
-        log = logs.open(path, topics)
-        stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
         settings = pipeline.sequence
         if sequence is not None:
             settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
+        log = logs.open(path, topics)
+        stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
         answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
         table = _table(store, list(drives), answers, stamps)
     if out is not None:
@@ -83,7 +84,7 @@ def query_map(
         "views": len(stamps),
         "answered": int((answers.count > 0).sum()),
         "best_by_drive": {
-            drive: int((answers.drive[answers.count > 0, 0] == number).sum()) for number, drive in enumerate(drives)
+            drive: int((answers.drive[answers.count > 0, :1] == number).sum()) for number, drive in enumerate(drives)
         },
         "warnings": log.warnings + warnings + told,
         "answers": table.to_pylist(),
@@ -201,7 +202,7 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) 
     numbers: list[int] = number.tolist()
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
-        known = pq.read_table(path, columns=["stamp_ns"])["stamp_ns"].to_numpy()
+        known = tables.read_stamps(path)
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")

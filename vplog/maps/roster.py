@@ -70,11 +70,11 @@ def read_drives(store: Store) -> Drives:
 
 
 def is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) -> bool:
+    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have."""
     member, joins = drives.members[at], drives.joins[at]
     return joins.made_from == pairs.search_key(member, pipeline) and all(
-        pair["ledger"] and pairs.ledger_path(store, member.drive, pair["match"]).is_file()
+        drives.counts(at, pair) and pair["ledger"] and pairs.ledger_path(store, member.drive, pair["match"]).is_file()
         for pair in joins.pairs
-        if drives.counts(at, pair)
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from vplog.errors import LibraryError
 from vplog.maps.answers import NONE, Answers, answers_of, merge, no_answers
-from vplog.maps.index import as_described
+from vplog.maps.index import as_described, of_drive
 from vplog.maps.store import other_library
 from vplog.places.sequence import rank_places
 from vplog.results import tables
@@ -60,7 +60,8 @@ def best_lines(
         column, made_by = tables.read_descriptors(store.file(drive, "descriptors.parquet"))
         if made_by != library:
             raise LibraryError(other_library(store, drive, made_by, library))
-        index = state.index(state.from_arrow(as_described(store, drive, column, state)))
+        with of_drive(store, drive):
+            index = state.index(state.from_arrow(as_described(store, drive, column, state)))
         stops = np.full(len(descriptors), len(column), np.int64)
         rankings = rank_places(index, descriptors, stops, top, settings, threads)
         best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)

@@ -6,7 +6,7 @@ from collections import deque
 from concurrent.futures import BrokenExecutor
 from typing import TYPE_CHECKING, TypeVar
 
-from vplog.errors import VplogError
+from vplog.errors import VplogError, was_interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -57,5 +57,7 @@ def _finished(
         except OSError as problem:
             return task, None, f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}."
         except Exception as problem:  # a fault of ours in one task must not stop the others
+            if was_interrupted(problem):
+                raise
             return task, None, f"Internal error: {type(problem).__name__}: {' '.join(str(problem).split())[:200]}."
     return task, None, f"Its worker died {_ATTEMPTS} times: {error}"

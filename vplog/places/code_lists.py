@@ -82,7 +82,8 @@ def check_lists(lists: CodeLists) -> None:
     start = lists.start.reshape(-1)
     blocks = -(-len(lists) // lists.block)
     sound = 0 < lists.block <= MOST_ROWS and lists.start.shape[1] == blocks + 1
-    if not sound or (len(start) and (start[0] != 0 or start[-1] != len(lists.offset) or np.any(np.diff(start) < 0))):
+    ends = len(start) == 0 or (start[0] == 0 and start[-1] == len(lists.offset))
+    if not (sound and ends) or np.any(start[1:] < start[:-1]):  # not differences, which wrap round
         raise ResultError("Its lists do not fit together.")
 
 

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
     from vplog.data import Floats, Int32s, Ints
 
-_MOST_BYTES = 256 << 20
-"""Largest file read: a million spatial edges. Arrays take up to 14 times the bytes of the text they come from."""
+_MOST_BYTES = 1 << 30
+"""Largest file read: a million poses with as many edges, at 500 to 770 bytes of each. Arrays take up to 14 times the
+bytes of the text they come from."""
 _MOST_ID = 2**63 - 1
 _LEFT_OUT = re.compile(r"(VERTEX|EDGE|PARAMS|DATA|ROBOT|FLASER|RAWLASER|TRUEPOSE|LASER)[A-Z0-9_:]*$")
 """What other elements of the format are called: landmarks, priors, sensor data. A pose graph is solved without them."""

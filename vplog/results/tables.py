@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.data import Floats, Solution
+    from vplog.data import Floats, Ints, Solution
 
 ROWS_PER_GROUP = 65_536
 """Rows of a row group; 64 Ki rows of the widest table here are about 40 MB in memory."""
@@ -384,11 +384,23 @@ def read_descriptors(path: Path) -> tuple[pa.Array, str]:
     return column, (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
 
 
+def read_stamps(path: Path) -> Ints:
+    """Stamps (N,) of the rows of a table of descriptors, in ns. Raises ResultError."""
+    try:
+        with pq.ParquetFile(path) as file:
+            column = file.read(columns=["stamp_ns"])["stamp_ns"]
+    except (OSError, KeyError, UnicodeDecodeError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
+    if column.type != pa.int64() or column.null_count:
+        raise ResultError(f"{path} has stamps that are no whole numbers of nanoseconds, so it is damaged.")
+    return np.asarray(column.to_numpy(), np.int64)
+
+
 def descriptors_type(path: Path) -> pa.DataType:
     """The recogniser's own type of a table of descriptors, of which the footer alone is read. Raises ResultError."""
     try:
         return pq.read_schema(path).field("descriptor").type
-    except (OSError, KeyError, pa.ArrowException) as error:
+    except (OSError, KeyError, UnicodeDecodeError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
 
 
@@ -396,7 +408,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
     try:
         header = pq.read_schema(path).metadata or {}
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
     return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
 
@@ -437,7 +449,7 @@ def _read(path: Path, name: str, schema: pa.Schema | None) -> pa.Table:
     try:
         with pq.ParquetFile(path) as file:
             table = file.read()
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
     found = (table.schema.metadata or {}).get(b"vplog.table", b"").decode()
     if found != name:

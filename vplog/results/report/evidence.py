@@ -87,7 +87,8 @@ def references_section(content: Content) -> str:
     if not isinstance(used, list) or not used or not all(isinstance(one, int) for one in used):
         return ""
     order = sorted(range(len(used)), key=lambda number: (-used[number], number))
-    explained = part(library, "coverage").get("explained")
+    coverage = part(library, "coverage")
+    explained = coverage.get("explained") if coverage.get("frames") else None
     share = f", which explain {100 * explained:.0f} % of the frames" if isinstance(explained, int | float) else ""
     said = [
         f"<h2>Reference images</h2>\n<p>{figure(len(used))} references{share}. How many keyframes each explains, the "
