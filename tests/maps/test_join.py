@@ -187,6 +187,27 @@ def test_a_drive_that_is_removed_is_out_of_the_joint_graph(copy: Path) -> None:
     assert (copy / "joins" / "drive=drive" / "match=before.parquet").exists()
 
 
+def test_a_drive_that_was_replaced_is_said(copy: Path, verb: Callable[..., Said]) -> None:
+    assert "replaced" not in verb("map", "info", copy).err
+    record = copy / "runs" / "drive=after" / "drive.json"
+    run_record.write_run_json(record, {**json.loads(record.read_text()), "key": "of another log"})
+    assert "after was replaced since" in verb("map", "info", copy).err
+    path = copy / "joint.json"
+    joint = json.loads(path.read_text())
+    joint["groups"][0]["components"] = [{"folder": "x", "drives": 3}]
+    path.write_text(json.dumps(joint))
+    assert "of another version or damaged" in verb("map", "info", copy).err
+
+
+def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
+    command = ["map", "query", copy, drive.log]
+    assert "fewer places than the window of 99 views" in verb(*command, "--sequence", 99).err
+    assert "it is a folder" in verb(*command, "-o", tmp_path).error
+    assert "length 4 is even" in verb(*command, "--sequence", 4).error
+    shutil.rmtree(copy / "libraries")
+    assert "has lost its library" in verb(*command).error
+
+
 def test_a_merged_map_is_joined_without_logs(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     merge_maps([whole], tmp_path / "other")
     monkeypatch.setattr("vplog.maps.members.located", lambda _: tmp_path / "gone.mcap")

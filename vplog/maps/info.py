@@ -10,7 +10,7 @@ from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.earth import bounds_of
 from vplog.maps.imports import ALONE
-from vplog.maps.joint_record import components_in
+from vplog.maps.joint_record import components_in, replaced_since
 from vplog.maps.store import other_library
 from vplog.places.stored import read_library_record
 from vplog.results import run_record
@@ -113,6 +113,11 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
     except ResultError as error:
         problems.append(str(error))
         return None
+    if replaced := replaced_since(store.root, known):
+        problems.append(
+            f"{', '.join(replaced)} was replaced since, and the joint graphs hold the one before. Solve them anew: "
+            f"vplog map join {store}"
+        )
     gone = sorted({drive for one in found or [] for drive in one["drives"]} - known.keys())
     if gone:
         problems.append(

@@ -8,6 +8,7 @@ from vplog.errors import ResultError
 from vplog.results import run_record
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from vplog.maps.store import Store
@@ -20,7 +21,8 @@ def read_joint(root: Path) -> dict[str, Any]:
     """What joins the drives of a map; empty where nothing was joined yet. Raises ResultError where it is damaged.
 
     `groups` are the drives that verified closures join, each with the `components` that came of it (`folder` in
-    MAP/joint, `drives`) and the pairs kept `apart`; `alone` are the drives in no component, `apart` says of some why.
+    MAP/joint, `drives`) and the pairs kept `apart`; `alone` are the drives in no component, `apart` says of some why;
+    `keys` are those that the drives of components had in their drive.json.
     """
     path = root / "joint.json"
     if not path.is_file():
@@ -28,12 +30,20 @@ def read_joint(root: Path) -> dict[str, Any]:
     record = run_record.read_run_json(path)
     groups = record.get("groups")
     sound = isinstance(groups, list) and all(
-        isinstance(group, dict) and isinstance(group.get("key"), str) and isinstance(group.get("components"), list)
+        isinstance(group, dict)
+        and isinstance(group.get("key"), str)
+        and isinstance(group.get("components"), list)
+        and all(map(_is_component, group["components"]))
         for group in groups
     )
     if record.get("format") != FORMAT or not sound:
         raise ResultError(f"{path} is of another version or damaged. Run `vplog map join {root}` to write it anew.")
     return record
+
+
+def _is_component(told: Any) -> bool:
+    drives = told.get("drives") if isinstance(told, dict) else None
+    return isinstance(drives, list) and all(isinstance(one, str) for one in [told.get("folder"), *drives])
 
 
 def components_of(root: Path) -> list[dict[str, Any]]:
@@ -46,6 +56,13 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
     if store.mirror is not None:
         store.mirror.rest(["joint.json"])
     return components_of(store.root) if (store.root / "joint.json").is_file() else None
+
+
+def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Drives of components in whose place others of that name came, by the records of those that are there."""
+    keys = read_joint(root).get("keys")
+    keys = keys if isinstance(keys, dict) else {}
+    return sorted(drive for drive, about in drives.items() if drive in keys and about.get("key") != keys[drive])
 
 
 def write_joint(root: Path, record: dict[str, Any]) -> None:

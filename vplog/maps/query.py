@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
-from vplog.errors import LogError, ResultError
+from vplog.errors import LibraryError, LogError, ResultError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.keyframes import select_keyframes
 from vplog.maps import store as map_store
@@ -24,7 +24,7 @@ from vplog.results import tables
 from vplog.results.placed import placed_table, write_placed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
@@ -69,6 +69,7 @@ def query_map(
             settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
         log = logs.open(path, topics)
         stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
+        warnings += _short(store, drives, settings.length)
         answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
         table = _table(store, list(drives), answers, stamps)
     if out is not None:
@@ -118,7 +119,13 @@ def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pip
     """The drives of a map, its settings, and the library that describes its places. Raises VplogError."""
     library, drives = map_store.one_library(store)
     pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
-    return drives, pipeline, pipeline.places.load(store.library(library), threads)
+    folder = store.library(library)
+    if not (folder / "library.json").is_file():
+        raise LibraryError(
+            f"{store} has lost its library {library}. Copy it back to {folder}, or describe the map anew: "
+            f"vplog map redescribe {store} --library LIB -o MAP"
+        )
+    return drives, pipeline, pipeline.places.load(folder, threads)
 
 
 def describe_log(
@@ -191,6 +198,18 @@ def search(
     elif executor is not None:
         told.append(f"Ray was not used: up to {EXACT_PLACES} places sequences are drawn in every drive, here.")
     return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
+
+
+def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
+    """What to do where a window of views is longer than drives: of what is usual in them there is too little."""
+    short = [drive for drive in drives if store.rows("descriptors", drive) < length]
+    if not short:
+        return []
+    more = f" and {len(short) - 1} more have" if len(short) > 1 else " has"
+    return [
+        f"{short[0]}{more} fewer places than the window of {length} views, which hardly finds them. Look for each view "
+        "by itself: --sequence 1"
+    ]
 
 
 def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:

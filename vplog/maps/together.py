@@ -37,7 +37,8 @@ def solve_groups(
     progress("solve together", len(groups), len(groups))
     together = {drive for group in told for component in group["components"] for drive in component["drives"]}
     alone = [member.drive for member in drives.members if member.drive not in together]
-    record = {"groups": told, "alone": sorted([*alone, *drives.apart]), "apart": drives.apart}
+    keys = {drive: drives.keys[drive] for drive in sorted(together)}
+    record = {"groups": told, "alone": sorted([*alone, *drives.apart]), "apart": drives.apart, "keys": keys}
     if told or (store.root / "joint.json").exists():
         write_joint(store.root, record)
     named = {component["folder"] for group in told for component in group["components"]}
