@@ -13,16 +13,21 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import wait as futures_wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
+from vplog import batch
 from vplog.batch import run_batch
 from vplog.batch_worker import Outcome, Task, made_by
 from vplog.demo import SMALL, make_drive
+from vplog.demo.record import IMAGE
 from vplog.engine import LocalEngine, computed
 from vplog.errors import LibraryError, SettingsError
 from vplog.libraries import build_library
@@ -253,7 +258,7 @@ def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path:
     assert set(engine.begun[:6]) == set(engine.fates), "each has its turn before one is tried again"
 
 
-def test_a_process_that_dies_takes_no_other_along() -> None:
+def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch) -> None:
     with OwnProcesses(2) as executor:
         dying, living = executor.submit(signal.raise_signal, signal.SIGKILL), executor.submit(os.getpid)
         with pytest.raises(BrokenExecutor, match="killed"):
@@ -264,6 +269,18 @@ def test_a_process_that_dies_takes_no_other_along() -> None:
         slept += [executor.submit(time.sleep, 600) for _ in range(3)]
         raise KeyboardInterrupt
     assert all(future.done() for future in slept)
+    left = [KeyboardInterrupt(), KeyboardInterrupt()]
+
+    def interrupted(*told: Any) -> Any:
+        if left:
+            raise left.pop()
+        return futures_wait(*told)
+
+    monkeypatch.setattr("vplog.own_processes.wait", interrupted)
+    with pytest.raises(KeyboardInterrupt), OwnProcesses(1) as executor:  # three times
+        slept.append(executor.submit(time.sleep, 600))
+        raise KeyboardInterrupt
+    assert (slept[-1].done(), left) == (True, [])
 
 
 def test_a_process_begun_ahead_is_that_of_the_first_task_or_ends() -> None:
@@ -319,6 +336,31 @@ def test_a_log_that_cannot_be_asked_for_stops_no_other(
         ("closed", "failed"), ("drive", "unchanged"), ("drive-2", "unchanged"),
     ]  # fmt: skip
     assert str(closed) in told["drives"][0]["error"]
+
+
+def test_a_log_without_a_sound_image_stops_no_library(logs: list[Path], tmp_path: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    with logs[0].open("rb") as source, bad.open("wb") as target:
+        writer, known = Writer(target), dict[int, int]()
+        writer.start("ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in known:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                known[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            image = channel.topic == IMAGE
+            data = message.data[:60] + bytes(len(message.data) - 60) if image else message.data
+            writer.add_message(known[channel.id], message.log_time, data, message.publish_time)
+        writer.finish()
+    told = run_batch([bad, logs[0]], tmp_path / "map", load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("bad", "failed"), (logs[0].stem, "computed")]
+
+
+def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "monday").mkdir()
+    monkeypatch.chdir(tmp_path / "monday")
+    found = (batch._name(Path()), batch._name(Path("../monday")), batch._place(Path("../monday")))
+    assert found == ("monday", "monday", str(tmp_path / "monday"))
 
 
 def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:

@@ -226,14 +226,14 @@ def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
 
 def _place(path: Path) -> str:
     """Where a log is, from any folder; by the name given, whatever that is a link to."""
-    return str(path) if isinstance(path, RemotePath) else str(path.absolute())
+    return str(path) if isinstance(path, RemotePath) else os.path.abspath(path)  # noqa: PTH100
 
 
 def _name(path: Path) -> str:
     """What a log is called: its file without the ending, or its folder."""
     with suppress(OSError):  # what cannot be asked for is said of the log elsewhere
         if path.is_dir():
-            return path.name
+            return Path(_place(path)).name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
 
 

@@ -6,21 +6,26 @@ import shutil
 from typing import TYPE_CHECKING
 
 from vplog import logs
-from vplog.errors import LibraryError, VplogError
+from vplog.errors import LibraryError, LogError, ResultError, VplogError
 from vplog.libraries import build_library, check_library
 from vplog.maps import store as map_store
 from vplog.places.stored import read_library_record
-from vplog.references import PAPER_SIZE
+from vplog.references import PAPER_SIZE, evenly
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from vplog.data import Ints
     from vplog.logs import TopicChoice
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
+    from vplog.stages import Log
 
     Progress = Callable[[str, int, int], None]
+
+_TRIED = 8
+"""Frames of a log that are decoded before it is relied on: one that does is enough."""
 
 
 def map_library(
@@ -48,7 +53,12 @@ def map_library(
             )
         if known is None:
             digest = pipeline.places.load(given, threads).hash  # held against what it says of itself
-            shutil.copytree(given, made)
+            try:
+                shutil.copytree(given, made)
+            except (OSError, shutil.Error) as error:
+                shutil.rmtree(made, ignore_errors=True)
+                told = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error
+                raise ResultError(f"Cannot copy the library {given} into {store}: {told}.") from None
     elif known is None:
         digest = build_library(_that_can_be_read(paths, topics), made, pipeline, topics, threads, progress).hash
     else:
@@ -60,19 +70,38 @@ def map_library(
 
 
 def _that_can_be_read(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
-    """The first logs, as many as a library has references, without those that tell no frames: their own run says why.
+    """The first logs, as many as a library has references, without those of which no frame can be had: their own run
+    says why.
 
-    Raises LogError of the first where none has any.
+    Raises LogError of the first where there is no other.
     """
     sound, first = [], None
     for path in paths:
         try:
-            if len(logs.open(path, topics).stamps()):
+            log = logs.open(path, topics)
+            if _decodes(log, log.stamps()):
                 sound.append(path)
         except VplogError as error:
             first = first or error
+        except OSError as error:
+            first = first or LogError(f"Cannot read {path}: {error.strerror or error}.")
         if len(sound) == PAPER_SIZE:
             break
     if not sound:
         raise first or LibraryError("None of the logs has a frame, so there is nothing to build a library from.")
     return sound
+
+
+def _decodes(log: Log, stamps: Ints) -> bool:
+    """Whether one of a few frames does, over the whole drive. Raises LogError where none does."""
+    why: VplogError | None = None
+    for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
+        try:
+            encoded.decode()
+        except VplogError as error:
+            why = why or error
+        else:
+            return True
+    if why is not None:
+        raise why
+    return False

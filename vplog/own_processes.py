@@ -107,9 +107,14 @@ class OwnProcesses(ThreadPoolExecutor):
         """Wait for all, or end them where the block failed."""
         if kind is not None:
             self.shutdown(wait=False, cancel_futures=True)
-            while wait(list(self._unfinished), _TERMINATE_EVERY_S).not_done:
-                for child in multiprocessing.active_children():
-                    child.terminate()
+            ended = False
+            while not ended:
+                try:
+                    for child in multiprocessing.active_children():
+                        child.terminate()
+                    ended = not wait(list(self._unfinished), _TERMINATE_EVERY_S).not_done
+                except KeyboardInterrupt:  # once more: else the threads would wait for drives to be done
+                    continue
         done = super().__exit__(kind, error, at)
         while _ahead:
             _ahead.pop().end()
