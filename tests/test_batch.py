@@ -361,6 +361,10 @@ def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.chdir(tmp_path / "monday")
     found = (batch._name(Path()), batch._name(Path("../monday")), batch._place(Path("../monday")))
     assert found == ("monday", "monday", str(tmp_path / "monday"))
+    (tmp_path / "far" / "below").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("far/below")
+    assert batch._place(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
+    assert (batch._place(Path("../link")), batch._name(Path("../link"))) == (str(tmp_path / "link"), "link")
 
 
 def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:

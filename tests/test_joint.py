@@ -56,7 +56,7 @@ def test_a_killed_run_of_several_drives_is_gone_on_with(joint: Path, tmp_path: P
     begin_folder(out, Pipeline.read(whole["settings"], "run.json"), paths[0], 1, drives=paths)
     assert f"vplog run --resume -o {out}" in verb("evaluate", out, "--truth", "gps").error
     shutil.rmtree(out / "after")  # not come to yet
-    stale = [out / "map7.g2o", out / "before" / "joint_trajectory.old"]
+    stale = [out / "map7.g2o", out / "drive" / "joint_keyframes.parquet"]
     for file in stale:
         file.write_text("of an earlier run")
     assert "Leave out the log" in verb("run", "--resume", whole["logs"][0], "-o", out).error

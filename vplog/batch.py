@@ -226,14 +226,19 @@ def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
 
 def _place(path: Path) -> str:
     """Where a log is, from any folder; by the name given, whatever that is a link to."""
-    return str(path) if isinstance(path, RemotePath) else os.path.abspath(path)  # noqa: PTH100
+    if isinstance(path, RemotePath):
+        return str(path)
+    if path.name in ("", ".."):
+        return str(path.resolve())
+    # `..` is of the folder that a link leads to
+    return str((path.parent.resolve() if ".." in path.parts else path.parent.absolute()) / path.name)
 
 
 def _name(path: Path) -> str:
     """What a log is called: its file without the ending, or its folder."""
     with suppress(OSError):  # what cannot be asked for is said of the log elsewhere
         if path.is_dir():
-            return Path(_place(path)).name
+            return path.name if path.name not in ("", "..") else path.resolve().name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
 
 

@@ -202,7 +202,7 @@ def search(
 
 def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
     """What to do where a window of views is longer than drives: of what is usual in them there is too little."""
-    short = [drive for drive in drives if store.rows("descriptors", drive) < length]
+    short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
     if not short:
         return []
     more = f" and {len(short) - 1} more have" if len(short) > 1 else " has"
