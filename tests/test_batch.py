@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import random
+import shlex
 import shutil
 import signal
 import subprocess
@@ -29,7 +30,7 @@ from vplog.batch_worker import Outcome, Task, made_by
 from vplog.demo import SMALL, make_drive
 from vplog.demo.record import IMAGE
 from vplog.engine import LocalEngine, computed
-from vplog.errors import LibraryError, SettingsError
+from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.libraries import build_library
 from vplog.logs import TopicChoice
 from vplog.maps import store as map_store
@@ -354,6 +355,83 @@ def test_a_log_without_a_sound_image_stops_no_library(logs: list[Path], tmp_path
         writer.finish()
     told = run_batch([bad, logs[0]], tmp_path / "map", load_pipeline("default", QUICK))
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("bad", "failed"), (logs[0].stem, "computed")]
+
+
+def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path], tmp_path: Path) -> None:
+    """Joins and other libraries read it again. Nothing else of the drive changes."""
+    root = Path(shutil.copytree(whole, tmp_path / "map"))
+    moved = Path(shutil.copy2(logs[0], tmp_path / logs[0].name))
+    before = tables(root)
+    told = run_batch([moved, logs[0]], root, load_pipeline("default", QUICK), join=False)
+    # the path decides which is the known one, so the copy is another drive
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive-3", "computed"), ("drive", "unchanged")]
+    assert "the same recording, byte for byte" in told["warnings"][0]
+    told = run_batch([moved], Path(shutil.copytree(whole, tmp_path / "other")), load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged")]
+    with map_store.reading(tmp_path / "other") as store:
+        assert store.drives()["drive"]["log"] == str(moved)
+    assert tables(tmp_path / "other") == before
+
+
+def test_a_join_that_fails_takes_no_fates_along(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Callable[..., Said]
+) -> None:
+    root, bad = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+
+    def full(*_: object) -> None:
+        raise ResultError("The disk is full.")
+
+    monkeypatch.setattr(batch, "join_drives", full)
+    said = verb("batch", *logs, "-o", root, *OPTIONS)
+    assert (said.code, said.out.count("unchanged")) == (1, 2)
+    assert said.err.splitlines()[-1] == (
+        f"vplog: error: The drives are in {root}, but not joined: The disk is full. When that is mended: "
+        f"vplog map join {root}"
+    )
+    said = verb("batch", *logs, bad, "-o", root, *OPTIONS)
+    assert said.code == 1
+    assert "bad: failed, 0.0 s: " in said.err
+    assert "1 of 3 drives failed" in said.err
+    assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
+    monkeypatch.setattr("vplog.maps.keys.code_hash", lambda: "other code")
+    found = run_batch([bad], root, load_pipeline("default", QUICK), join=False)
+    assert "Another version of vplog or its packages made 2 of the drives" in found["warnings"][0]
+
+
+def test_what_was_found_stays_known_after_ctrl_c(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, bad = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "computed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_batch([bad, *logs], root, load_pipeline("default", QUICK))
+    assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
+
+
+def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, verb: Callable[..., Said]) -> None:
+    said = verb("batch", *logs, "-o", tmp_path / "map", "--odometry-file", tmp_path / "poses.tum")
+    assert "2 logs are given. Give them one by one" in said.error
+
+
+@pytest.mark.parametrize(("bad", "closed", "code"), [(False, "| true", 0), (True, "| true", 1), (True, "2>&-", 1)])
+def test_the_exit_status_is_that_of_the_batch(
+    whole: Path, logs: list[Path], tmp_path: Path, bad: bool, closed: str, code: int
+) -> None:
+    """Whoever reads what it prints, or does not."""
+    root, given = shutil.copytree(whole, tmp_path / "map"), [*logs, *([tmp_path / "gone.bag"] if bad else [])]
+    options = [*OPTIONS, "--no-join", "--threads", "1"]
+    command = shlex.join([sys.executable, "-m", "vplog", "batch", *map(str, given), "-o", str(root), *options])
+    done = subprocess.run(
+        ["bash", "-c", f"{command} {closed}; exit ${{PIPESTATUS[0]}}"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, "Exception ignored" in done.stderr) == (code, False), done.stderr
+    assert "Internal error" not in done.stderr
 
 
 def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

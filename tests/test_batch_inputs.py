@@ -6,13 +6,17 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from vplog import batch_inputs
 from vplog.batch_inputs import known_hashes
 from vplog.logs import TopicChoice
+from vplog.logs.mcap_file import MAGIC
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 @pytest.fixture
@@ -21,9 +25,9 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     found: list[str] = []
     original = batch_inputs.hash_inputs
 
-    def counted(path: Path) -> dict[str, str]:
+    def counted(path: Path, told: Callable[[int], None]) -> dict[str, str]:
         found.append(path.name)
-        return original(path)
+        return original(path, told)
 
     monkeypatch.setattr(batch_inputs, "hash_inputs", counted)
     monkeypatch.setattr(batch_inputs, "_SETTLED_S", -3600.0)
@@ -34,7 +38,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def logs(tmp_path: Path) -> dict[str, Path]:
     (tmp_path / "folder").mkdir()
     for name in ("one.mcap", "two.mcap", "folder/a.mcap", "folder/b.mcap"):
-        (tmp_path / name).write_bytes(name.encode())
+        (tmp_path / name).write_bytes(log(name))
     return {name: tmp_path / name for name in ("one.mcap", "two.mcap", "folder")}
 
 
@@ -42,15 +46,20 @@ def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dic
     return known_hashes(logs, TopicChoice.model_validate(beside), record, 2)
 
 
+def log(text: str) -> bytes:
+    """What begins as a log."""
+    return MAGIC + text.encode()
+
+
 def sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(log(text)).hexdigest()
 
 
 def test_what_has_not_changed_is_not_read_again(logs: dict[str, Path], tmp_path: Path, read: list[str]) -> None:
     record, odometry = tmp_path / ".inputs.json", tmp_path / "odometry.tum"
     odometry.write_text("0 0 0 0 0 0 0 1")
     first = asked(logs, record, odometry_file=odometry)
-    beside = {"beside odometry.tum": sha256("0 0 0 0 0 0 0 1")}
+    beside = {"beside odometry.tum": hashlib.sha256(b"0 0 0 0 0 0 0 1").hexdigest()}
     assert first == (
         [
             {"one.mcap": sha256("one.mcap"), **beside},
@@ -62,9 +71,9 @@ def test_what_has_not_changed_is_not_read_again(logs: dict[str, Path], tmp_path:
     read.clear()
     assert asked(logs, record, odometry_file=odometry) == first
     assert not read
-    (tmp_path / "folder" / "c.mcap").write_bytes(b"more")
+    (tmp_path / "folder" / "c.mcap").write_bytes(log("more"))
     now = logs["two.mcap"].stat()
-    logs["two.mcap"].write_bytes(b"TWO.mcap")
+    logs["two.mcap"].write_bytes(log("TWO.mcap"))
     os.utime(logs["two.mcap"], ns=(now.st_atime_ns, now.st_mtime_ns))  # a copy may bring its time of writing along
     while logs["two.mcap"].stat().st_ctime_ns == now.st_ctime_ns:  # clocks of file systems tick every 10 ms
         os.utime(logs["two.mcap"], ns=(now.st_atime_ns, now.st_mtime_ns))
@@ -107,7 +116,7 @@ def test_the_record_forgets_logs_that_are_gone(logs: dict[str, Path], tmp_path: 
     record = tmp_path / ".inputs.json"
     asked(logs, record)
     logs.pop("one.mcap").unlink()
-    (tmp_path / "three.mcap").write_bytes(b"three")
+    (tmp_path / "three.mcap").write_bytes(log("three"))
     asked({"three": tmp_path / "three.mcap"}, record)
     assert set(json.loads(record.read_text())) == {
         str(tmp_path / name) for name in ("two.mcap", "folder", "three.mcap")
@@ -136,3 +145,38 @@ def test_a_log_of_the_record_that_cannot_be_asked_for_stops_nothing(
 
 def test_a_record_that_cannot_be_written_is_done_without(logs: dict[str, Path], tmp_path: Path) -> None:
     assert len(asked(logs, tmp_path / "no" / ".inputs.json")[0]) == 3
+
+
+def test_what_is_no_log_is_not_read(tmp_path: Path, read: list[str]) -> None:
+    """However large; a pipe would wait for its writer."""
+    large, pipe, home = tmp_path / "disk.img", tmp_path / "pipe.mcap", tmp_path / "home"
+    with large.open("wb") as file:
+        file.truncate(10**13)
+    os.mkfifo(pipe)
+    home.mkdir()
+    (home / "large").symlink_to(large)
+    found, errors = asked({"large": large, "pipe": pipe, "home": home}, tmp_path / ".inputs.json")
+    assert found == [{}, {}, {}]
+    assert not read
+    assert "which no log does" in errors["large"]
+    assert "neither a file nor a folder" in errors["pipe"]
+    assert "no log and no images" in errors["home"]
+
+
+def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A log of 10 TB takes hours: Ctrl-C does not wait for that."""
+    large, told = tmp_path / "large.mcap", list[tuple[str, int, int]]()
+    large.write_bytes(MAGIC)
+    with large.open("r+b") as file:
+        file.truncate(10**13)
+    monkeypatch.setattr(batch_inputs, "_TELL_EVERY_S", 0.05)
+
+    def interrupt(*what: Any) -> None:
+        told.append(what)
+        if told[-1][1]:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        known_hashes({"large": large}, TopicChoice(), tmp_path / ".inputs.json", 2, interrupt)
+    assert told[-1][0] == "check (MB)"
+    assert 0 < told[-1][1] < told[-1][2] == 10**7

@@ -521,11 +521,12 @@ cli.main()
     return process
 
 
-def test_interrupted_in_the_middle(drive: Drive, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_in_the_middle(drive: Drive, tmp_path: Path, sent: signal.Signals, code: int) -> None:
     process = begun(drive, tmp_path / "run")
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     out, err = process.communicate(timeout=600)
-    assert (process.returncode, out) == (130, "")
+    assert (process.returncode, out) == (code, "")
     assert err.startswith("vplog: interrupted")
     assert len(err.splitlines()) == 1, err
     assert record_of(tmp_path / "run")["finished"] is False

@@ -17,7 +17,7 @@ from vplog.batch_inputs import NAME, known_hashes
 from vplog.batch_library import map_library
 from vplog.batch_worker import Task, made_by
 from vplog.engine import RETRIES, LocalEngine, computed, opened
-from vplog.errors import ResultError, SettingsError
+from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.imports import ALONE
@@ -45,9 +45,12 @@ is computed, at 0.3 MB a keyframe."""
 
 
 _OTHER = (
-    "Other settings made {count} of the drives that were in the map before. Give their logs too and they are made "
-    "anew; the first is {first}."
+    "{what} made {count} of the drives that were in the map before. Give their logs too and they are made anew; the "
+    "first is {first}."
 )
+_CODE = ("code", "versions")
+"""What of drive.json tells the program that made it."""
+_ALIKE = "{first} and {second} are the same recording, byte for byte: it is in the map as {drives}."
 
 
 @dataclass(frozen=True)
@@ -105,15 +108,17 @@ def run_batch(
     retries: int = RETRIES,
     join: bool = True,
     keep_cache: bool = False,
+    tell: Callable[[Drive], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Drives in, a map in `root` out: what of it is missing or made from something else is computed, `jobs` at once.
 
     On this machine every job has so many `threads`, and there is one job unless told. The engine `ray` takes the
     cluster at `address`, or one of this machine with so many threads; without `jobs` as many drives as it has cores
     for. Results depend on none of this. Without `library` the map's own is used, or one is built from the first logs.
-    A drive whose worker dies is tried again, `retries` times; one that fails is recorded and stops no other; every
-    log's fate is in the answer. At the end closures `join` what the map then has (vplog/maps/join.py). With
-    `keep_cache` what the stages came to stays in MAP/.cache, so that other settings do not need the images again.
+    A drive whose worker dies is tried again, `retries` times; one that fails is recorded and stops no other; `tell` is
+    given each as it ends, and every log's fate is in the answer. At the end closures `join` what the map then has
+    (vplog/maps/join.py); where that fails, `join_error` of the answer says why. With `keep_cache` what the stages came
+    to stays in MAP/.cache, so that other settings do not need the images again.
     Raises VplogError where the map as a whole cannot be written or does not fit the library or the settings.
     """
     topics = topics or logs.TopicChoice()
@@ -130,44 +135,45 @@ def run_batch(
         digest = map_library(store, paths, library, pipeline, topics, threads, progress)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        inputs, errors = known_hashes(dict(zip(given, paths, strict=True)), topics, store.root / NAME, threads)
+        at = dict(zip(given, paths, strict=True))
+        inputs, errors = known_hashes(at, topics, store.root / NAME, threads, progress)
         drives = keys.drive_names([_name(path) for path in paths], given, {**_failed(store), **known}, inputs)
-        done: dict[str, Drive] = {}
-        tasks = []
         alike = _alike(pipeline, topics, digest)
+        done, wanted = dict[str, Drive](), list[dict[str, Any]]()
         for drive, log, content in zip(drives, given, inputs, strict=True):
             about = {"drive": drive, "inputs": content, **alike}
             about |= {"key": keys.key_of(about), "log": log}
-            if drive in known and known[drive]["key"] == about["key"] and log not in errors:
-                done[drive] = Drive(drive, log, "unchanged")
-            elif log in errors:
+            if log in errors:
                 done[drive] = Drive(drive, log, "failed", error=errors[log])
+                tell(done[drive])
+            elif drive in known and known[drive]["key"] == about["key"]:
+                done[drive] = Drive(drive, log, "unchanged")
+                _relocate(store, drive, known[drive]["log"], log)
             else:
-                made = store.staging / f"{os.getpid()}-{len(tasks)}"
-                place = (made, store.library(digest))
-                tasks.append(Task(drive, log, *place, pipeline, topics, 1, about, _cache(store, drive)))
-        each = _threads_each(workers, jobs, len(tasks))
+                wanted.append(about)
+        each = _threads_each(workers, jobs, len(wanted))
         at_once = jobs or workers.at_once(each)
         progress("drives", len(done), len(paths))
-        tasks = [replace(task, threads=each, keep_cache=join or keep_cache) for task in tasks]
+        like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, join or keep_cache)
+        tasks = _tasks(store, wanted, like)
         places = None
         if join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
-            places = aside.submit(load_places, store.library(digest), pipeline, threads)
-        for ended in computed(workers, tasks, jobs, retries):
-            found = _put_in(store, *ended)
-            if found.state == "computed" and not ((join or keep_cache) and _has_room(store)):
-                shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
-            done[found.drive] = found
-            progress("drives", len(done), len(paths))
-        tell_failures(store, done)
-        joined = None
+            places = aside.submit(load_places, like.library, pipeline, threads)
+        try:
+            for ended in computed(workers, tasks, jobs, retries):
+                found = done[ended[0].drive] = _put_in(store, *ended)
+                if not (like.keep_cache and _has_room(store)):
+                    _forget(store, found)
+                tell(found)
+                progress("drives", len(done), len(paths))
+        finally:  # of a batch that was interrupted, too
+            unsaid = _tell_failures(store, done)
+        joined, join_error = None, ""
         if join:
             ready = None if places is None else places.result
-            joined = join_drives(store, pipeline, workers.helpers(threads), threads, progress, ready)
-        for drive in () if keep_cache else store.drives():
-            shutil.rmtree(_cache(store, drive), ignore_errors=True)
-        with suppress(OSError):  # not empty: what failed goes on there another time
-            _cache(store, "").parent.rmdir()
+            joined, join_error = _join(store, pipeline, workers.helpers(threads), threads, progress, ready)
+        if not keep_cache:
+            _forget_all(store)
     fate = [done[drive] for drive in drives]
     return {
         "map": str(root),
@@ -179,7 +185,12 @@ def run_batch(
         "failed": sum(one.state == "failed" for one in fate),
         "drives": [asdict(one) for one in fate],
         "joined": joined,
-        "warnings": _mixed([about for drive, about in known.items() if drive not in done], alike),
+        "join_error": join_error,
+        "warnings": [
+            *unsaid,
+            *_same(drives, given, inputs),
+            *_mixed([about for drive, about in known.items() if drive not in done], alike),
+        ],
     }
 
 
@@ -198,11 +209,37 @@ def tell_failures(store: Store, done: Mapping[str, Drive]) -> None:
         store.write_failures(failures)
 
 
+def _tell_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
+    """The same where a full disk must not cost the answer: then what is wrong is a warning."""
+    try:
+        tell_failures(store, done)
+    except (VplogError, OSError) as error:
+        return [f"failures.json does not tell of this batch: {error}"]
+    return []
+
+
+def _same(drives: Sequence[str], given: Sequence[str], inputs: Sequence[dict[str, str]]) -> list[str]:
+    """A warning for each recording that was given under several names: closures between them say nothing."""
+    alike: dict[tuple[str, ...], list[int]] = {}
+    for number, content in enumerate(inputs):
+        if content:
+            alike.setdefault(tuple(sorted(content.values())), []).append(number)
+    return [
+        _ALIKE.format(first=given[these[0]], second=given[these[1]], drives=" and ".join(drives[one] for one in these))
+        for these in alike.values()
+        if len(these) > 1
+    ]
+
+
 def _mixed(others: Sequence[dict[str, Any]], alike: dict[str, Any]) -> list[str]:
-    """A warning where drives that are no part of this batch were made with other settings."""
+    """Warnings where drives that are no part of this batch were made with other settings, or by another vplog."""
     made = [about for about in others if ALONE not in about]
-    other = [about["log"] for about in made if about.get("settings") != alike["settings"]]
-    return [_OTHER.format(count=len(other), first=other[0])] if other else []
+    warnings = []
+    for what, names in (("Other settings", ["settings"]), ("Another version of vplog or its packages", _CODE)):
+        other = [about["log"] for about in made if any(about.get(name) != alike[name] for name in names)]
+        if other:
+            warnings.append(_OTHER.format(what=what, count=len(other), first=other[0]))
+    return warnings
 
 
 def _cache(store: Store, drive: str) -> Path:
@@ -210,9 +247,47 @@ def _cache(store: Store, drive: str) -> Path:
     return store.root / ".cache" / folder_name(drive)
 
 
+def _forget(store: Store, found: Drive) -> None:
+    """What the stages of a drive kept; of one that failed it stays, for another time."""
+    if found.state == "computed":
+        shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
+
+
+def _forget_all(store: Store) -> None:
+    for drive in store.drives():
+        shutil.rmtree(_cache(store, drive), ignore_errors=True)
+    with suppress(OSError):  # not empty: what failed goes on there
+        _cache(store, "").parent.rmdir()
+
+
+def _relocate(store: Store, drive: str, before: str, log: str) -> None:
+    """Joins and other libraries may need the log of a drive, so the map follows where it is moved."""
+    if before != log:
+        map_store.relocate(store, drive, log)
+
+
 def _has_room(store: Store) -> bool:
     """Whether features of finished drives may stay until these are joined; they can be computed again."""
     return shutil.disk_usage(store.root).free > _FREE_BYTES
+
+
+def _tasks(store: Store, wanted: Sequence[dict[str, Any]], like: Task) -> list[Task]:
+    """A task for each drive that is to be computed, by what drive.json will say of it."""
+    return [
+        replace(
+            like, drive=about["drive"], log=about["log"], about=about, cache=_cache(store, about["drive"]),
+            folder=like.folder / f"{os.getpid()}-{number}",
+        )
+        for number, about in enumerate(wanted)
+    ]  # fmt: skip
+
+
+def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:
+    """What came of joining the map, or why nothing did: the fates of drives are not lost for that."""
+    try:
+        return join_drives(store, *how), ""
+    except (VplogError, OSError) as error:
+        return None, str(error)
 
 
 def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
-from vplog.errors import ResultError
-from vplog.inputs import changed_s, hash_inputs, look_of
+from vplog import logs as all_logs
+from vplog.errors import LogError, ResultError
+from vplog.inputs import bytes_of, changed_s, hash_inputs, look_of
 from vplog.remote import RemotePath
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from vplog.logs import TopicChoice
+
+    Progress = Callable[[str, int, int], None]
 
 NAME = ".inputs.json"
 """In the map: hidden, as it tells of the logs on this machine and nothing of the map."""
@@ -28,44 +32,69 @@ them in steps of two seconds."""
 _MOST_BYTES = 10**9
 """Longest record that is read: a million logs of several files."""
 
+_TELL_EVERY_S = 0.2
+"""How often it is said how far reading has come."""
+
 Hashes = dict[str, str]
 
 
 def known_hashes(
-    logs: Mapping[str, Path], topics: TopicChoice, record: Path, threads: int
+    logs: Mapping[str, Path], topics: TopicChoice, record: Path, threads: int, progress: Progress = lambda *_: None
 ) -> tuple[list[Hashes], dict[str, str]]:
     """sha256 of the files of each log and of those beside it, by name, in order; by log one line where they cannot be
-    read.
+    read, or are no log.
 
     A file whose length and times are those of the record, a file that is made and kept up to date, is not read. The
     record is only to save time: one that cannot be read is made anew, one that cannot be written is done without.
+    Ctrl-C ends it within a block, and `progress` tells of MB read.
     """
     beside = [file for file in (topics.odometry_file, topics.calibration_file) if file is not None]
     known = _read(record)
     seen: dict[str, dict[str, Any]] = {}
+    done, total, stop = [0] * len(logs), [0] * len(logs), Event()
 
-    def one(path: Path) -> Hashes:
+    def one(path: Path, number: int) -> Hashes:
         if isinstance(path, RemotePath):
             return hash_inputs(path)
         name, look = str(path.absolute()), look_of(path)
         if name in known and known[name]["look"] == look:
             seen[name] = known[name]
             return known[name]["hashes"]
-        asked = time.time()
-        hashes = hash_inputs(path)
+
+        def read(count: int) -> None:
+            done[number] += count
+            if stop.is_set():
+                raise CancelledError
+
+        if path not in beside:
+            all_logs.check(path)  # a folder of other things may hold anything
+        asked, total[number] = time.time(), total[number] + bytes_of(path)
+        hashes = hash_inputs(path, read)
         if look_of(path) == look and changed_s(path) < asked - _SETTLED_S:
             seen[name] = {"look": look, "hashes": hashes}
         return hashes
 
-    def of_log(path: Path) -> Hashes | str:
+    def of_log(path: Path, number: int) -> Hashes | str:
         try:
-            found = [one(file) for file in (path, *beside)]
+            found = [one(file, number) for file in (path, *beside)]
+        except LogError as error:
+            return str(error)
         except OSError as error:
             return f"Cannot read {error.filename or path}: {error.strerror or error}."
         return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}
 
     with ThreadPoolExecutor(threads) as pool:
-        answers = dict(zip(logs, pool.map(of_log, logs.values()), strict=True))
+        waiting = [pool.submit(of_log, path, number) for number, path in enumerate(logs.values())]
+        try:
+            while wait(waiting, _TELL_EVERY_S).not_done:
+                progress("check (MB)", sum(done) // 10**6, sum(total) // 10**6)
+        except BaseException:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+        answers = dict(zip(logs, (one.result() for one in waiting), strict=True))
+        if sum(done):
+            progress("check (MB)", sum(done) // 10**6, sum(done) // 10**6)
     if any(known.get(name) != about for name, about in seen.items()):
         _write(record, {**known, **seen})
     errors = {log: answer for log, answer in answers.items() if isinstance(answer, str)}

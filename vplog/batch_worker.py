@@ -93,7 +93,7 @@ def compute_drive(task: Task) -> Outcome:
     except VplogError as problem:
         error = str(problem)
     except MemoryError:
-        error, may_pass = "Out of memory. Use fewer --jobs.", True
+        error, may_pass = "Out of memory. Use fewer --jobs, or a machine with more.", True
     except OSError as problem:
         # another attempt may be on another machine, and finds what this one had done
         error, may_pass = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True

@@ -6,7 +6,9 @@ import argparse
 import json
 import logging
 import os
+import signal
 import sys
+import threading
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -44,19 +46,20 @@ _DEMO_NEXT = (
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Parse, run one verb, exit: 0 done, 1 a known error in one line, 2 wrong usage, 130 interrupted."""
+    """Parse, run one verb, exit: 0 done, 1 a known error in one line, 2 wrong usage, 130 interrupted, 143 ended."""
     # before numpy loads: every stage has its own workers, and a BLAS pool inside each would only get in their way
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
     arguments = _parser().parse_args(argv)
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
-        with _at_hand(arguments), limited(getattr(arguments, "threads", None)):
+        with _ended_by(signal.SIGTERM), _at_hand(arguments), limited(getattr(arguments, "threads", None)):
             arguments.verb(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _unheard()
         sys.exit(0)
     except KeyboardInterrupt:
         _interrupted()
@@ -94,14 +97,43 @@ def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _ended_by(number: signal.Signals) -> Iterator[None]:
+    """What asks a process to end, as schedulers and containers do, ends it as Ctrl-C: workers and scratch files go."""
+
+    def end(*_: object) -> NoReturn:
+        _ended.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+_ended: list[signal.Signals] = []
+
+
+def _unheard() -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _interrupted() -> NoReturn:
     say("interrupted; nothing is lost of what was finished in the output folder")
-    sys.exit(130)
+    sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
 
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
         raise  # noqa: PLE0704 (called from an except block)
+    try:
+        sys.stdout.flush()
+    except OSError:  # what it was cannot be told there
+        _unheard()
     say(f"error: {message}")
     sys.exit(1)
 

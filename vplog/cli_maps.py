@@ -33,6 +33,7 @@ from vplog.cli_print import (
 if TYPE_CHECKING:
     from collections.abc import Callable
     from contextlib import AbstractContextManager
+    from typing import Any
 
     from vplog.maps.cache import Cache
 
@@ -91,8 +92,6 @@ def remove_drives(arguments: argparse.Namespace) -> None:
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """The drives of a map in another map, described with another library; their logs are read again."""
-    from vplog.errors import ResultError
-
     with _drive_ahead(arguments), Progress(arguments) as progress:
         from vplog.redescribe import redescribe_map as redescribe
 
@@ -100,12 +99,8 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
             arguments.map, arguments.library, arguments.target, arguments.jobs, arguments.threads, progress,
             engine=arguments.engine, address=arguments.address, retries=arguments.retries,
         )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_redescribed(found)
-    if found["failed"]:
-        raise ResultError(f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}.")
+    wrong = f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}."
+    _end(arguments, found, print_redescribed, wrong)
 
 
 def _drive_ahead(arguments: argparse.Namespace) -> AbstractContextManager[None]:
@@ -117,8 +112,13 @@ def _drive_ahead(arguments: argparse.Namespace) -> AbstractContextManager[None]:
 
 def batch(arguments: argparse.Namespace) -> None:
     """Many recorded drives to one map that grows, each drive in a process of its own, here or over a Ray cluster."""
-    from vplog.errors import ResultError
+    from vplog.errors import SettingsError
 
+    if arguments.odometry_file is not None and len(arguments.logs) > 1:
+        raise SettingsError(
+            f"--odometry-file {arguments.odometry_file} is of one drive, and {len(arguments.logs)} logs are given. "
+            "Give them one by one, each with its own; the map grows."
+        )
     with _drive_ahead(arguments), Progress(arguments) as progress:
         from vplog.batch import run_batch, settings_for
 
@@ -126,16 +126,29 @@ def batch(arguments: argparse.Namespace) -> None:
         found = run_batch(
             arguments.logs, arguments.map, pipeline, arguments.library, topics_of(arguments), arguments.jobs,
             arguments.threads, progress, engine=arguments.engine, address=arguments.address,
-            retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
+            retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache, tell=progress.tell_drive,
         )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_batch(found)
-    if found["failed"]:
-        raise ResultError(
-            f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
-        )
+    wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
+    _end(arguments, found, print_batch, wrong)
+
+
+def _end(
+    arguments: argparse.Namespace, found: dict[str, Any], shown: Callable[[dict[str, Any]], None], wrong: str
+) -> None:
+    """Print what became of a batch. Raises ResultError where it is not all well, whether anyone reads that or not."""
+    from vplog.errors import ResultError
+
+    try:
+        if arguments.json:
+            print_json(found)
+        else:
+            shown(found)
+    finally:
+        if found["failed"]:
+            raise ResultError(wrong)
+        if found["join_error"]:
+            said = f"The drives are in {found['map']}, but not joined: {found['join_error'].rstrip('.')}."
+            raise ResultError(f"{said} When that is mended: vplog map join {found['map']}")
 
 
 def info_map(arguments: argparse.Namespace) -> None:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from vplog.batch import Drive
+
 
 def say(message: str) -> None:
     print(f"vplog: {message}", file=sys.stderr)
@@ -327,6 +329,7 @@ class Progress:
         from rich.progress import TimeRemainingColumn as Eta
 
         self._tasks: dict[str, Any] = {}
+        self._line_by_line = not (arguments.json or sys.stderr.isatty())
         self._bars = Progress(
             TextColumn("{task.description:<18}", markup=False),
             BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
@@ -345,11 +348,20 @@ class Progress:
             self._tasks[stage] = self._bars.add_task(stage, total=total)
         self._bars.update(self._tasks[stage], completed=done, total=total)
 
+    def tell_drive(self, drive: Drive) -> None:
+        """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
+        if self._line_by_line:
+            say(f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}")
+
 
 def console(stream: Any) -> Console:
     from rich.console import Console
 
-    return Console(file=stream, width=None if stream.isatty() else 160)
+    class Told(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # main() decides what comes of it; rich would exit with 1
+
+    return Told(file=stream, width=None if stream.isatty() else 160)
 
 
 def print_json(tree: dict[str, Any]) -> None:

@@ -113,6 +113,8 @@ def _brought(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
             engine.take(task, outcome)
     except BrokenExecutor as error:
         return Outcome(str(error), may_pass=True)
+    except OSError as error:  # no process more, or no room for what a machine brings
+        return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", may_pass=True)
     except VplogError as error:
         return Outcome(str(error))
     except Exception as error:  # what a worker cannot even begin with

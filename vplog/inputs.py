@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, cast
 from vplog.remote import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
+
+
+_BLOCK_BYTES = 2**20
+"""Read at once: hashing one takes a millisecond."""
 
 
 def files_of(drive: Path | Sequence[Path]) -> list[Path]:
@@ -17,8 +21,11 @@ def files_of(drive: Path | Sequence[Path]) -> list[Path]:
     return list(drive) if isinstance(drive, list | tuple) else [cast("Path", drive)]
 
 
-def hash_inputs(drive: Path | Sequence[Path]) -> dict[str, str]:
-    """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole."""
+def hash_inputs(drive: Path | Sequence[Path], told: Callable[[int], None] = lambda _: None) -> dict[str, str]:
+    """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole.
+
+    `told` the bytes of every block read; what it raises ends the reading.
+    """
     result: dict[str, str] = {}
     for own, file in _named(drive):
         name = str(file) if own in result else own
@@ -26,8 +33,17 @@ def hash_inputs(drive: Path | Sequence[Path]) -> dict[str, str]:
             result[name] = file.version()
             continue
         with file.open("rb") as stream:
-            result[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest, block = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
+            while count := stream.readinto(block):
+                digest.update(block[:count])
+                told(count)
+        result[name] = digest.hexdigest()
     return result
+
+
+def bytes_of(drive: Path | Sequence[Path]) -> int:
+    """Length of the files of a log on this machine. Raises OSError."""
+    return sum(file.stat().st_size for _, file in _named(drive) if not isinstance(file, RemotePath))
 
 
 def look_of(drive: Path | Sequence[Path]) -> dict[str, str]:

@@ -49,7 +49,7 @@ class OwnProcess:
                 return self._pool.submit(function, *args, **kwargs).result()
         except BrokenProcessPool:
             raise BrokenExecutor(
-                "Its process was killed, as for want of memory. Use fewer --jobs, and run again."
+                "Its process was killed, as for want of memory. Make room or use fewer --jobs, and run again."
             ) from None
 
     def loaded(self) -> dict[str, Any] | None:

@@ -54,7 +54,7 @@ def redescribe_map(
         _, drives = map_store.one_library(store)
         topics = {drive: run_record.read_run_json(store.file(drive, "run.json")).get("topics") for drive in drives}
         _bring_caches(store.root, target)
-    fate, missing, joined = [], dict[str, Drive](), None
+    fate, missing, joined, join_error = [], dict[str, Drive](), None, ""
     groups: dict[str, list[str]] = {}
     for drive in in_order(drives):
         log = drives[drive]["log"]
@@ -78,7 +78,7 @@ def redescribe_map(
                 paths, target, pipeline, folder, choice, jobs, threads, progress,
                 engine=engine, address=address, retries=retries, join=last,
             )  # fmt: skip
-            joined = found["joined"]
+            joined, join_error = found["joined"], found["join_error"]
             fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
         digest = read_library_record(folder)["hash"]
     fate += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
@@ -92,6 +92,7 @@ def redescribe_map(
         "failed": sum(one["state"] == "failed" for one in fate),
         "drives": fate,
         "joined": joined,
+        "join_error": join_error,
     }
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from vplog.stages import Log
 
-__all__ = ["TopicChoice", "open", "open_drive"]
+__all__ = ["TopicChoice", "check", "open", "open_drive"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
@@ -23,6 +23,13 @@ def open(path: Path, topics: TopicChoice | None = None) -> Log:
     from vplog.logs.detect import open_log  # OpenCV, rosbags and mcap load here, not with the package
 
     return open_log(path, topics or TopicChoice())
+
+
+def check(path: Path) -> None:
+    """Raises LogError where there is nothing at `path` that looks like a log; of a file a few bytes are read."""
+    from vplog.logs.detect import check_log
+
+    check_log(path)
 
 
 def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:

@@ -39,14 +39,38 @@ def open_log(path: Path, choice: TopicChoice) -> Log:
     """The log at `path`. Raises LogError where there is none that vplog reads."""
     path, notes = located(path), Notes()
     try:
-        if not path.exists():
-            raise LogError(f"No log at {path}: there is no such file or folder.")
-        if not (path.is_dir() or path.is_file()):  # to open a pipe would wait for its writer
-            raise LogError(f"{path} is neither a file nor a folder. A log is {_KNOWN}.")
+        _check_there(path)
         return _open_folder(path, choice, notes) if path.is_dir() else _open_file(path, choice, notes)
     except OSError as error:
-        reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
-        raise LogError(f"Cannot read {path}: {reason}.") from None
+        raise _unreadable(path, error) from None
+
+
+def check_log(path: Path) -> None:
+    """Raises LogError where there is nothing that could be a log, told by the first bytes of files."""
+    path = located(path)
+    try:
+        _check_there(path)
+        if not path.is_dir():
+            if not _magic(path):
+                raise LogError(_no_log(path))
+        elif not (path / "metadata.yaml").is_file():
+            files = [file for file in path.iterdir() if file.is_file()]
+            if not any(_magic(file) or image_folder.is_image(file) for file in files):
+                raise LogError(_no_folder(path, files))
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> LogError:
+    reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
+    return LogError(f"Cannot read {path}: {reason}.")
+
+
+def _check_there(path: Path) -> None:
+    if not path.exists():
+        raise LogError(f"No log at {path}: there is no such file or folder.")
+    if not (path.is_dir() or path.is_file()):  # to open a pipe would wait for its writer
+        raise LogError(f"{path} is neither a file nor a folder. A log is {_KNOWN}.")
 
 
 def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
@@ -125,8 +149,7 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         endings = {file.suffix for file in images if file.suffix}
         damaged = {file for file in files if file.suffix in endings}.difference(images)
         return ImageFolder(path, [*images, *damaged], notes, choice, damaged)
-    found = plural(len(files), "file") if files else "nothing"
-    raise LogError(f"{path} holds {found}, but no log and no images. A log is {_KNOWN}.")
+    raise LogError(_no_folder(path, files))
 
 
 def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:
@@ -178,6 +201,11 @@ def _magic(path: Path) -> str:
     with path.open("rb") as file:
         head = file.read(max(map(len, _MAGIC)))
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
+
+
+def _no_folder(path: Path, files: list[Path]) -> str:
+    found = plural(len(files), "file") if files else "nothing"
+    return f"{path} holds {found}, but no log and no images. A log is {_KNOWN}."
 
 
 def _no_log(path: Path) -> str:

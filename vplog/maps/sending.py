@@ -101,6 +101,16 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
     _after_manifest(mirror, drive, manifest)
 
 
+def relocate(mirror: Mirror, drive: str, log: str) -> None:
+    """The manifest with another place of the drive's log. Raises ResultError."""
+    manifest = {**mirror.manifests[drive], "log": log}
+    if mirror.lock is not None:
+        mirror.lock.check()
+    with told(mirror.remote):
+        put_json(mirror.remote / "runs" / folder_name(drive) / "drive.json", manifest)
+    mirror.lay(manifest)
+
+
 def _listed(folder: Path) -> list[Path]:
     """Names of the files of a folder, in order, without what is hidden."""
     names = [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]

@@ -28,6 +28,7 @@ from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps import local
 from vplog.maps.earth import earth_from_plain, earth_of_made, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
+from vplog.parquet_bounds import check_file
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
 from vplog.scratch import scratch
@@ -180,7 +181,10 @@ class Store:
     def failures(self) -> dict[str, dict[str, Any]]:
         """Log and error of each drive that failed when it was last tried, by ID."""
         path = self.root / "failures.json"
-        return run_record.read_run_json(path) if path.exists() else {}
+        found = run_record.read_run_json(path) if path.exists() else {}
+        if any(not isinstance(told, dict) or not isinstance(told.get("error"), str) for told in found.values()):
+            raise ResultError(f"{path} is damaged. Remove it: the next batch tries what failed again.")
+        return found
 
     def head(self) -> Head:
         """map.json. Raises ResultError where the folder is no map, or one of another version."""
@@ -290,6 +294,17 @@ def publish(store: Store, drive: str, made: Path) -> None:
     sending.publish(store.mirror, drive, made)
 
 
+def relocate(store: Store, drive: str, log: str) -> None:
+    """Note where the log of a drive is now; nothing else of the drive depends on it. Raises ResultError."""
+    run = store.root / "runs" / folder_name(drive)
+    if store.mirror is None:
+        run_record.write_run_json(run / "drive.json", {**drive_record(run), "log": log})
+        return
+    from vplog.maps import sending
+
+    sending.relocate(store.mirror, drive, log)
+
+
 def remove(store: Store, drive: str) -> None:
     """Take a drive out, with all that bears its name. Raises ResultError."""
     if store.mirror is None:
@@ -341,6 +356,7 @@ def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
 def row_count(path: Path) -> int:
     """Rows of a table, by its footer. Raises ResultError."""
     try:
+        check_file(path)
         return pq.read_metadata(path).num_rows
     except (OSError, pa.ArrowException) as error:
         raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Remove the drive's folders.") from None
