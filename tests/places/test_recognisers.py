@@ -153,6 +153,23 @@ def test_a_query_sorts_the_scores_and_ties_go_to_the_earlier_row(case: Case) -> 
         assert ranked[:2] == [row, row + n]  # itself and its copy
 
 
+def test_a_map_in_parts_is_ranked_as_a_whole(case: Case) -> None:
+    """Drives of a map are asked one after the other."""
+    n, cut = len(case.places), len(case.places) // 3
+    of_part = getattr(case.state, "index_of_part", case.state.index)
+    whole, parts = case.state.index(case.places), (of_part(case.places[:cut]), of_part(case.places[cut:]))
+    for place in case.places:
+        found = [part.query(place, n) for part in parts]
+        rows = np.concatenate([found[0].rows, found[1].rows + cut])
+        score = np.concatenate([one.score for one in found])
+        np.testing.assert_array_equal(np.concatenate([part.scores(place) for part in parts])[rows], score)
+        ranked = whole.query(place, n)
+        together = rows[np.lexsort((rows, -score))]
+        # what the one says is equal to its last bit may be in another order
+        np.testing.assert_allclose(whole.scores(place)[together], ranked.score, rtol=1e-6)
+        assert together[0] == ranked.rows[0]
+
+
 def test_without_a_map_nothing_is_found(case: Case) -> None:
     index = case.state.index([])
     assert len(index) == len(index.scores(case.places[0])) == len(index.query(case.places[0], 5).rows) == 0

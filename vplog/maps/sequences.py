@@ -56,12 +56,13 @@ def best_lines(
     of one view. Raises LibraryError where a drive's descriptors are of another library.
     """
     best = no_answers(len(descriptors), top)
+    of_part = getattr(state, "index_of_part", state.index)  # of a recogniser whose scores depend on the other places
     for done, (number, drive) in enumerate(drives.items()):
         column, made_by = tables.read_descriptors(store.file(drive, "descriptors.parquet"))
         if made_by != library:
             raise LibraryError(other_library(store, drive, made_by, library))
         with of_drive(store, drive):
-            index = state.index(state.from_arrow(as_described(store, drive, column, state)))
+            index = of_part(state.from_arrow(as_described(store, drive, column, state)))
         stops = np.full(len(descriptors), len(column), np.int64)
         rankings = rank_places(index, descriptors, stops, top, settings, threads)
         best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)

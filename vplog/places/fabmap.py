@@ -149,6 +149,10 @@ class FabmapState:
     def index(self, descriptors: Sequence[Words]) -> FabmapIndex:
         return FabmapIndex(self, descriptors)
 
+    def index_of_part(self, descriptors: Sequence[Words]) -> FabmapPart:
+        """Of some places of a map: what it scores compares with what other parts do."""
+        return FabmapPart(self, descriptors)
+
     def to_arrow(self, descriptors: Sequence[Words]) -> pa.Array:
         start = np.concatenate([[0], np.cumsum([len(place) for place in descriptors])]).astype(np.int32)
         words = np.concatenate([np.zeros(0, np.uint16), *descriptors]).astype(np.uint16)
@@ -179,6 +183,13 @@ class FabmapIndex:
         places, _ = self._evidence(descriptor, self._below(stop))
         return places, self._new_place(descriptor)
 
+    def log_ratio(self, descriptor: Words, stop: int | None = None) -> tuple[Floats, Bools]:
+        """(stop,) float64 log of how much likelier the image is at each place than at a new one, weighed, and whether
+        they share a word."""
+        places, shared = self._evidence(descriptor, self._below(stop))
+        new = self._new_place(descriptor) + self._state.new_place_nats
+        return self._state.weight * (places - new), shared
+
     def scores(self, descriptor: Words, stop: int | None = None) -> Float32s:
         """(stop,) natural log of each place's posterior, before smoothing.
 
@@ -208,10 +219,7 @@ class FabmapIndex:
     def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
         """The k most probable places below row `stop` that share a word; ties go to the earlier row."""
         places, _, shared = self._log_posterior(descriptor, stop)
-        score = places.astype(np.float32)
-        rows = np.flatnonzero(shared)
-        rows = rows[np.lexsort((rows, -score[rows]))][: max(k, 0)]
-        return Ranking(rows.astype(np.int32), score[rows])
+        return _best(places.astype(np.float32), shared, k)
 
     def _log_posterior(self, descriptor: Words, stop: int | None) -> tuple[Floats, float, Bools]:
         """ln p(L | Z) of the places and of a new place before smoothing, and whether a place shares a word."""
@@ -235,6 +243,32 @@ class FabmapIndex:
 
     def _below(self, stop: int | None) -> int:
         return len(self) if stop is None else min(stop, len(self))
+
+
+class FabmapPart:
+    """Some places of a map. A posterior is over all places there are, so here a place's score is the natural log of how
+    much more likely the image is there than at a new place: over the whole map the order is that of the posterior."""
+
+    def __init__(self, state: FabmapState, places: Sequence[Words]) -> None:
+        self._all = FabmapIndex(state, places)
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def scores(self, descriptor: Words, stop: int | None = None) -> Float32s:
+        """(stop,) natural log of each place's likelihood over that of a new place."""
+        return self._all.log_ratio(descriptor, stop)[0].astype(np.float32)
+
+    def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
+        """The k most probable places below row `stop` that share a word; ties go to the earlier row."""
+        ratio, shared = self._all.log_ratio(descriptor, stop)
+        return _best(ratio.astype(np.float32), shared, k)
+
+
+def _best(score: Float32s, shared: Bools, k: int) -> Ranking:
+    rows = np.flatnonzero(shared)
+    rows = rows[np.lexsort((rows, -score[rows]))][: max(k, 0)]
+    return Ranking(rows.astype(np.int32), score[rows])
 
 
 def _words(vocabulary: Vocabulary, descriptors: NDArray[np.uint8]) -> Words:
