@@ -10,6 +10,7 @@ import numpy as np
 from vplog.back_end import by_odometry
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import joint as graph_joint
+from vplog.graph.build import busier
 from vplog.graph.refine import rescaled
 
 if TYPE_CHECKING:
@@ -42,13 +43,14 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor
 def between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
     """The verified closures of a ledger, for the graph."""
     rows = np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
+    shared = busier(ledger.match[rows], ledger.query[rows])
     return graph_joint.Between(
         later,
         earlier,
         query=ledger.query[rows].astype(np.int64),
         match=ledger.match[rows].astype(np.int64),
         match_from_query=ledger.match_from_query[rows],
-        information=ledger.information[rows],
+        information=ledger.information[rows] / shared[:, None, None],
         of_odometry=np.array([ledger.scale[row] == "odometry" for row in rows.tolist()], bool),
     )
 

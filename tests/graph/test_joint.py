@@ -149,3 +149,26 @@ def test_few_closures_of_drives_that_others_join_are_kept() -> None:
     assert found.maps == [(0, 1, 2)]
     assert found.weight[2].tolist() == [1.0, 1.0]
     assert np.isfinite(found.residual[2]).all()
+
+
+def looking_alike(true: list[np.ndarray], random: np.random.Generator) -> Between:
+    """Six neighbours of the one drive that see what six of the other see, elsewhere: they agree with each other."""
+    tie = between(1, 0, true, 12, 0)
+    rows, query, match = np.zeros(6, int), np.arange(20, 26), np.arange(60, 66)
+    wrong = geometry.exp(np.array([0.0, 0.0, 0.3, 2.0, 1.0, 0.0]))
+    z = geometry.between(true[0][match], true[0][np.full(6, 60)]) @ wrong
+    z = z @ geometry.between(true[1][np.full(6, 20)], true[1][query])
+    z = z @ geometry.exp(random.normal(size=(6, 6)) * drives.CLOSURE_SIGMA)
+    return replace(
+        tie, query=query, match=match, match_from_query=z, information=tie.information[rows],
+        of_odometry=tie.of_odometry[rows],
+    )  # fmt: skip
+
+
+def test_neighbours_of_one_place_that_looks_like_another_join_nothing() -> None:
+    laps = [lap(seed) for seed in (1, 2)]
+    tie = looking_alike([true for _, true in laps], np.random.default_rng(0))
+    found = join([drive for drive, _ in laps], [tie], GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == [(0,), (1,)]
+    loose = JoinSettings(spacing=1)
+    assert join([drive for drive, _ in laps], [tie], GncSettings(), loose, RefineSettings()).maps == [(0, 1)]

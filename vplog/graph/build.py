@@ -67,9 +67,7 @@ def build_graph(
             )
         a, b = np.concatenate([a, match]), np.concatenate([b, query])
         a_from_b = np.concatenate([a_from_b, closures.match_from_query[rows]])
-        information = np.concatenate(
-            [information, closures.information[rows] / _shared(match, query, n)[:, None, None]]
-        )
+        information = np.concatenate([information, closures.information[rows] / busier(match, query)[:, None, None]])
     graph = PoseGraph(
         world_from_body=np.array(poses, np.float64),
         a=a.astype(np.int32),
@@ -82,9 +80,9 @@ def build_graph(
     return graph, rows.astype(np.int64), warnings
 
 
-def _shared(match: Int32s, query: Int32s, n: int) -> Floats:
-    """(L,) how many closures the busier end of each has."""
-    at_match, at_query = np.bincount(match, minlength=n), np.bincount(query, minlength=n)
+def busier(match: Int32s | Ints, query: Int32s | Ints) -> Floats:
+    """(L,) how many closures the busier end of each has: they share its errors, so each tells that much less."""
+    at_match, at_query = np.bincount(match), np.bincount(query)
     return np.maximum(at_match[match], at_query[query]).astype(np.float64)
 
 

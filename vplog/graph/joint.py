@@ -36,9 +36,12 @@ class JoinSettings(Settings):
     """When closures between two drives are enough to put them into one map."""
 
     least_closures: int = Field(default=3, ge=1)
-    """Closures between two drives that the solve must keep, each at keyframes of its own in both. Nothing but another
+    """Closures between two drives that the solve must keep, each at a place of its own in both. Nothing but another
     one can speak against a closure that alone joins two drives; a second may be of the same mistake, seldom a third at
-    another keyframe."""
+    another place."""
+    spacing: int = Field(default=5, ge=1)
+    """Keyframes from one such place to the next: neighbours show the same things, and what looks like another place
+    does so from all of them."""
     most_drives: int = Field(default=32, ge=1)
     """Drives that one is verified against: those whose places are most like its own. With `propose.per_query`, which
     bounds the candidates of a keyframe in all drives together, what a drive costs does not grow with their number."""
@@ -118,7 +121,7 @@ def join(
     nothing keeps its own poses. Where odometry bends more than its noise allows, the half of the pairs that closures
     speak least for goes first, so that one drive does not part all others.
     """
-    joined = [_places(one) >= settings.least_closures for one in between]
+    joined = [_places(one, settings.spacing) >= settings.least_closures for one in between]
     weight = [np.zeros(len(one.query)) for one in between]
     residual = [np.full(len(one.query), np.nan) for one in between]
     poses = [drive.graph.world_from_body for drive in drives]
@@ -137,11 +140,10 @@ def join(
         tried = solve(believed)
         solution = keep_odometry_if_worse(believed, tried, _KNOWN_TO)
         held = dict(zip(ties, rows, strict=True))
-        loose = [
-            at for at in ties if joined[at] and _places(between[at], tried.weight[held[at]]) < settings.least_closures
-        ]
+        places = {at: _places(between[at], settings.spacing, tried.weight[held[at]]) for at in ties if joined[at]}
+        loose = [at for at, count in places.items() if count < settings.least_closures]
         if not loose and solution is not tried:  # each by itself holds, and together they do not
-            loose = sorted((at for at in ties if joined[at]), key=lambda at: (tried.weight[held[at]].sum(), at))
+            loose = sorted(places, key=lambda at: (places[at], tried.weight[held[at]].sum(), at))
             loose = loose[: -(-len(loose) // 2)]
         if loose:
             for at in loose:
@@ -158,10 +160,19 @@ def join(
     return Joined(_maps(len(drives), between, joined), poses, solved, weight, residual, apart)
 
 
-def _places(one: Between, weight: Floats | None = None) -> int:
-    """Closures at keyframes of their own, of those with weight (L,): the keyframes of the drive that has fewer."""
+def _places(one: Between, spacing: int, weight: Floats | None = None) -> int:
+    """Places of the drive that has fewer, of closures with weight (L,): keyframes so far from one to the next."""
     kept = slice(None) if weight is None else weight > 0.5
-    return min(len(np.unique(one.query[kept])), len(np.unique(one.match[kept])))
+    return min(_apart(one.query[kept], spacing), _apart(one.match[kept], spacing))
+
+
+def _apart(keyframes: Ints, spacing: int) -> int:
+    """The most of the keyframes that are so far from each other."""
+    count, last = 0, -spacing
+    for one in np.unique(keyframes).tolist():
+        if one >= last + spacing:
+            count, last = count + 1, one
+    return count
 
 
 def _as_found(drives: Sequence[Drive], members: Sequence[int], graph: PoseGraph) -> PoseGraph:

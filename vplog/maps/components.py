@@ -72,7 +72,7 @@ class Solving:
     @property
     def settings(self) -> dict[str, Any]:
         chosen = {name: getattr(self, name).model_dump(mode="json") for name in ("solve", "refine")}
-        return {**chosen, "join": {"least_closures": self.join.least_closures}}
+        return {**chosen, "join": self.join.model_dump(mode="json", include={"least_closures", "spacing"})}
 
 
 def groups_of(order: Sequence[str], keys: dict[str, str], ties: Sequence[Tie], solving: Solving) -> list[Group]:
