@@ -210,6 +210,7 @@ class Fated:
 
     fates: dict[str, list[Outcome | Exception]]
     begun: list[str] = field(default_factory=list)
+    given_up: list[str] = field(default_factory=list)
     cores: int = 4
     widest: int = 4
 
@@ -230,6 +231,9 @@ class Fated:
         future.set_exception(fate) if isinstance(fate, Exception) else future.set_result(fate)
         return future
 
+    def forget(self, task: Task) -> None:
+        self.given_up.append(task.drive)
+
     def take(self, task: Task, outcome: Outcome) -> None:
         if outcome.worker == "gone":
             raise BrokenExecutor("What it gave back was lost.")
@@ -248,6 +252,7 @@ def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path:
     topics, pipeline = TopicChoice(), load_pipeline("default")
     tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
     ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in computed(engine, tasks, 2, 2)}
+    assert sorted(engine.given_up) == sorted(ended)
     assert ended == {
         "unlucky": ("", 3),
         "bad": ("No such topic.", 1),

@@ -58,6 +58,10 @@ class Engine(Protocol):
         """Have the finished run folder in `task.folder`. Raises BrokenExecutor where it is lost, ResultError."""
         ...
 
+    def forget(self, task: Task) -> None:
+        """Let go what is kept of a drive for another attempt: it is in, or given up."""
+        ...
+
 
 @contextmanager
 def opened(
@@ -102,6 +106,7 @@ def computed(
             if outcome.may_pass and attempt <= retries:
                 waiting.append((task, attempt + 1))
             else:
+                engine.forget(task)
                 yield task, outcome, attempt
 
 
@@ -140,3 +145,6 @@ class LocalEngine:
 
     def take(self, task: Task, outcome: Outcome) -> None:
         """It is there already."""
+
+    def forget(self, task: Task) -> None:
+        """Nothing is kept."""

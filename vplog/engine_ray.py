@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import secrets
 import time
-from concurrent.futures import BrokenExecutor, Executor, Future
-from contextlib import contextmanager
+from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,7 +17,7 @@ import vplog
 from vplog.batch_worker import Outcome, Task, made_by
 from vplog.errors import SettingsError, VplogError
 from vplog.parts import missing_parts, parts_of
-from vplog.ray_cluster import connected
+from vplog.ray_cluster import connected, watched_head
 from vplog.remote import located
 from vplog.scratch import packed, write_pieces
 
@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.parts import Part
+    from vplog.ray_cluster import Head
     from vplog.ray_tasks import Away
 
 _PROBE_S = 60.0
 """Until the machines of a cluster have told what they run; a slower one is asked again with each drive."""
 _DRIVE_BYTES = 2**30
 """Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
+_FETCH_S = 5.0
+"""Until it is asked again whether the cluster is there from which a piece is to come."""
 _PART_S = 6.0
 """What the frames of a part take one core. Whoever computes it opens the log for it, which may take longer."""
 
@@ -43,8 +46,8 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
     If its machines see `folder`, of the map, they do more with it. Raises SettingsError where there is no such cluster,
     or where its machines do not run what this one does.
     """
-    with connected(address, threads) as ray:
-        engine = RayEngine(ray)
+    with connected(address, threads) as ray, watched_head(ray) as head:
+        engine = RayEngine(ray, head)
         engine.check_nodes()
         if folder is not None:
             engine.look_for(folder)
@@ -54,11 +57,11 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
 class RayEngine:
     """The cluster that this process is connected to."""
 
-    def __init__(self, ray: Any) -> None:
+    def __init__(self, ray: Any, head: Head) -> None:
         from vplog import ray_tasks
 
-        self._ray, self._tasks, self._shares_disk = ray, ray_tasks, False
-        self.executor = RayExecutor(ray, ray_tasks.call)
+        self._ray, self._head, self._tasks, self._shares_disk = ray, head, ray_tasks, False
+        self.executor = RayExecutor(ray, head, ray_tasks.call)
         # a process of its own for each drive, so that memory is given back
         self._drive = ray.remote(max_calls=1, max_retries=0)(ray_tasks.call)
         self._part = ray.remote(num_cpus=1, num_returns=2)(ray_tasks.compute_part_away)
@@ -128,11 +131,17 @@ class RayEngine:
         for folder, files in places:
             for name, parts in files:
                 write_pieces(folder, name, map(self._fetched, parts))
+        self.forget(task)
+
+    def forget(self, task: Task) -> None:
+        """Let the parts of a drive go, which is in the map or given up."""
         self._parts.pop(task.drive, None)
 
     def helpers(self, threads: int) -> Executor | None:
         """Tasks over all machines, if each of them sees the map."""
-        return RayExecutor(self._ray, self._tasks.call, min(threads, self.widest)) if self._shares_disk else None
+        if not self._shares_disk or self._head.is_lost:
+            return None
+        return RayExecutor(self._ray, self._head, self._tasks.call, min(threads, self.widest))
 
     def look_for(self, folder: Path) -> None:
         """Whether all machines see a folder of this one."""
@@ -143,7 +152,11 @@ class RayEngine:
         sign.unlink()
 
     def check_nodes(self) -> None:
-        """Raises SettingsError where a machine would compute with something else than this one."""
+        """Raises SettingsError where no machine computes, or one would do so with something else than this one."""
+        if max(self._of_nodes("CPU")) < 1:
+            raise SettingsError(
+                "No machine of the Ray cluster has CPUs, as with `ray start --num-cpus 0`. Add one that has some."
+            )
         own, answers = made_by(), self._asked(self._tasks.about_node)
         for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
             found, same = self._answer(answer), f"Install the same there: vplog {vplog.__version__}."
@@ -175,36 +188,40 @@ class RayEngine:
             return error
 
     def _fetched(self, part: Any) -> Any:
-        try:
-            return self._ray.get(part)
-        except self._ray.exceptions.RayError as error:
-            raise translated(error) from None
+        while True:
+            try:
+                return self._ray.get(part, timeout=_FETCH_S)
+            except self._ray.exceptions.GetTimeoutError:
+                self._head.check()
+            except self._ray.exceptions.RayError as error:
+                raise translated(error) from None
 
     def _of_nodes(self, resource: str) -> list[float]:
+        self._head.check()
         return [node["Resources"].get(resource, 0.0) for node in self._ray.nodes() if node["Alive"]] or [0.0]
 
 
 class RayExecutor(Executor):
     """Ray tasks as `concurrent.futures` has them, with so many cores each."""
 
-    def __init__(self, ray: Any, call: Callable[..., Any], cores: int = 1) -> None:
-        self._task = ray.remote(num_cpus=cores)(call)
+    def __init__(self, ray: Any, head: Head, call: Callable[..., Any], cores: int = 1) -> None:
+        self._head, self._task = head, ray.remote(num_cpus=cores)(call)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         return self.follow(self._task.remote(fn, *args, **kwargs))
 
     def follow(self, answer: Any) -> Future[Any]:
         """The future of a Ray task, whose errors are those of this side."""
-        future: Future[Any] = Future()
+        future = self._head.future()
 
         def settle(done: Future[Any]) -> None:
             error = done.exception()
-            if error is None:
-                future.set_result(done.result())
-            else:
-                future.set_exception(translated(error))
+            with suppress(InvalidStateError):  # the head was lost before
+                if error is None:
+                    future.set_result(done.result())
+                else:
+                    future.set_exception(translated(error))
 
-        future.set_running_or_notify_cancel()
         answer.future().add_done_callback(settle)
         return future
 
@@ -216,8 +233,9 @@ def translated(error: BaseException) -> BaseException:
     if isinstance(error, exceptions.RayTaskError):
         return error.cause
     for kind, text in (
-        (exceptions.OutOfMemoryError, "Its machine ran out of memory. Use fewer --jobs"),
+        (exceptions.OutOfMemoryError, "Its machine ran out of memory. Give it more, or use fewer --jobs"),
         (exceptions.NodeDiedError, "Its machine left the cluster. Look at `ray status`"),
+        (exceptions.LocalRayletDiedError, "Ray was stopped on this machine. Start it again"),
         (exceptions.ObjectLostError, "What it gave back was lost along with a machine. Look at `ray status`"),
         (exceptions.ObjectStoreFullError, "The cluster has no room for what it gives back"),
         (exceptions.OutOfDiskError, "The cluster's disks have no room for what it gives back"),
