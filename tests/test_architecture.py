@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
-    {"data", "settings", "timing", "cores", "google_store", "web", "scratch", "own_processes"},
+    {"data", "settings", "timing", "cores", "google_store", "web", "scratch", "own_processes", "parquet_bounds"},
     {"geometry", "geodesy", "remote"},
     {"tum"},
     {"stages", "references", "inputs", "code_hash"},

@@ -11,6 +11,7 @@ import numpy as np
 from vplog import geodesy, geometry
 from vplog.boxes import boxes_of, references_of, voting_map, windows_of
 from vplog.data import Verdict
+from vplog.errors import ResultError
 from vplog.extract import one_thread_each
 from vplog.places.bobb import BobbState
 from vplog.places.bobb_paper import PaperBobbState
@@ -185,9 +186,16 @@ def earth_of(trajectory: Trajectory, gps: Gps | None, known: dict[str, Any] | No
     """Where on earth a trajectory is: as the solve found it (`known`, the `gps` of run.json), else by laying it on
     the fixes as a whole (Umeyama 1991). None without at least three fixes within the drive."""
     if known is not None:
-        origin = known["origin"]
-        where = (origin["latitude_deg"], origin["longitude_deg"], origin["altitude_m"])
-        return Earth(where, geometry.inverse(np.array(known["world_from_enu"], np.float64)))
+        try:
+            origin = [float(known["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]
+            world_from_enu = np.array(known["world_from_enu"], np.float64)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            origin, world_from_enu = [], np.empty(0)
+        if world_from_enu.shape != (4, 4) or not np.isfinite([*origin, *world_from_enu.ravel()]).all():
+            raise ResultError(
+                "The `gps` of a run.json does not say where the run is. Run it again: vplog run LOG --gps"
+            )
+        return Earth((origin[0], origin[1], origin[2]), geometry.inverse(world_from_enu))
     if gps is None or len(trajectory.stamp_ns) < 2:
         return None
     fixes = geodesy.local_enu(gps)

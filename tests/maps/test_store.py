@@ -8,7 +8,9 @@ import signal
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
 import pyarrow.dataset as ds
+import pyarrow.parquet as pq
 import pytest
 
 from vplog.errors import ResultError, SettingsError
@@ -194,3 +196,14 @@ def test_the_tables_are_a_data_set_by_drive(root: Path) -> None:
         assert found.count_rows(filter=ds.field("drive") == "one") > 0
     keyframes = ds.dataset(root / "descriptors", partitioning="hive").to_table()
     assert sorted(keyframes["drive"].to_pylist()) == ["one"] * PLACES + ["two"] * PLACES
+
+
+def test_drives_that_are_called_like_numbers_are_a_data_set_as_the_readme_has_it(tmp_path: Path) -> None:
+    root = make_map(tmp_path / "map", {"0001": 1, "0002": 2})
+    by_drive = ds.partitioning(pa.schema([("drive", pa.string())]), flavor="hive")
+    for name in map_store.TABLES:
+        for table in (
+            ds.dataset(root / name, partitioning=by_drive).to_table(),
+            pq.read_table(root / name, partitioning=by_drive),  # as pandas does
+        ):
+            assert set(table["drive"].to_pylist()) == {"0001", "0002"}, name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,8 +62,12 @@ def earth_of_made(folder: Path) -> dict[str, Any] | None:
 def bounds_of(told: Any) -> list[float] | None:
     """South, west, north, east by drive.json; None where it does not say."""
     bounds = told.get("bounds") if isinstance(told, dict) else None
-    sound = isinstance(bounds, list) and len(bounds) == 4 and all(isinstance(one, float | int) for one in bounds)
-    return bounds if sound else None
+    return bounds if isinstance(bounds, list) and len(bounds) == 4 and all(map(is_finite, bounds)) else None
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value of a record is a number to reckon with."""
+    return isinstance(value, float | int) and abs(value) <= sys.float_info.max
 
 
 def earth_from_plain(told: Any) -> Earth | None:

@@ -23,6 +23,7 @@ from vplog.errors import LibraryError, ResultError
 from vplog.maps.cache import is_sealed, seal, seal_of
 from vplog.maps.segment import SUFFIX, Content, Segment, checksum, open_segment, write_segment
 from vplog.maps.store import other_library
+from vplog.parquet_bounds import check_file
 from vplog.results import tables
 
 if TYPE_CHECKING:
@@ -108,6 +109,7 @@ def content_of(store: Store, drive: str, key: str) -> Content:
         return Content(drive, key, mark)
     path = _descriptors(store, drive)
     try:
+        check_file(path)
         with path.open("rb") as stream:
             size = stream.seek(0, 2)
             stream.seek(max(size - 8, 0))
@@ -237,7 +239,7 @@ def _remove(paths: Sequence[Path], store: Store) -> None:
         try:
             if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
                 path.unlink(missing_ok=True)
-        except FileNotFoundError:  # whoever wrote it has just renamed it
+        except (FileNotFoundError, IsADirectoryError):  # whoever wrote it has just renamed it; or it is none of ours
             continue
         except OSError:
             return

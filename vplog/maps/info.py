@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.maps.earth import bounds_of
+from vplog.maps.earth import bounds_of, is_finite
 from vplog.maps.imports import ALONE
 from vplog.maps.joint_record import components_in, replaced_since
 from vplog.maps.store import other_library
@@ -92,12 +92,18 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
             "descriptor_bytes": sizes.get("descriptors.parquet", 0),
             "descriptor_bits": record.get("descriptor_bits"),
             "bytes": sum(sizes.values()),
-            "seconds": record.get("totals", {}).get("seconds"),
-            "peak_memory_mb": record.get("totals", {}).get("peak_memory_mb"),
+            "seconds": _figure(record.get("totals"), "seconds"),
+            "peak_memory_mb": _figure(record.get("totals"), "peak_memory_mb"),
             "warnings": record.get("warnings", []),
         }
 
     return store.read(drive, read, ())
+
+
+def _figure(told: Any, name: str) -> float | None:
+    """One of the numbers of a record; None where it does not say."""
+    value = told.get(name) if isinstance(told, dict) else None
+    return value if is_finite(value) else None
 
 
 def _accepted(counts: Any) -> int:

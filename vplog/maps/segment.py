@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.errors import ResultError
+from vplog.parquet_bounds import check_file
 from vplog.places.code_lists import MOST_ROWS, CodeLists, check_lists
 from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
@@ -91,6 +92,8 @@ class Segment:
 def write_segment(folder: Path, segment: Segment) -> Path:
     """Write a segment under its name, whole or not at all. Raises ResultError where the folder cannot be written."""
     path = folder / segment.name
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe. Remove it.")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -140,6 +143,7 @@ def open_segment(path: Path) -> Segment:
     ResultError where it is no segment or a damaged one, and FileNotFoundError where it is gone.
     """
     try:
+        check_file(path)
         with path.open("rb") as stream:
             size = stream.seek(0, 2)
             stream.seek(0)

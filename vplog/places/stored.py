@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
+from vplog.parquet_bounds import check_file, open_table, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -123,6 +124,7 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
 def read_library_record(folder: Path) -> dict[str, Any]:
     """library.json of a saved library. Raises LibraryError where the folder is not one."""
     try:
+        check_file(folder / "library.json")
         record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise LibraryError(
@@ -138,11 +140,8 @@ def read_library_record(folder: Path) -> dict[str, Any]:
 def load_references(folder: Path, threads: int = 1) -> list[Reference]:
     """The references of a saved library, in their order. Raises LibraryError where the files do not fit together."""
     try:
-        files = pq.ParquetFile(folder / "features.parquet"), pq.ParquetFile(folder / "references.parquet")
-        for file, schema in zip(files, (_FEATURES, _REFERENCES), strict=True):
-            if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
-                raise LibraryError(f"{folder}: the tables are not those of a library; build it anew.")
-        features, references = (file.read() for file in files)
+        features = _table(folder / "features.parquet", _FEATURES)
+        references = _table(folder / "references.parquet", _REFERENCES)
         if any(column.null_count for table in (features, references) for column in table.columns):
             raise LibraryError(f"{folder}: the tables have empty cells; build the library anew.")
         entries = references.to_pylist()
@@ -174,6 +173,13 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(reference, range(len(entries))))
+
+
+def _table(path: Path, schema: pa.Schema) -> pa.Table:
+    with open_table(path) as file:
+        if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
+            raise LibraryError(f"{path.parent}: the tables are not those of a library; build it anew.")
+        return read_table(path, file)
 
 
 def _decode(data: bytes) -> np.ndarray | None:

@@ -8,8 +8,9 @@ header says how the bytes are to be taken.
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain, groupby
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 
 from vplog import geometry
 from vplog.errors import ResultError
+from vplog.parquet_bounds import check_file, check_size, open_table, read_table
 from vplog.results import geo, run_record, tables
 from vplog.results.atomic import replacing
 
@@ -174,9 +176,10 @@ def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
 def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
     """The table of places without descriptors, and these in the recogniser's own type. Raises ResultError."""
     try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+        with open_table(path) as file:
+            table = read_table(path, file)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
     parts = list(_parts(kind, ""))
     header = table.schema.metadata or {}
     described = header.get(b"vplog.descriptor", b"").decode()
@@ -204,11 +207,12 @@ class AboutMap:
 def about_map(path: Path) -> AboutMap:
     """The header of a map of places. Raises ResultError where it is none."""
     try:
+        check_file(path)
         header = {key.decode(): value.decode() for key, value in (pq.read_schema(path).metadata or {}).items()}
         settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
         run_record.canonical_json([settings, drives])  # not nested deeper than can be written again
     except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+        raise _unreadable(path, error) from None
     sound = isinstance(settings, dict) and isinstance(drives, dict)
     sound = sound and all(isinstance(told, dict) for told in drives.values())
     if header.get("vplog.table") != "map" or not sound:
@@ -222,13 +226,13 @@ def places_by_drive(path: Path) -> dict[str, int]:
     """How many places of each drive are in a map. Raises ResultError."""
     found: dict[str, int] = {}
     try:
-        with pq.ParquetFile(path, read_dictionary=["drive"]) as file:
+        with _opened(path, ["drive"]) as file:
             for batch in file.iter_batches(ROWS_PER_GROUP, columns=["drive"]):
                 for value in batch.column(0).value_counts():
                     drive = str(value["values"])
                     found[drive] = found.get(drive, 0) + value["counts"].as_py()
-    except (OSError, KeyError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+    except (OSError, ValueError, KeyError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
     return found
 
 
@@ -241,7 +245,7 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
     schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])
     done, waiting = set[str](), list[pa.Table]()
     try:
-        with pq.ParquetFile(path, read_dictionary=["drive"]) as file:
+        with _opened(path, schema.names) as file:
             for number in range(file.num_row_groups):
                 if (rows := file.metadata.row_group(number).num_rows) > _MOST_ROWS:
                     raise ResultError(f"{path} has {rows} places in a row group; write it with at most {_MOST_ROWS}.")
@@ -257,19 +261,33 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
         if waiting:
             yield _places_of(waiting, path, parts, kind)
     except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+        raise _unreadable(path, error) from None
+
+
+@contextmanager
+def _opened(path: Path, columns: list[str]) -> Iterator[pq.ParquetFile]:
+    """A file of places that takes no more memory than it may, with its drives as numbers. Raises ValueError where these
+    columns would take more."""
+    check_file(path)
+    with pq.ParquetFile(path, read_dictionary=["drive"]) as file:
+        check_size(path, file, columns)
+        yield file
+
+
+def _unreadable(path: Path, error: Exception) -> ResultError:
+    why = next(iter(str(error).splitlines()), type(error).__name__)
+    return ResultError(f"{path} cannot be read: {why} Write it anew: vplog map export MAP -o FILE.parquet")
 
 
 def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
     """Rows of one drive after the other."""
     drives = table["drive"].combine_chunks()
     if drives.null_count:
-        raise ValueError("there are places of no drive")
-    at = 0
-    for number, rows in groupby(drives.indices.to_pylist()):
-        count = sum(1 for _ in rows)
-        yield drives.dictionary[number].as_py(), table.slice(at, count)
-        at += count
+        raise ValueError("There are places of no drive.")
+    numbers = drives.indices.to_numpy()
+    starts = np.flatnonzero(np.diff(numbers, prepend=-1))
+    for start, stop in pairwise([*starts.tolist(), len(numbers)]):
+        yield drives.dictionary[int(numbers[start])].as_py(), table.slice(start, stop - start)
 
 
 def _places_of(tables_of_drive: list[pa.Table], path: Path, parts: list[Any], kind: pa.DataType) -> DrivePlaces:

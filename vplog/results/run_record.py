@@ -8,10 +8,15 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.parquet_bounds import check_file
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
+
+_MOST_DEPTH = 100
+"""Values within values, of which ours have ten; Python follows a few hundred."""
 
 
 def write_run_json(path: Path, record: dict[str, Any]) -> None:
@@ -24,16 +29,33 @@ def write_run_json(path: Path, record: dict[str, Any]) -> None:
 def read_run_json(path: Path) -> dict[str, Any]:
     """The record of a run folder. Raises ResultError where the file is missing or is no JSON object."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        check_file(path)
+        record = _sound_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ResultError(
-            f"Cannot read {path}: {error.strerror}. Is {path.parent} the output of `vplog run`?"
+            f"Cannot read {path}: {error.strerror or error}. Is {path.parent} the output of `vplog run`?"
         ) from None
     except (ValueError, RecursionError):
         raise ResultError(f"{path} is not JSON. Run `vplog run` again to write it anew.") from None
     if not isinstance(record, dict):
         raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again to write it anew.")
     return record
+
+
+def _sound_json(text: str) -> Any:
+    """What a text says, if it can be written again. Raises ValueError or RecursionError."""
+    tree = json.loads(text)
+    if "\\u" in text:  # half a character that takes two, which no file or terminal can hold
+        json.dumps(tree, ensure_ascii=False).encode()
+    level, depth = [tree] if text.count("[") + text.count("{") > _MOST_DEPTH else [], 0
+    while level := [part for one in level if isinstance(one, dict | list) for part in _parts(one)]:
+        if (depth := depth + 1) > _MOST_DEPTH:
+            raise ValueError(f"values are nested in more than {_MOST_DEPTH} others")
+    return tree
+
+
+def _parts(one: dict[str, Any] | list[Any]) -> Iterable[Any]:
+    return one.values() if isinstance(one, dict) else one
 
 
 def read_finished_run(folder: Path) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import vplog
 from vplog import geometry
 from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.errors import ResultError
+from vplog.parquet_bounds import check_file, open_table, read_table
 from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
 
@@ -379,17 +380,21 @@ def _own(array: pa.Array) -> pa.Array:
 
 def read_descriptors(path: Path) -> tuple[pa.Array, str]:
     """The descriptors in the order of the keyframes, and the hash of the library they belong to."""
-    table = _read(path, "descriptors", None)
-    column = table["descriptor"].combine_chunks()
-    return column, (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
+    try:
+        with open_table(path) as file:
+            _check_name(path, "descriptors", file.schema_arrow)
+            table = read_table(path, file, ["descriptor"])
+        return table["descriptor"].combine_chunks(), (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from None
 
 
 def read_stamps(path: Path) -> Ints:
     """Stamps (N,) of the rows of a table of descriptors, in ns. Raises ResultError."""
     try:
-        with pq.ParquetFile(path) as file:
-            column = file.read(columns=["stamp_ns"])["stamp_ns"]
-    except (OSError, KeyError, UnicodeDecodeError, pa.ArrowException) as error:
+        with open_table(path) as file:
+            column = read_table(path, file, ["stamp_ns"])["stamp_ns"]
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
     if column.type != pa.int64() or column.null_count:
         raise ResultError(f"{path} has stamps that are no whole numbers of nanoseconds, so it is damaged.")
@@ -399,18 +404,20 @@ def read_stamps(path: Path) -> Ints:
 def descriptors_type(path: Path) -> pa.DataType:
     """The recogniser's own type of a table of descriptors, of which the footer alone is read. Raises ResultError."""
     try:
+        check_file(path)
         return pq.read_schema(path).field("descriptor").type
-    except (OSError, KeyError, UnicodeDecodeError, pa.ArrowException) as error:
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
     try:
+        check_file(path)
         header = pq.read_schema(path).metadata or {}
-    except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
+        return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
-    return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
 
 
 def _write(path: Path, name: str, schema: pa.Schema, columns: dict[str, Any], metadata: TableMetadata) -> None:
@@ -444,33 +451,38 @@ def _with_metadata(schema: pa.Schema, name: str, metadata: TableMetadata) -> pa.
     return schema.with_metadata({**metadata.record(), "vplog.table": name})
 
 
-def _read(path: Path, name: str, schema: pa.Schema | None) -> pa.Table:
-    """The table with the columns of the schema (any where None), checked. Raises ResultError."""
+def _read(path: Path, name: str, schema: pa.Schema) -> pa.Table:
+    """The table with the columns of the schema, checked. Raises ResultError."""
     try:
-        with pq.ParquetFile(path) as file:
-            table = file.read()
-    except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
+        with open_table(path) as file:
+            found = file.schema_arrow
+            _check_name(path, name, found)
+            for column in schema:
+                if column.name not in found.names or found.field(column.name).type != column.type:
+                    raise ResultError(
+                        f"{path} has no column {column.name} of type {column.type}: it is of another version of vplog. "
+                        "Run `vplog run` again."
+                    )
+            table = read_table(path, file, schema.names)
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
-    found = (table.schema.metadata or {}).get(b"vplog.table", b"").decode()
-    if found != name:
-        raise ResultError(f"{path} is not a {name} table of vplog (it says {found!r}). Give the folder of a run.")
-    if schema is None:
-        return table
     for column in schema:
-        if column.name not in table.schema.names or table.schema.field(column.name).type != column.type:
-            raise ResultError(
-                f"{path} has no column {column.name} of type {column.type}: it is of another version of vplog. "
-                "Run `vplog run` again."
-            )
         if not column.nullable and table[column.name].null_count:
             raise ResultError(f"{path} holds nulls in column {column.name}. Run `vplog run` again.")
     return table
 
 
+def _check_name(path: Path, name: str, schema: pa.Schema) -> None:
+    found = (schema.metadata or {}).get(b"vplog.table", b"").decode()
+    if found != name:
+        raise ResultError(f"{path} is not a {name} table of vplog (it says {found!r}). Give the folder of a run.")
+
+
 def _unreadable(path: Path, error: Exception) -> ResultError:
     if isinstance(error, FileNotFoundError):
         return ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.")
-    return ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Run `vplog run` again to write it anew.")
+    why = next(iter(str(error).splitlines()), type(error).__name__)
+    return ResultError(f"{path} cannot be read: {why} Run `vplog run` again to write it anew.")
 
 
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
