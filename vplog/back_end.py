@@ -16,6 +16,7 @@ from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.satellites import fixes_on
+from vplog.graph.solve import gated
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -105,8 +106,7 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
 
 def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
     """The robust solution, or the odometry where that cannot be believed."""
-    solution = consistency.keep_odometry_if_worse(graph, settings.solve(graph))
-    return cross_checked(graph, solution, settings.cross_check)
+    return cross_checked(graph, gated(graph, settings.solve), settings.cross_check)
 
 
 def without_metres(closures: Closures) -> Ints:

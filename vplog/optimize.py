@@ -12,8 +12,7 @@ from vplog.data import EdgeKind, PoseGraph, Solution
 from vplog.errors import GraphError
 from vplog.geometry import inverse
 from vplog.graph.build import checked, parts
-from vplog.graph.consistency import keep_odometry_if_worse
-from vplog.graph.solve import OptimiserSettings
+from vplog.graph.solve import OptimiserSettings, gated
 from vplog.results.g2o import read_g2o, write_g2o
 from vplog.timing import Watch
 
@@ -88,7 +87,7 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
             graph.dimension,
         )
         alone, repairs = checked(alone)
-        solution = keep_odometry_if_worse(alone, optimiser(alone))
+        solution = gated(alone, optimiser)
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
         warnings += [where + text for text in repairs]
         poses[rows], weight[edges] = solution.world_from_body, solution.weight

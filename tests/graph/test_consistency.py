@@ -12,13 +12,14 @@ from vplog.data import EdgeKind
 from vplog.graph import descent
 from vplog.graph.consistency import (
     chi2_quantile,
+    is_loop,
     keep_odometry_if_worse,
     odometry_chain,
     residual_before,
     residual_sigma,
 )
 from vplog.graph.factors import Factors
-from vplog.graph.solve import GncSettings, LmSettings
+from vplog.graph.solve import GncSettings, LmSettings, gated
 
 from .drive import ring, without_loops
 
@@ -97,6 +98,17 @@ def test_a_sound_solution_is_left_alone(seed: int) -> None:
     for graph in (ring(seed=seed).graph, ring(false=10, seed=seed).graph, without_loops(ring(seed=seed).graph)):
         solution = GncSettings()(graph)
         assert keep_odometry_if_worse(graph, solution) is solution
+
+
+def test_noise_told_a_little_too_small_costs_no_closures_in_large_graphs() -> None:
+    """Where each was held against the others; what an optimiser believes without that must not bend odometry so far."""
+    graph = ring(3000, 600, seed=1).graph
+    odometry = ~is_loop(graph)
+    information = np.where(odometry[:, None, None], graph.information * 1.3**2, graph.information)
+    sure = replace(graph, information=information)
+    assert keep_odometry_if_worse(sure, GncSettings()(sure)).weight[~odometry].sum() == 0
+    assert gated(sure, GncSettings()).weight[~odometry].sum() > 0.9 * (~odometry).sum()
+    assert gated(sure, LmSettings()).weight[~odometry].sum() == 0
 
 
 @pytest.mark.parametrize("dof", [6, 60, 6000])

@@ -11,7 +11,7 @@ from pydantic import Field
 from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
 from vplog.graph.build import parts
-from vplog.graph.consistency import is_loop, keep_odometry_if_worse, residual_sigma
+from vplog.graph.consistency import KNOWN_TO, is_loop, keep_odometry_if_worse, residual_sigma
 from vplog.graph.refine import RefineSettings, refine
 from vplog.settings import Settings
 
@@ -25,11 +25,6 @@ if TYPE_CHECKING:
     from vplog.stages import Optimiser
 
     Bools = NDArray[np.bool_]
-
-
-_KNOWN_TO = 30
-"""Degrees of freedom from which the noise of odometry is known at best, as `refine.least_redundancy` has it. Joint
-graphs check it with as many as they are large, by which every real covariance would be found wrong."""
 
 
 class JoinSettings(Settings):
@@ -138,7 +133,7 @@ def join(
         graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
         believed = _as_found(drives, members, graph)
         tried = solve(believed)
-        solution = keep_odometry_if_worse(believed, tried, _KNOWN_TO)
+        solution = keep_odometry_if_worse(believed, tried, KNOWN_TO)
         held = dict(zip(ties, rows, strict=True))
         places = {at: _places(between[at], settings.spacing, tried.weight[held[at]]) for at in ties if joined[at]}
         loose = [at for at, count in places.items() if count < settings.least_closures]
