@@ -34,6 +34,9 @@ def locked(root: Path) -> Iterator[None]:
             raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
     try:
         root.mkdir(parents=True, exist_ok=True)
+        for path in root.iterdir():
+            if path.is_symlink() and not path.is_dir():  # of a map from elsewhere: what is written would go anywhere
+                raise SettingsError(f"{path} is a link, and a map holds its own files. Put a copy in its place.")
         lock = (root / ".lock").open("a")
     except OSError as error:
         raise SettingsError(f"Cannot make the map {root}: {error.strerror}. Choose another folder with -o.") from None

@@ -190,6 +190,8 @@ class Store:
         """map.json. Raises ResultError where the folder is no map, or one of another version."""
         path = self.root / "map.json"
         if not path.is_file():
+            if (self.root / "run.json").is_file():
+                raise ResultError(f"{self} is the folder of one run, not a map. Make one: vplog batch LOG... -o MAP")
             raise ResultError(f"{self} is not a map: it has no map.json. Make one: vplog batch LOG... -o {self}")
         record = run_record.read_run_json(path)
         if record.get("format") != FORMAT:
