@@ -90,7 +90,7 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
         assert workers == {"engine": "local", "address": None, "retries": 2}
         asked.append(([path.parent.name for path in paths], topics.image, pipeline.places.kind))
         fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
-        return {"drives": fate, "joined": None}
+        return {"drives": fate, "joined": None, "join_error": ""}
 
     monkeypatch.setattr("vplog.redescribe.run_batch", run_batch)
     other = tmp_path / "library"
