@@ -469,3 +469,11 @@ def test_engines_that_are_not_there_are_said(logs: list[Path], tmp_path: Path, m
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(SettingsError, match=r"pip install 'vplog\[ray\]'"):
         run_batch(logs, tmp_path / "map", pipeline, engine="ray")
+
+
+def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:
+    at = {name: tmp_path / name for name in ("short", "gone", "long", "same")}
+    for name, size in (("short", 10), ("long", 30), ("same", 10)):
+        at[name].write_bytes(bytes(size))
+    found = batch._longest_first([{"log": name} for name in at], at)
+    assert [about["log"] for about in found] == ["long", "short", "same", "gone"]

@@ -18,6 +18,7 @@ from vplog.batch_library import map_library
 from vplog.batch_worker import Task, made_by
 from vplog.engine import RETRIES, LocalEngine, computed, opened
 from vplog.errors import ResultError, SettingsError, VplogError
+from vplog.inputs import bytes_of
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.imports import ALONE
@@ -155,7 +156,7 @@ def run_batch(
         at_once = jobs or workers.at_once(each)
         progress("drives", len(done), len(paths))
         like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, join or keep_cache)
-        tasks = _tasks(store, wanted, like)
+        tasks = _tasks(store, wanted if at_once == 1 else _longest_first(wanted, at), like)
         places = None
         if join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
             places = aside.submit(load_places, like.library, pipeline, threads)
@@ -280,6 +281,18 @@ def _tasks(store: Store, wanted: Sequence[dict[str, Any]], like: Task) -> list[T
         )
         for number, about in enumerate(wanted)
     ]  # fmt: skip
+
+
+def _longest_first(wanted: Sequence[dict[str, Any]], at: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """By the bytes of the logs, so that none of the long ones is begun when all others are done."""
+
+    def size(about: dict[str, Any]) -> int:
+        try:
+            return bytes_of(at[about["log"]])
+        except OSError:  # its own run says why
+            return 0
+
+    return sorted(wanted, key=size, reverse=True)
 
 
 def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:

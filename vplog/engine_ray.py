@@ -47,7 +47,7 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
     or where its machines do not run what this one does.
     """
     with connected(address, threads) as ray, watched_head(ray) as head:
-        engine = RayEngine(ray, head)
+        engine = RayEngine(ray, head, address is None)
         engine.check_nodes()
         if folder is not None:
             engine.look_for(folder)
@@ -57,9 +57,10 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
 class RayEngine:
     """The cluster that this process is connected to."""
 
-    def __init__(self, ray: Any, head: Head) -> None:
+    def __init__(self, ray: Any, head: Head, is_ours: bool) -> None:
         from vplog import ray_tasks
 
+        self._is_ours = is_ours
         self._ray, self._head, self._tasks, self._shares_disk = ray, head, ray_tasks, False
         self.executor = RayExecutor(ray, head, ray_tasks.call)
         # a process of its own for each drive, so that memory is given back
@@ -86,6 +87,8 @@ class RayEngine:
             self._library = task.library, self._ray.put(packed(task.library))
         memory = min(_DRIVE_BYTES, int(max(self._of_nodes("memory"))))
         drive = self._drive.options(num_cpus=task.threads, memory=memory, name=f"vplog {task.drive}")
+        if self._is_ours:  # nobody else's tasks are there, and the system shares out the cores, the last drive has all
+            task = replace(task, threads=self.widest)
         parts = self._scattered(task, cores)
         data, failed = [(part, data) for part, _, data in parts], [failed for _, failed, _ in parts]
         # Ray begins it when `failed` is known of every part; their bytes it takes one after the other
