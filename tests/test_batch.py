@@ -367,7 +367,12 @@ def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path
     root = Path(shutil.copytree(whole, tmp_path / "map"))
     moved = Path(shutil.copy2(logs[0], tmp_path / logs[0].name))
     before = tables(root)
-    told = run_batch([moved, logs[0]], root, load_pipeline("default", QUICK), join=False)
+    cut, again = tmp_path / "cut.mcap", tmp_path / "again.mcap"
+    for bad in (cut, again):
+        bad.write_bytes(logs[0].read_bytes()[:200])
+    told = run_batch([moved, logs[0], cut, again], root, load_pipeline("default", QUICK), join=False)
+    assert (told["failed"], len(told["warnings"])) == (2, 1)
+    told["drives"] = told["drives"][:2]
     # the path decides which is the known one, so the copy is another drive
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive-3", "computed"), ("drive", "unchanged")]
     assert "the same recording, byte for byte" in told["warnings"][0]
@@ -424,7 +429,10 @@ def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, ver
     assert "2 logs are given. Give them one by one" in said.error
 
 
-@pytest.mark.parametrize(("bad", "closed", "code"), [(False, "| true", 0), (True, "| true", 1), (True, "2>&-", 1)])
+@pytest.mark.parametrize(
+    ("bad", "closed", "code"),
+    [(False, "| true", 0), (True, "| true", 1), (True, "2>&-", 1), (True, "2>&1 | true", 1), (True, "2>/dev/full", 1)],
+)
 def test_the_exit_status_is_that_of_the_batch(
     whole: Path, logs: list[Path], tmp_path: Path, bad: bool, closed: str, code: int
 ) -> None:
@@ -437,6 +445,8 @@ def test_the_exit_status_is_that_of_the_batch(
     )
     assert (done.returncode, "Exception ignored" in done.stderr) == (code, False), done.stderr
     assert "Internal error" not in done.stderr
+    failures = Path(root, "failures.json")
+    assert bool(failures.exists() and json.loads(failures.read_text())) == bad
 
 
 def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,7 +38,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet_bounds, "ALWAYS_BYTES", 2**20)
 
 
-@pytest.mark.parametrize("rows", [1000, ROWS])
+@pytest.mark.parametrize("rows", [4000, ROWS])
 def test_places_of_a_few_bytes_are_read_up_to_a_bound(tmp_path: Path, rows: int) -> None:
     path, start = tmp_path / "descriptors.parquet", pa.total_allocated_bytes()
     schema = tables.descriptors_schema(PLACE).with_metadata({"vplog.table": "descriptors"})

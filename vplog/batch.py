@@ -173,7 +173,7 @@ def run_batch(
         if join:
             ready = None if places is None else places.result
             joined, join_error = _join(store, pipeline, workers.helpers(threads), threads, progress, ready)
-        if not keep_cache:
+        if not keep_cache and not join_error:  # another join would need it
             _forget_all(store)
     fate = [done[drive] for drive in drives]
     return {
@@ -189,7 +189,7 @@ def run_batch(
         "join_error": join_error,
         "warnings": [
             *unsaid,
-            *_same(drives, given, inputs),
+            *_same(fate, inputs),
             *_mixed([about for drive, about in known.items() if drive not in done], alike),
         ],
     }
@@ -219,14 +219,14 @@ def _tell_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
     return []
 
 
-def _same(drives: Sequence[str], given: Sequence[str], inputs: Sequence[dict[str, str]]) -> list[str]:
-    """A warning for each recording that was given under several names: closures between them say nothing."""
-    alike: dict[tuple[str, ...], list[int]] = {}
-    for number, content in enumerate(inputs):
-        if content:
-            alike.setdefault(tuple(sorted(content.values())), []).append(number)
+def _same(fate: Sequence[Drive], inputs: Sequence[dict[str, str]]) -> list[str]:
+    """A warning for each recording that is in under several names: closures between them say nothing."""
+    alike: dict[tuple[str, ...], list[Drive]] = {}
+    for one, content in zip(fate, inputs, strict=True):
+        if content and one.state != "failed" and "://" not in one.log:  # of those the bytes are not known
+            alike.setdefault(tuple(sorted(content.values())), []).append(one)
     return [
-        _ALIKE.format(first=given[these[0]], second=given[these[1]], drives=" and ".join(drives[one] for one in these))
+        _ALIKE.format(first=these[0].log, second=these[1].log, drives=" and ".join(one.drive for one in these))
         for these in alike.values()
         if len(these) > 1
     ]

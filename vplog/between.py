@@ -12,6 +12,7 @@ from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import calibration_share, verify_between
 from vplog.places.sequence import rank_places
 from vplog.places.shared import Shared, SharesReferences
+from vplog.stages import index_of_part
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -66,7 +67,8 @@ def proposed_in(
 ) -> Proposals:
     """The candidates of the places `later` among those of one drive."""
     stops = np.full(len(later), len(earlier), np.int64)
-    ranked = rank_places(state.index(earlier), later, stops, pipeline.propose.asked, pipeline.sequence, threads)
+    index = index_of_part(state, earlier)
+    ranked = rank_places(index, later, stops, pipeline.propose.asked, pipeline.sequence, threads)
     return propose(ranked, pipeline.propose)
 
 
@@ -92,7 +94,8 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
 def likely_drives(candidates: Candidates, settings: JoinSettings) -> list[int]:
     """Numbers of the drives that are worth a look, increasing: those that hold most, and enough to join."""
     numbers, counts = np.unique(candidates.drive, return_counts=True)
-    weight = np.array([candidates.proposals.score[candidates.drive == one].sum(dtype=np.float64) for one in numbers])
+    score = np.maximum(candidates.proposals.score, 0.0)  # less than nothing would make more of them less
+    weight = np.array([score[candidates.drive == one].sum(dtype=np.float64) for one in numbers])
     enough = np.flatnonzero(counts >= settings.least_closures)
     best = enough[np.lexsort((numbers[enough], -weight[enough]))][: settings.most_drives]
     return np.sort(numbers[best]).tolist()

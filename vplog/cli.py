@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -108,6 +108,7 @@ def _ended_by(number: signal.Signals) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    _ended.clear()
     before = signal.signal(number, end)
     try:
         yield
@@ -119,7 +120,8 @@ _ended: list[signal.Signals] = []
 
 
 def _unheard() -> None:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    with suppress(OSError):  # what stands in for stdout may be no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted() -> NoReturn:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import textwrap
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
 
 
 def say(message: str) -> None:
-    print(f"vplog: {message}", file=sys.stderr)
+    """A line on stderr. Where that is closed or full, no work is lost for it."""
+    with suppress(OSError):
+        print(f"vplog: {message}", file=sys.stderr)
 
 
 def print_info(found: dict[str, Any]) -> None:

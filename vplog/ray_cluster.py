@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import signal
 import socket
 import subprocess
 import sys
@@ -88,7 +89,7 @@ class Head:
         told = os.environ.get(_RAY_WAITS, "")
         patience_s = max(_LOST_S, int(told) / 2 if told.isdecimal() else 0)
         while not ended.wait(_LOST_S / 10):
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 socket.create_connection((place[0].strip("[]"), int(place[2])), _CONNECT_S).close()
                 heard = time.monotonic()
             self.is_lost = self.is_lost or time.monotonic() - heard > patience_s
@@ -174,11 +175,17 @@ def _check_answers(address: str) -> None:
 
 
 def _connect(ray: Any, address: str, **more: Any) -> None:
+    ends = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR", **more)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # of many kinds, by what is wrong and by version; the end of this process is one
         what = "start a Ray cluster here" if address == "local" else f"join the Ray cluster at {address}"
+        if getattr(error, "code", None) == signal.SIGTERM and callable(ends):
+            ends(signal.SIGTERM, None)  # Ray's own handler was asked in place of ours
         text = " ".join(str(error).split())[:400] or type(error).__name__
         raise SettingsError(f"Cannot {what}: {text}") from None
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, ends)

@@ -124,6 +124,12 @@ class PlaceState(Protocol):
     def save(self, folder: Path) -> None: ...
 
 
+def index_of_part(state: PlaceState, descriptors: Sequence[Any]) -> PlaceIndex:
+    """An index of some places of a map, whose scores compare with those of its other parts: where they depend on all
+    places, as FAB-MAP's posterior does, the recogniser's own for that."""
+    return getattr(state, "index_of_part", state.index)(descriptors)
+
+
 class Recogniser(Protocol):
     def learn(self, references: Iterable[Reference], threads: int) -> PlaceState: ...
 

@@ -19,6 +19,7 @@ from vplog.maps.index import as_described, of_drive
 from vplog.maps.store import other_library
 from vplog.places.sequence import rank_places
 from vplog.results import tables
+from vplog.stages import index_of_part
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -56,13 +57,12 @@ def best_lines(
     of one view. Raises LibraryError where a drive's descriptors are of another library.
     """
     best = no_answers(len(descriptors), top)
-    of_part = getattr(state, "index_of_part", state.index)  # of a recogniser whose scores depend on the other places
     for done, (number, drive) in enumerate(drives.items()):
         column, made_by = tables.read_descriptors(store.file(drive, "descriptors.parquet"))
         if made_by != library:
             raise LibraryError(other_library(store, drive, made_by, library))
         with of_drive(store, drive):
-            index = of_part(state.from_arrow(as_described(store, drive, column, state)))
+            index = index_of_part(state, state.from_arrow(as_described(store, drive, column, state)))
         stops = np.full(len(descriptors), len(column), np.int64)
         rankings = rank_places(index, descriptors, stops, top, settings, threads)
         best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)
