@@ -287,8 +287,9 @@ def _longest_first(wanted: Sequence[dict[str, Any]], at: Mapping[str, Path]) -> 
     """By the bytes of the logs, so that none of the long ones is begun when all others are done."""
 
     def size(about: dict[str, Any]) -> int:
+        path = at[about["log"]]
         try:
-            return bytes_of(at[about["log"]])
+            return 0 if isinstance(path, RemotePath) else bytes_of(path)  # of a URL it would be asked for again
         except OSError:  # its own run says why
             return 0
 
