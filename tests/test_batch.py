@@ -441,8 +441,9 @@ def test_the_exit_status_is_that_of_the_batch(
     options = [*OPTIONS, "--no-join", "--threads", "1"]
     command = shlex.join([sys.executable, "-m", "vplog", "batch", *map(str, given), "-o", str(root), *options])
     done = subprocess.run(
-        ["bash", "-c", f"{command} {closed}; exit ${{PIPESTATUS[0]}}"], capture_output=True, text=True, check=False
-    )
+        ["bash", "-c", f"{command} {closed}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True, text=True, check=False, env=os.environ | {"PYTHONUNBUFFERED": ""},
+    )  # fmt: skip
     assert (done.returncode, "Exception ignored" in done.stderr) == (code, False), done.stderr
     assert "Internal error" not in done.stderr
     failures = Path(root, "failures.json")

@@ -571,6 +571,19 @@ def test_results_that_cannot_be_printed_are_one_line() -> None:
     assert len(done.stderr.splitlines()) == 1, done.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [("--help", 0), ("config", 0), ("info gone.mcap", 1), ("explain gone --worst", 1), ("conf", 2), ("run", 2)],
+)
+@pytest.mark.parametrize("streams", ["| true", "2>&1 | true", "2>/dev/full", "2>&-"])
+def test_the_exit_status_is_that_of_the_verb(arguments: str, status: int, streams: str) -> None:
+    """Whether its output has a reader or not; with streams that the interpreter flushes at its end."""
+    command = f"{sys.executable} -m vplog {arguments} {streams}; exit ${{PIPESTATUS[0]}}"
+    environment = os.environ | {"PYTHONUNBUFFERED": ""}
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False, env=environment)
+    assert (done.returncode, "Exception ignored" in done.stderr) == (status, False), done.stderr
+
+
 def test_an_interrupt_behind_another_error_is_one(monkeypatch: pytest.MonkeyPatch, verb: Callable[..., Said]) -> None:
     """As compiled code raises it."""
 

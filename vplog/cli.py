@@ -47,6 +47,13 @@ _DEMO_NEXT = (
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Parse, run one verb, exit: 0 done, 1 a known error in one line, 2 wrong usage, 130 interrupted, 143 ended."""
+    try:
+        _run_verb(argv)
+    finally:
+        _flush()
+
+
+def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     # before numpy loads: every stage has its own workers, and a BLAS pool inside each would only get in their way
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -59,7 +66,6 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
             arguments.verb(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
-        _unheard()
         sys.exit(0)
     except KeyboardInterrupt:
         _interrupted()
@@ -119,9 +125,15 @@ def _ended_by(number: signal.Signals) -> Iterator[None]:
 _ended: list[signal.Signals] = []
 
 
-def _unheard() -> None:
-    with suppress(OSError):  # what stands in for stdout may be no file
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _flush() -> None:
+    """Write out stdout and stderr. What one of them does not take is dropped: the interpreter, which flushes both once
+    more, would end with a status of its own (120)."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            with suppress(OSError):  # what stands in for the stream may be no file
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _interrupted() -> NoReturn:
@@ -132,10 +144,7 @@ def _interrupted() -> NoReturn:
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
         raise  # noqa: PLE0704 (called from an except block)
-    try:
-        sys.stdout.flush()
-    except OSError:  # what it was cannot be told there
-        _unheard()
+    _flush()
     say(f"error: {message}")
     sys.exit(1)
 
