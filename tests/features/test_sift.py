@@ -104,3 +104,44 @@ def test_depth_is_that_of_the_pixel_under_the_point() -> None:
 def test_settings_that_cannot_work(change: dict[str, Any]) -> None:
     with pytest.raises(SettingsError):
         SiftSettings.read(change, "test")
+
+
+@pytest.mark.parametrize("sigma", [2.5, 4.0, 7.0])
+def test_a_blob_is_as_large_as_it_is(sigma: float) -> None:
+    """A Gaussian blob of blur s is strongest at scale s (Lindeberg 1998); its size is the diameter."""
+    features = SiftSettings(doubled=False)(blob(200, 160, 99.3, 80.6, sigma))
+    np.testing.assert_allclose(features.points[0], [99.3, 80.6], atol=0.1)
+    assert features.sizes[0] / 2 == pytest.approx(sigma, rel=0.15)
+
+
+def test_an_edge_is_no_feature() -> None:
+    image = np.full((120, 160), 40, np.uint8)
+    image[:, 80:] = 200
+    assert len(SiftSettings(doubled=False)(image)) == 0
+
+
+def test_features_are_found_again_in_a_turned_and_larger_picture() -> None:
+    """Most of the strong ones, in their places, with descriptors nearest to their own."""
+    image = texture(5, 480, 360)
+    turn = cv2.getRotationMatrix2D((240, 180), 30.0, 1.25)
+    settings = SiftSettings(max_features=300, doubled=False)
+    a, b = settings(image), settings(cv2.warpAffine(image, turn, (480, 360)).astype(np.uint8))
+    expected = a.points @ turn[:, :2].T + turn[:, 2]
+    inside = ((expected > 40) & (expected < [440, 320])).all(axis=1)
+    distance = np.square(a.descriptors[:, None].astype(np.int64) - b.descriptors[None].astype(np.int64)).sum(axis=2)
+    nearest = distance.argmin(axis=1)
+    right = np.linalg.norm(expected - b.points[nearest], axis=1) < 3.0
+    assert inside.sum() > 60
+    assert right[inside].mean() > 0.5
+    grown = b.sizes[nearest][inside & right] / a.sizes[inside & right]
+    assert np.median(grown) == pytest.approx(1.25, rel=0.05)
+
+
+def test_doubling_finds_smaller_features() -> None:
+    image = cv2.resize(texture(7, 640, 400), (160, 100), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    plain, doubled = SiftSettings(doubled=False)(image), SiftSettings()(image)
+    assert len(doubled) > 2 * len(plain)
+    assert doubled.sizes.min() < 2.0
+    assert plain.sizes.min() > 2.8
+    offset = np.linalg.norm(plain.points[:20, None] - doubled.points[None], axis=2).min(axis=1)
+    assert np.median(offset) < 0.3

@@ -1,7 +1,7 @@
-"""SIFT (Lowe 2004), as rows of bytes: 128 integers of 0..255 a feature.
+"""SIFT (Lowe 2004) by OpenCV, as rows of bytes: 128 integers of 0..255 a feature.
 
-Through OpenCV, which always doubles the image first: that costs four times the pixels, for features below 3 px. Where
-these are not wanted, scale_space.py and gradients.py find the others in a fifth of the time.
+OpenCV always doubles the image first, which costs four times the pixels for features below 3 px. Where these are not
+wanted, the image is halved before.
 """
 
 from __future__ import annotations
@@ -14,17 +14,12 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import THUMBNAIL_SIDE, Features
-from vplog.features import gradients, scale_space
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Bytes, Float32s
-
-
-_CAMERA_BLUR = 0.5
-"""px that a picture is blurred by as it is taken (Lowe 2004, section 3.3)."""
 
 
 class SiftSettings(Settings):
@@ -42,14 +37,14 @@ class SiftSettings(Settings):
     """Larger images are reduced to this, half of full HD (960 x 540) as it is; points stay in px of the full image."""
     doubled: bool = True
     """The image is doubled first, so that the smallest features are of 1.5 px instead of 3. Without, a frame takes a
-    fifth of the time; by day that recognises and places as well, at night less is left to recognise."""
+    third of the time; by day that recognises and places as well, at night less is left to recognise."""
 
     def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
         """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points."""
         height, width = image.shape
         thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
         pixels = self._reduced(image)
-        points, sizes, response, angles, descriptors = (self._by_opencv if self.doubled else self._undoubled)(pixels)
+        points, sizes, response, angles, descriptors = self._detect(pixels)
         # OpenCV keeps every feature that ties with the last; a full order makes the cut the same everywhere
         order = np.lexsort((angles, sizes, points[:, 0], points[:, 1], -response))[: self.max_features]
         scale = np.array([width / pixels.shape[1], height / pixels.shape[0]], np.float32)
@@ -65,15 +60,15 @@ class SiftSettings(Settings):
         )
 
     def _reduced(self, image: Bytes) -> Bytes:
-        """The image, no larger than it may be."""
+        """The image at the size that OpenCV gets."""
         height, width = image.shape
-        if image.size <= self.max_megapixels * 1e6:
+        share = min(math.sqrt(self.max_megapixels * 1e6 / image.size), 1.0) * (1.0 if self.doubled else 0.5)
+        if share == 1.0:
             return image
-        share = math.sqrt(self.max_megapixels * 1e6 / image.size)
         smaller = (max(round(width * share), 1), max(round(height * share), 1))
         return np.asarray(cv2.resize(image, smaller, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _by_opencv(self, pixels: Bytes) -> tuple[Float32s, Float32s, Float32s, Float32s, Bytes]:
+    def _detect(self, pixels: Bytes) -> tuple[Float32s, Float32s, Float32s, Float32s, Bytes]:
         """Points (M, 2) px, sizes px, contrast, directions and descriptors (M, 128), strongest first."""
         detector = cv2.SIFT.create(
             nfeatures=self.max_features,
@@ -88,34 +83,6 @@ class SiftSettings(Settings):
         sizes = np.array([keypoint.size for keypoint in keypoints], np.float32)
         angles = np.array([keypoint.angle for keypoint in keypoints], np.float32)
         return points, sizes, response, angles, found.astype(np.uint8)  # whole numbers already
-
-    def _undoubled(self, pixels: Bytes) -> tuple[Float32s, Float32s, Float32s, Float32s, Bytes]:
-        """The same by octave, with directions in rad."""
-        # OpenCV's measure: the threshold is shared out among the layers
-        contrast = self.contrast_threshold * 255.0 / scale_space.LAYERS
-        seen = [
-            (octave, levels, scale_space.extrema(differences, contrast))
-            for octave, (levels, differences) in enumerate(scale_space.octaves(pixels.astype(np.float32), _CAMERA_BLUR))
-        ]
-        response = np.concatenate([extrema[:, 3] for _, _, extrema in seen])
-        surplus = len(response) - self.max_features  # these are not even looked at
-        least = np.partition(response, surplus)[surplus] if surplus > 0 else 0.0
-        found = []
-        for octave, levels, extrema in seen:
-            strong = extrema[extrema[:, 3] >= least]
-            rows, angle = gradients.directions(levels, strong, _scale(strong))
-            strong = strong[rows]
-            sigma = _scale(strong)
-            described = gradients.describe(levels, strong, sigma, angle)
-            size = np.float32(2 ** (octave + 1)) * sigma
-            found.append((strong[:, :2] * np.float32(2**octave), size, strong[:, 3], angle, described))
-        points, sizes, response, angles, descriptors = (np.concatenate(part) for part in zip(*found, strict=True))
-        return points, sizes, response, angles, descriptors
-
-
-def _scale(extrema: Float32s) -> Float32s:
-    """(K,) px of their octave: blur of the level that each of (K, 4) extrema was found on."""
-    return (scale_space.SIGMA * np.exp2(extrema[:, 2] / scale_space.LAYERS)).astype(np.float32)
 
 
 def _depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:
