@@ -10,7 +10,7 @@ from pydantic import Field
 
 from vplog import geometry
 from vplog.data import Verdict
-from vplog.loops import chance, pose_fit, three_points, undistort
+from vplog.loops import chance, p3p_ransac, pose_fit, undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -101,9 +101,9 @@ def solve(
     cloud, near = bearing / points[:, 2:], settings.ransac_px / focal_px
     inlier = np.zeros(len(rows), bool)
     if start is not None:
-        inlier = three_points.agreeing(geometry.inverse(start), cloud, seen, near)
+        inlier = p3p_ransac.inliers(geometry.inverse(start), cloud, seen, near)
     if start is None or inlier.sum() < settings.min_inliers:
-        found = three_points.find_pose(cloud, seen, near, settings.ransac_rounds)
+        found = p3p_ransac.find_pose(cloud, seen, near, settings.ransac_rounds)
         if found is None:
             return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
         start, inlier = geometry.inverse(found[0]), found[1]

@@ -1,0 +1,48 @@
+"""The pose that most matches agree with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vplog import geometry
+from vplog.loops import p3p_ransac
+
+
+def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    moved = geometry.transform(pose, points)
+    return moved[:, :2] / moved[:, 2:]
+
+
+@pytest.mark.parametrize("wrong", [0, 20, 36, 44])
+def test_the_pose_is_found_among_wrong_matches(wrong: int) -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-3, -3, 2], [3, 3, 10], (60, 3))
+    true = geometry.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
+    seen = project(true, points)
+    seen[:wrong] = rng.uniform(-0.5, 0.5, (wrong, 2))
+    found = p3p_ransac.find_pose(points, seen, 0.005, 500)
+    assert found is not None
+    pose, agree = found
+    assert agree[wrong:].all()
+    assert agree[:wrong].sum() <= 2
+    np.testing.assert_allclose(pose, true, atol=1e-4)  # OpenCV samples in single precision
+    again = p3p_ransac.find_pose(points, seen, 0.005, 500)
+    assert again is not None
+    assert again[0].tobytes() == pose.tobytes()
+    np.testing.assert_array_equal(p3p_ransac.inliers(pose, points, seen, 0.005), agree)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((0, 3)),
+        np.ones((3, 3)),
+        np.ones((9, 3)),
+        np.column_stack([np.zeros((9, 2)), np.arange(1.0, 10)]),
+        np.full((9, 3), np.nan),
+        np.full((9, 3), np.inf),
+    ],
+)
+def test_where_no_three_points_fix_a_pose_there_is_none(points: np.ndarray) -> None:
+    assert p3p_ransac.find_pose(points, np.zeros((len(points), 2)), 0.005, 50) is None
