@@ -17,7 +17,6 @@ from vplog.logs.transforms import FrameTree
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry
     from vplog.logs.containers import Container, Notes, Place
-    from vplog.logs.early import EarlyImages
     from vplog.logs.messages import CalibrationMessage
     from vplog.logs.select import Selection
 
@@ -58,8 +57,8 @@ _TOGETHER_NS = 5_000_000
 """ns that the images of a pair may be apart: 5 cm at 10 m/s, a tenth of a usual baseline."""
 
 
-def read_content(container: Container, chosen: Selection, notes: Notes, early: EarlyImages) -> Content:
-    """Read the chosen topics once; what had to be repaired or left out is noted. `early` decodes images meanwhile."""
+def read_content(container: Container, chosen: Selection, notes: Notes) -> Content:
+    """Read the chosen topics once; what had to be repaired or left out is noted."""
     read = Gathered(
         Images(chosen.image),
         Images(chosen.depth),
@@ -74,7 +73,6 @@ def read_content(container: Container, chosen: Selection, notes: Notes, early: E
     )
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
     for block in container.blocks(chosen.channels, stamped):
-        early.offer(block)
         read.take_block(block)
     read.finish_poses()
     for (reason, topic), runs in read.lost.items():

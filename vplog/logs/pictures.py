@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from vplog.data import Float32s
     from vplog.logs.containers import Channel, Container, Notes, Octets, Place
     from vplog.logs.content import Content
-    from vplog.logs.early import EarlyImages
 
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
@@ -33,18 +32,9 @@ def _frame_and_size(channel: Channel, data: Octets) -> tuple[str, tuple[int, int
 class Pictures:
     """Reads images where `content` says they lie."""
 
-    def __init__(
-        self,
-        container: Container,
-        image: Channel | None,
-        codec: str,
-        content: Content,
-        notes: Notes,
-        early: EarlyImages,
-    ) -> None:
-        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty. `early` has what is decoded
-        of `image` already."""
-        self._container, self._image, self._early = container, image, early
+    def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
+        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
+        self._container, self._image = container, image
         self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """What was read, without the images before a video's first key frame."""
@@ -53,16 +43,11 @@ class Pictures:
         if self._image is None:
             raise LogError("No image topic is chosen.")
         if self._video is None:
-            place = self.content.places[row]
-            return self._early.take(place) or Encoded(self._image, self._container.read(place))
+            return Encoded(self._image, self._container.read(self.content.places[row]))
         try:
             return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])), "")
         except BadMessageError as error:
             return Decoded(self._image, None, str(error))
-
-    def forget_early(self) -> None:
-        """Give back the memory of images that nobody asked for."""
-        self._early.forget()
 
     def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
         """The depth or right image of a row; None where there is none."""
@@ -77,8 +62,6 @@ class Pictures:
         video, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:
-                if channel == self._image and (found := self._early.frame_and_size(place)) is not None:
-                    return found
                 if video is None:
                     return _frame_and_size(channel, self._container.read(place))
                 message = decode(channel, self._container.read(place))

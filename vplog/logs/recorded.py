@@ -12,7 +12,6 @@ from vplog.logs.beside import Beside
 from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
 from vplog.logs.candidates import read_candidates
 from vplog.logs.content import read_content
-from vplog.logs.early import EarlyImages
 from vplog.logs.frames import RecordedFrame, size_of
 from vplog.logs.losses import Account
 from vplog.logs.pictures import Pictures
@@ -104,7 +103,6 @@ class RecordedLog:
         camera = self.camera()
         for row in rows_of(self._content.stamp_ns, stamp_ns, self._name):
             yield self._frame(row, camera)
-        self._pictures.forget_early()
 
     def odometry(self) -> Odometry | None:
         return self._beside_log.odometry or self._content.odometry
@@ -163,9 +161,8 @@ class RecordedLog:
     def _pictures(self) -> Pictures:
         image = self._selection.image
         codec = self._codec(image)
-        with EarlyImages(self._container, None if codec else image) as early:
-            content = read_content(self._container, self._selection, self._notes, early)
-        return Pictures(self._container, image, codec, content, self._notes, early)
+        content = read_content(self._container, self._selection, self._notes)
+        return Pictures(self._container, image, codec, content, self._notes)
 
     @property
     def _content(self) -> Content:
