@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from vplog.logs.images import depth_m, grey, image_size, is_depth
+from vplog.image_file import image_size
+from vplog.logs.images import depth_m, grey, is_depth
 from vplog.logs.messages import BadMessageError, ImageMessage
 
 RNG = np.random.default_rng(1)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vplog.logs.images import image_size, is_depth
+from vplog.image_file import image_size
+from vplog.logs.images import is_depth
 from vplog.logs.messages import BadMessageError, CalibrationMessage, ImageMessage, decode, kind_of
 from vplog.logs.select import Candidate
 from vplog.logs.transforms import clean
