@@ -136,7 +136,9 @@ def _checked_png(data: bytes) -> bytes:
 
     What else a file may hold (colour profile, gamma, text) changes no pixel here, and libpng says much of it.
     """
-    view, parts, packed = memoryview(data), [PNG], []
+    view = memoryview(data)
+    parts: list[bytes | memoryview] = [PNG]
+    packed: list[memoryview] = []
     for kind, start, stop in _png_chunks(data):
         if zlib.crc32(view[start + 4 : stop - 4]) != int.from_bytes(data[stop - 4 : stop], "big"):
             raise BadImageError("the checksum of its PNG does not match")
@@ -162,7 +164,7 @@ def _deflates_to(packed: bytes, rows: list[tuple[int, int]]) -> bool:
     stream = zlib.decompressobj()
     try:
         data = np.frombuffer(stream.decompress(packed, size + 1), np.uint8)
-    except zlib.error:
+    except zlib.error:  # pyright: ignore[reportGeneralTypeIssues]
         return False
     if len(data) != size or not stream.eof or stream.unused_data:
         return False

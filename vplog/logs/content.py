@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.logs.containers import plural
-from vplog.logs.gather import Gathered, Images
+from vplog.logs.gather import Calibrations, Gathered, Images
 from vplog.logs.moving import MovingFrames
 from vplog.logs.stamps import nearest, share_clock
 from vplog.logs.tracks import FixTrack, PoseTrack
@@ -37,7 +37,9 @@ class Content:
     """Where the depth image of each lies."""
     right_places: list[Place | None]
     """Where the right image of each lies."""
-    calibration: CalibrationMessage | None
+    calibrations: list[CalibrationMessage]
+    """Those that are set, each other than the one before: the first is the camera's, a later one that of images behind
+    its stamp."""
     right_calibration: CalibrationMessage | None
     odometry: Odometry | None
     frames: list[str]
@@ -63,11 +65,11 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         Images(chosen.image),
         Images(chosen.depth),
         Images(chosen.right),
-        chosen.right_info,
+        Calibrations(chosen.camera_info),
+        Calibrations(chosen.right_info),
         PoseTrack(chosen.odometry.topic) if chosen.odometry and chosen.odometry not in chosen.tf else None,
         FixTrack(chosen.gps.topic) if chosen.gps else None,
         odometry=chosen.odometry,
-        info=chosen.camera_info,
         tf=chosen.tf,
         moving=MovingFrames(keep=chosen.odometry in chosen.tf),
     )
@@ -101,7 +103,9 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
     gps = read.fixes.finish(notes) if read.fixes else None
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
+    calibrations = read.calibrations.finish(notes)
+    right_calibration = next(iter(read.right_calibrations.finish(notes)), None)
     return Content(
-        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], read.calibration, read.right_calibration,
+        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], calibrations, right_calibration,
         odometry, frames, gps, tree, read.skew_ms(),
     )  # fmt: skip

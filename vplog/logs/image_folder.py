@@ -13,7 +13,7 @@ from vplog.data import Frame, LogInfo, Topic
 from vplog.errors import LogError
 from vplog.logs.beside import Beside
 from vplog.logs.cameras import camera_of
-from vplog.logs.images import grey
+from vplog.logs.images import drive_levels, grey, spread
 from vplog.logs.messages import BadMessageError, ImageMessage
 from vplog.logs.stamps import increasing, rows_of
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Bytes, Camera, Gps, Ints, Odometry
     from vplog.logs.containers import Notes
+    from vplog.logs.images import Levels
     from vplog.logs.losses import Account, Loss
     from vplog.logs.select import TopicChoice
 
@@ -73,11 +74,13 @@ class FileFrame:
     path: Path
     account: Account
     """Of the folder: what does not decode is counted there."""
+    levels: Levels | None = None
+    """Black and white of the folder, where its images have 16 bits."""
 
     def decode(self) -> Frame:
         """Raises LogError where the file is not an image."""
         try:
-            return Frame(self.stamp_ns, self.camera, _read(self.path))
+            return Frame(self.stamp_ns, self.camera, _read(self.path, self.levels))
         except LogError:
             name, at = self.path.parent.name, self.stamp_ns
             self.account.add("undecodable_image", {name: 1}, (name, at), [(at, at)])
@@ -140,13 +143,17 @@ class ImageFolder:
 
     def frames(self, stamp_ns: Ints) -> Iterator[FileFrame]:
         for row in rows_of(self._stamp_ns, stamp_ns, self.name):
-            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row], self._notes.account)
+            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row], self._notes.account, self._levels)
 
     def odometry(self) -> Odometry | None:
         return self._beside.odometry
 
     def gps(self) -> Gps | None:
         return None
+
+    @cached_property
+    def _levels(self) -> Levels | None:
+        return drive_levels(map(_message, self._files[:: spread(len(self._files))]))
 
     @cached_property
     def _camera(self) -> Camera:
@@ -168,8 +175,12 @@ class ImageFolder:
         raise LogError(f"{self._path} has no image that can be decoded. The first: {reason}")
 
 
-def _read(path: Path) -> Bytes:
+def _message(path: Path) -> ImageMessage:
+    return ImageMessage(0, "", path.suffix, path.read_bytes(), True)
+
+
+def _read(path: Path, levels: Levels | None = None) -> Bytes:
     try:
-        return grey(ImageMessage(0, "", path.suffix, path.read_bytes(), True))
+        return grey(_message(path), levels)
     except (OSError, BadMessageError) as error:
         raise LogError(f"{path} cannot be decoded: {error}.") from None

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from functools import lru_cache
+from itertools import chain
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,12 +15,20 @@ from vplog.image_file import PNG, BadImageError, decode_image
 from vplog.logs.messages import BadMessageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from vplog.data import Bytes, Float32s
     from vplog.logs.containers import Octets
     from vplog.logs.messages import ImageMessage
 
 _DEPTH_HEADER = 12
 """Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""
+_CLIPPED = 0.002
+"""Share of pixels beyond black, and beyond white: hot and dead ones and glints, of 1000 px two."""
+_SAMPLED = 16
+"""Images that tell the levels of a drive: day and night, sun and tunnel are among them."""
+_LEAST_UNKNOWN = 0.001
+"""Share of px without measurement that depth images have at least; a camera has a few dead ones in a million."""
 _INVALID_MM = (0, 65535)
 """Depth values in mm that mean no measurement: 0 in ROS REP 118 and cameras' firmware, 65535 in 7-Scenes."""
 _LAYOUTS: dict[str, tuple[str, int, int | None]] = {
@@ -35,7 +46,9 @@ _LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "bgr16": ("u2", 3, cv2.COLOR_BGR2GRAY),
     "rgba16": ("u2", 4, cv2.COLOR_RGBA2GRAY),
     "bgra16": ("u2", 4, cv2.COLOR_BGRA2GRAY),
+    "16SC1": ("i2", 1, None),
     "32FC1": ("f4", 1, None),
+    "64FC1": ("f8", 1, None),
     "yuv422": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
     "uyvy": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
     "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
@@ -56,38 +69,117 @@ _MOSAICS = {
 _LAYOUTS |= {f"bayer_{name}{8 * size}": (f"u{size}", 1, code) for name, code in _MOSAICS.items() for size in (1, 2)}
 _COLOURS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
 """As OpenCV decodes them."""
-_DEPTH_ENCODINGS = ("16UC1", "32FC1")
+_DEPTH_ENCODINGS = ("16UC1", "16SC1", "32FC1", "64FC1")
+_SIXTEEN_BITS = "16UC1"
+"""Depth in mm, or what a thermal camera counts."""
 
 
 def is_depth(message: ImageMessage) -> bool:
-    """By encoding: 16UC1 or 32FC1, raw or in the format of compressedDepth (`16UC1; compressedDepth png`)."""
+    """By encoding: one of _DEPTH_ENCODINGS, raw or in the format of compressedDepth (`16UC1; compressedDepth png`)."""
     if message.compressed:
         return "compresseddepth" in message.encoding.lower() or message.encoding.startswith(_DEPTH_ENCODINGS)
     return message.encoding in _DEPTH_ENCODINGS
 
 
-def grey(message: ImageMessage) -> Bytes:
-    """(H, W) uint8; of more bits the highest eight that are used. Raises BadMessageError."""
-    if message.compressed:
-        mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
-        pixels, conversion = _imdecode(message.data, unchanged=mosaic is not None), None
-        if mosaic is not None:  # some transports compress the mosaic as it is
-            conversion = mosaic[2] if pixels.ndim == 2 else _COLOURS[pixels.shape[2]]
-    else:
-        pixels, conversion = _raw(message)
+def is_image(message: ImageMessage) -> bool:
+    """Whether `grey` knows the encoding: of raw pixels those of _LAYOUTS that are not depth alone."""
+    known = message.encoding == _SIXTEEN_BITS or message.encoding in _LAYOUTS.keys() - set(_DEPTH_ENCODINGS)
+    return message.compressed or known
+
+
+def may_be_thermal(message: ImageMessage) -> bool:
+    """Whether it has 16 bits that may be depth in mm or a thermal camera's counts: depth has px without measurement
+    (ROS REP 118), where nothing reflects, in shadow of the emitter and at edges; every px of a camera counts."""
+    if not message.encoding.startswith(_SIXTEEN_BITS) or "compresseddepth" in message.encoding.lower():
+        return False
+    try:
+        unknown = np.isnan(depth_m(message)).mean()
+    except BadMessageError:
+        return False
+    return bool(unknown < _LEAST_UNKNOWN)
+
+
+class Levels(NamedTuple):
+    """Values of 16 bits that become black and white: cameras of 10 to 14 bits fill the low ones, thermal ones a few."""
+
+    black: int
+    white: int
+
+    def apply(self, pixels: Any) -> Bytes:
+        """uint8 of uint16: linear from black to white, and clipped."""
+        return _grey_table(self)[pixels]
+
+
+@lru_cache(maxsize=16)
+def _grey_table(levels: Levels) -> Bytes:
+    """(65536,) uint8."""
+    spread = (np.arange(2**16) - levels.black) * (255 / (levels.white - levels.black))
+    return np.clip(np.rint(spread), 0, 255).astype(np.uint8)
+
+
+def sixteen_bits(message: ImageMessage) -> bool:
+    """Whether its pixels have 16 bits, told without decoding them."""
+    if not message.compressed:
+        return message.encoding in _LAYOUTS and _LAYOUTS[message.encoding][0] == "u2"
+    return message.data[:8] == PNG and bytes(message.data[24:25]) == b"\x10"
+
+
+def levels_of(messages: Iterable[ImageMessage]) -> Levels | None:
+    """The levels that all but _CLIPPED of the pixels lie within; a grey is one value at least, so that noise is not
+    stretched. None where no image decodes to 16 bits."""
+    counts = np.zeros(2**16, np.int64)
+    for message in messages:
+        with suppress(BadMessageError):
+            pixels, _ = _pixels(message)
+            if pixels.dtype == np.uint16:
+                counts += np.bincount(pixels.ravel(), minlength=2**16)
+    if not counts.any():
+        return None
+    share = np.cumsum(counts) / counts.sum()
+    black, white = (int(np.searchsorted(share, at)) for at in (_CLIPPED, 1 - _CLIPPED))
+    return Levels(black, max(white, black + 255))
+
+
+def spread(count: int) -> int:
+    """The step at which _SAMPLED images, about, lie over a drive of `count`."""
+    return max(-(-count // _SAMPLED), 1)
+
+
+def drive_levels(messages: Iterator[ImageMessage]) -> Levels | None:
+    """The levels of images that speak for a drive; None, and only one is looked at, where it has not 16 bits."""
+    first = next(messages, None)
+    return levels_of(chain([first], messages)) if first is not None and sixteen_bits(first) else None
+
+
+def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
+    """(H, W) uint8; of 16 bits by the `levels` of the topic, or by its own. Raises BadMessageError."""
+    pixels, conversion = _pixels(message)
     if pixels.dtype == np.uint16:
-        # cameras of 10, 12 and 14 bits fill the low bits of 16: the high byte alone would be black
-        pixels = (pixels >> max(int(pixels.max()).bit_length() - 8, 0)).astype(np.uint8)
+        pixels = (levels or levels_of([message]) or Levels(0, 2**16 - 1)).apply(pixels)
     if pixels.dtype != np.uint8:
         raise BadMessageError(f"encoding {message.encoding[:40]!r} is depth, not an image")
     try:
-        return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion))
+        return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion), np.uint8)
     except cv2.error:  # a mosaic or a row of shared colours of one px
         raise BadMessageError(f"{message.encoding[:40]!r} with {pixels.shape[1]} x {pixels.shape[0]} px") from None
 
 
+def _pixels(message: ImageMessage) -> tuple[Any, int | None]:
+    """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion to grey."""
+    if not message.compressed:
+        return _raw(message)
+    mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
+    pixels = _imdecode(message.data, unchanged=mosaic is not None)
+    if mosaic is None:
+        return pixels, None
+    return pixels, mosaic[2] if pixels.ndim == 2 else _COLOURS[pixels.shape[2]]  # some transports compress the mosaic
+
+
 def depth_m(message: ImageMessage) -> Float32s:
-    """(H, W) float32 m, NaN where unknown: 16UC1 holds mm, 32FC1 m (ROS REP 118). Raises BadMessageError."""
+    """(H, W) float32 m, NaN where unknown: 16UC1 and 16SC1 hold mm, 32FC1 and 64FC1 m (ROS REP 118).
+
+    Raises BadMessageError.
+    """
     if not message.compressed:
         pixels, _ = _raw(message)
         return _metres(pixels, message.encoding)
@@ -112,12 +204,15 @@ def depth_m(message: ImageMessage) -> Float32s:
 
 
 def _metres(pixels: Any, encoding: str) -> Float32s:
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.int16, np.float32, np.float64):
         raise BadMessageError(f"{encoding[:40]!r} with {pixels.ndim} dimensions of {pixels.dtype} is not a depth image")
     if pixels.dtype == np.uint16:
         unknown = np.logical_or.reduce([pixels == value for value in _INVALID_MM])  # np.isin takes ten times as long
         return np.where(unknown, np.float32(np.nan), pixels * np.float32(0.001)).astype(np.float32)
-    return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.float32(np.nan)).astype(np.float32)
+    if pixels.dtype == np.int16:
+        return np.where(pixels > 0, pixels * np.float32(0.001), np.float32(np.nan)).astype(np.float32)
+    known = np.isfinite(pixels) & (pixels > 0)
+    return np.where(known, pixels, np.nan).astype(np.float32)
 
 
 def _raw(message: ImageMessage) -> tuple[Any, int | None]:

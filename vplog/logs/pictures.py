@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,14 +12,17 @@ import numpy as np
 from vplog.errors import LogError
 from vplog.logs.containers import plural
 from vplog.logs.frames import Decoded, Encoded, image_in
-from vplog.logs.images import grey
+from vplog.logs.images import drive_levels, grey, spread
 from vplog.logs.messages import BadMessageError, ImageMessage, decode
 from vplog.logs.video import VideoStream
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from vplog.data import Float32s
     from vplog.logs.containers import Channel, Container, Notes, Octets, Place
     from vplog.logs.content import Content
+    from vplog.logs.images import Levels
 
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
@@ -43,7 +48,7 @@ class Pictures:
         if self._image is None:
             raise LogError("No image topic is chosen.")
         if self._video is None:
-            return Encoded(self._image, self._container.read(self.content.places[row]))
+            return Encoded(self._image, self._container.read(self.content.places[row]), self._levels)
         try:
             return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])), "")
         except BadMessageError as error:
@@ -52,7 +57,18 @@ class Pictures:
     def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
         """The depth or right image of a row; None where there is none."""
         place = places[row]
-        return None if channel is None or place is None else Encoded(channel, self._container.read(place))
+        return None if channel is None or place is None else Encoded(channel, self._container.read(place), self._levels)
+
+    @cached_property
+    def _levels(self) -> Levels | None:
+        """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
+        places = self.content.places
+        return None if self._image is None else drive_levels(self._sampled(self._image, places[:: spread(len(places))]))
+
+    def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
+        for place in places:
+            with suppress(BadMessageError):
+                yield image_in(channel, self._container.read(place))
 
     def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
         """Frame, and width and height of the first image that decodes.
