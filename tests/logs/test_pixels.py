@@ -192,7 +192,7 @@ def by_levels(images: list[np.ndarray]) -> list[np.ndarray]:
         return images
     everything = np.concatenate([image.ravel() for image in images])
     black, white = np.quantile(everything, [0.002, 0.998], method="inverted_cdf").astype(float)
-    scaled = [np.rint((image - black) * 255 / max(white - black, 255)) for image in images]
+    scaled = [np.rint((image - black) * (255 / max(white - black, 255))) for image in images]
     return [np.clip(image, 0, 255).astype(np.uint8) for image in scaled]
 
 
