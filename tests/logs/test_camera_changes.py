@@ -70,7 +70,7 @@ def test_a_thermal_camera_is_a_camera(topic: str, tmp_path: Path) -> None:
         found = decoded(logs.open(path, choice))
         assert len(found) == 5
         assert np.corrcoef(found[0].ravel(), SCENE.ravel())[0, 1] > 0.99
-        assert len(np.unique(found[0])) > 200
+        assert len(np.unique(found[0])) > 150
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "16SC1", "32FC1", "64FC1"])
@@ -165,7 +165,7 @@ def test_a_window_that_moves_keeps_rays(tmp_path: Path) -> None:
 
 def test_images_of_another_shape_are_left_out_and_counted(tmp_path: Path) -> None:
     messages = [image(SCENE if i < 4 else SCENE[:, :100].copy(), i, "/cam/image") for i in range(8)]
-    log = logs.open(written(tmp_path / "drive", messages))
+    log: Any = logs.open(written(tmp_path / "drive", messages))
     lost = 0
     for frame in log.frames(log.stamps()):
         try:
@@ -183,7 +183,7 @@ def test_a_storage_file_whose_messages_are_packed_is_read_without_its_folder(sto
     folder = write_ros2(tmp_path / "drive", ros_messages(drive, 2), storage, compression=True)
     (file,) = [file for file in folder.iterdir() if file.suffix in (".mcap", ".db3")]
     alone = file.rename(tmp_path / file.name)
-    log = logs.open(alone)
+    log: Any = logs.open(alone)
     np.testing.assert_array_equal(log.stamps(), drive.stamp_ns)
     np.testing.assert_array_equal(decoded(log), drive.images)
     odometry = log.odometry()

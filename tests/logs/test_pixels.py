@@ -209,7 +209,7 @@ def test_pixels_are_those_of_the_reference_readers(form: Format, encoding: str, 
         expected = by_levels([pixels_of(found) for found in recorded(path, form.family, topic)])
         for threads in (1, 2, 4):
             with limited(threads), ThreadPoolExecutor(threads) as pool:
-                log = logs.open(path, TopicChoice(image=topic))
+                log: Any = logs.open(path, TopicChoice(image=topic))
                 log.odometry()
                 log.camera()
                 frames = log.frames(log.stamps())

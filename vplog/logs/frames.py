@@ -109,39 +109,25 @@ class RecordedFrame:
                 self._lose(self.image.channel, str(error))
                 raise
             return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
-        affine = self._affine(image)
+        try:
+            affine = affine_to_camera(self.image.channel.topic, image, self.camera, self.calibration, self.notes)
+        except LogError as error:
+            self._lose(self.image.channel, str(error))
+            raise
         if self.depth is None:
-            return Frame(self.stamp_ns, self.camera, _warped(image, affine, self.camera))
+            return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera))
         try:
             depth = self.depth.depth_m(self.stamp_ns)
         except LogError:
             self._lose(self.depth.channel)
-            return Frame(self.stamp_ns, self.camera, _warped(image, affine, self.camera))
+            return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera))
         if depth.shape != image.shape:
             raise LogError(
                 f"{self.depth.channel.topic} at {self.stamp_ns} ns is {size_of(depth)} px, but the image is "
                 f"{size_of(image)} px. Depth must be registered to the image; choose another with --depth-topic."
             )
-        image, depth = _warped(image, affine, self.camera), _warped_depth(depth, affine, self.camera)
+        image, depth = warped(image, affine, self.camera), _warped_depth(depth, affine, self.camera)
         return Frame(self.stamp_ns, self.camera, image, depth)
-
-    def _affine(self, image: Bytes) -> Floats | None:
-        """(2, 3) from px of the image to those of the camera; None where they are the same. Raises LogError."""
-        size, topic = (image.shape[1], image.shape[0]), self.image.channel.topic
-        found, same = camera_from_image(self.camera, size, self.calibration)
-        if found is None and not same:
-            reason = (
-                f"{topic} has an image of {size_of(image)} px among those of {self.camera.width} x "
-                f"{self.camera.height} px, of another shape and without a calibration of its own; it is left out."
-            )
-            self._lose(self.image.channel, reason)
-            raise LogError(reason)
-        if found is not None:
-            self.notes.add(
-                f"The images of {topic} change their size or window; those that are not the first's, "
-                f"{self.camera.width} x {self.camera.height} px, are resampled to it."
-            )
-        return found
 
     def _right(self, pair: Pair) -> Bytes | None:
         if self.right is None:
@@ -167,7 +153,26 @@ def size_of(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]}"
 
 
-def _warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
+def affine_to_camera(
+    topic: str, image: Bytes, camera: Camera, calibration: CalibrationMessage | None, notes: Notes
+) -> Floats | None:
+    """(2, 3) from px of the image to those of the camera; None where they are the same. Raises LogError."""
+    found, same = camera_from_image(camera, (image.shape[1], image.shape[0]), calibration)
+    size = f"{camera.width} x {camera.height} px"
+    if found is None and not same:
+        raise LogError(
+            f"{topic} has an image of {size_of(image)} px among those of {size}, of another shape and without a "
+            "calibration of its own; it is left out."
+        )
+    if found is not None:
+        notes.add(
+            f"The images of {topic} change their size or window; those that are not the first's, {size}, are "
+            "resampled to it."
+        )
+    return found
+
+
+def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
     """The image in px of the camera; what it does not show repeats its edge, which has no corners."""
     if affine is None:
         return image
