@@ -111,7 +111,10 @@ def test_every_verb_refuses_in_one_line(verb: str, tmp_path: Path) -> None:
     options = {"compare": ["--truth", "index", "--methods", "bovf"], "info": []}.get(
         verb, ["-o", str(tmp_path / "out")]
     )
-    logs_given = [str(folder)] * (2 if verb == "compare" else 1)
+    logs_given = [str(folder)]
+    if verb == "compare":
+        write(tmp_path / "map", [f"{i}.png" for i in range(5)])
+        logs_given.append(str(tmp_path / "map"))
     done = subprocess.run(
         [sys.executable, "-m", "vplog", verb, *logs_given, *options], capture_output=True, text=True, check=False
     )
