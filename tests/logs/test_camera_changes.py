@@ -101,6 +101,8 @@ def test_depth_that_is_asked_for_as_the_image_is_not_its_own_depth(tmp_path: Pat
     holes = (20 * SCENE.astype(np.uint16)).astype(np.uint16)
     holes[:30] = 0
     path = written(tmp_path / "drive", [image(holes, i, "/cam/depth", "16UC1") for i in range(3)])
+    with pytest.raises(LogError, match=r"thermal camera's, take it with --image-topic /cam/depth\."):
+        logs.open(path).camera()
     log = logs.open(path, TopicChoice(image="/cam/depth"))
     assert len(decoded(log)) == 3
     assert log.info().warnings == []

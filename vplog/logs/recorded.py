@@ -126,7 +126,9 @@ class RecordedLog:
         if self._selection.image is None:
             names = list(dict.fromkeys(channel.topic for channel in self._contents.counts))
             listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
-            raise LogError(f"No camera images in {self._path.name}. Topics: {listed or 'none'}.")
+            depth = [c.channel.topic for c in self._candidates if c.role == "depth" and c.encoding.startswith("16UC1")]
+            hint = f" If {depth[0]} is a thermal camera's, take it with --image-topic {depth[0]}." if depth else ""
+            raise LogError(f"No camera images in {self._path.name}. Topics: {listed or 'none'}.{hint}")
         if not len(self._content.stamp_ns):
             raise LogError(f"{self._selection.image.topic} in {self._path.name} has no readable image.")
         return self._selection.image
