@@ -22,6 +22,7 @@ PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
     {"data", "settings", "timing", "cores", "google_store", "web", "scratch", "own_processes", "parquet_bounds"},
+    {"image_file"},
     {"geometry", "geodesy", "remote"},
     {"tum"},
     {"stages", "references", "inputs", "code_hash"},

@@ -170,19 +170,22 @@ def library(arguments: argparse.Namespace) -> None:
     """Build a reference library of frames of logs."""
     from vplog.libraries import build_library
 
-    pipeline = pipeline_of(arguments)
+    pipeline, warnings = pipeline_of(arguments), []
     with Progress(arguments) as progress:
         state = build_library(
-            arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress
-        )
+            arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress,
+            warnings.append,
+        )  # fmt: skip
     record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
     if arguments.json:
-        print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits})
+        print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
         return
     print(
         f"{arguments.output}: {record['references']} references, {record['features']} features, "
         f"{state.bits} bits a place, hash {state.hash[:12]}"
     )
+    for warning in warnings:
+        say(f"warning: {warning}")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -120,9 +120,11 @@ def build_library(
     topics: logs.TopicChoice | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
+    warn: Callable[[str], object] = lambda _: None,
 ) -> PlaceState:
     """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
 
+    `warn` gets what the logs warn of, once they are read.
     Raises VplogError where that cannot be.
     """
     references: list[Reference] = []
@@ -136,6 +138,8 @@ def build_library(
             progress(f"extract {log.name}", done + 1, len(stamps))
             if frame is not None and features is not None:
                 references.append(Reference(frame.image, features, log.name, stamp_ns))
+    for line in dict.fromkeys(line for log in opened for line in log.warnings):
+        warn(line)
     state = pipeline.places.learn(references, threads)
     state.save(out)
     return state

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from vplog.data import Closures, Verdict
+from vplog.image_file import decode_image
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _LENGTH = struct.Struct("<I")
-_DEFLATED_PX = 1032
-"""Bytes that one of a PNG file becomes at most, as deflate packs 258 bytes into 2 bits (RFC 1951, section 3.2.5)."""
 _NUMBERS = "biuf"
 """Kinds of numpy types that are read: truth values, whole and floating numbers."""
 
@@ -120,23 +119,13 @@ def images_codec() -> Codec[list[tuple[int, Bytes]]]:
         columns = _unpack(data)
         ends = np.cumsum(columns["bytes"])
         pictures = np.split(columns["png"], ends[:-1]) if len(ends) else []
-        if any(_pixels(picture) > _DEFLATED_PX * len(picture) for picture in pictures):
-            raise ValueError("an image would be larger than its bytes can be")
-        images = [cv2.imdecode(picture, cv2.IMREAD_GRAYSCALE) for picture in pictures]
-        if any(image is None for image in images):
-            raise ValueError("an image is damaged")
+        images = [decode_image(picture.tobytes()) for picture in pictures]
         return [
             (number, np.asarray(image, np.uint8))
             for number, image in zip(columns["number"].tolist(), images, strict=True)
         ]
 
     return Codec(to_bytes, from_bytes)
-
-
-def _pixels(png: np.ndarray) -> int:
-    """Of a PNG file, by its first chunk."""
-    width, height = struct.unpack(">II", png[16:24].tobytes())
-    return width * height
 
 
 def _pack(columns: dict[str, Any]) -> bytes:

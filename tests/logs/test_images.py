@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from vplog.logs.images import depth_m, grey, image_size, is_depth
+from vplog.image_file import image_size
+from vplog.logs.images import Levels, depth_m, grey, is_depth
 from vplog.logs.messages import BadMessageError, ImageMessage
 
 RNG = np.random.default_rng(1)
@@ -48,7 +49,7 @@ def test_mosaics_become_the_grey_of_their_colours(pattern: str, bits: int) -> No
         mosaic[i // 2 :: 2, i % 2 :: 2] = colours[c][i // 2 :: 2, i % 2 :: 2]
     expected = 0.299 * colours["R"] + 0.587 * colours["G"] + 0.114 * colours["B"]
     pixels = mosaic if bits == 8 else mosaic.astype(np.uint16) * 257
-    image = grey(raw(f"bayer_{pattern}{bits}", pixels, padding=6, big_endian=bits == 16))
+    image = grey(raw(f"bayer_{pattern}{bits}", pixels, padding=6, big_endian=bits == 16), Levels(0, 65535))
     np.testing.assert_allclose(image[:, 2:8], expected[:, 2:8], atol=1)
     np.testing.assert_allclose(image[:, 12:18], expected[:, 12:18], atol=1)
     file = cv2.imencode(".png", mosaic)[1].tobytes()  # as a transport compresses it
@@ -77,12 +78,30 @@ def test_luma_planes_come_first(encoding: str, planes: float) -> None:
 def test_low_bits_of_sixteen_are_seen(bits: int) -> None:
     pixels = RNG.integers(0, 2**bits, (20, 30)).astype(np.uint16)
     pixels[0, 0] = 2**bits - 1
-    expected = pixels >> (bits - 8)
-    np.testing.assert_array_equal(grey(raw("mono16", pixels)), expected)
+    expected = grey(raw("mono16", pixels))
+    assert np.abs(expected - pixels * 255.0 / 2**bits).max() < 3
     file = cv2.imencode(".png", pixels)[1].tobytes()
     np.testing.assert_array_equal(grey(ImageMessage(0, "", "mono16; png compressed ", file, True)), expected)
     colour = grey(raw("rgb16", np.stack([pixels] * 3, axis=-1)))
     np.testing.assert_allclose(colour, expected, atol=1)
+
+
+def test_hot_pixels_take_no_greys() -> None:
+    """One of 65535 among 12 bits left thirteen greys, by the highest bit that is set."""
+    scene = cv2.resize(RNG.integers(0, 4096, (9, 12)).astype(np.uint16), (160, 120), interpolation=cv2.INTER_LINEAR)
+    hot = scene.copy()
+    hot[3, 5] = hot[7, 9] = 65535
+    difference = np.abs(grey(raw("mono16", hot)).astype(int) - grey(raw("mono16", scene)))
+    assert np.delete(difference, [3, 7], 0).max() <= 1
+    assert len(np.unique(grey(raw("mono16", hot)))) > 200
+
+
+def test_what_a_thermal_camera_counts_is_spread() -> None:
+    """Kelvin in hundredths, of a scene of 20 to 30 degrees; below 256 values a grey is one."""
+    scene = (29_315 + 1000 * RNG.random((60, 80))).astype(np.uint16)
+    assert len(np.unique(grey(raw("16UC1", scene)))) == 256
+    even = (29_315 + 9 * RNG.random((60, 80))).astype(np.uint16)
+    assert np.ptp(grey(raw("16UC1", even)).astype(int)) <= 9
 
 
 @pytest.mark.parametrize("padding", [0, 3])
@@ -100,7 +119,7 @@ def test_mono_rows_with_padding(padding: int) -> None:
 def test_sixteen_bits_in_both_byte_orders(big_endian: bool) -> None:
     pixels = RNG.integers(1, 65535, (6, 5)).astype(np.uint16)
     pixels[0, 0] = 65534
-    np.testing.assert_array_equal(grey(raw("mono16", pixels, 2, big_endian)), pixels // 256)
+    np.testing.assert_allclose(grey(raw("mono16", pixels, 2, big_endian), Levels(0, 65535)), pixels / 257, atol=0.5)
     np.testing.assert_allclose(depth_m(raw("16UC1", pixels, 2, big_endian)), pixels / 1000.0, rtol=1e-6)
     metres = RNG.uniform(0.1, 9, (6, 5)).astype(np.float32)
     metres[0, :4] = np.nan, np.inf, 0.0, -1.0

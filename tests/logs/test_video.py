@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from vplog import logs
 from vplog.errors import LogError
+from vplog.logs import video as video_module
 from vplog.logs.h264 import FrameNumbers
 from vplog.logs.messages import BadMessageError
 from vplog.logs.video import VideoStream, codec_of, packet_kind
@@ -29,7 +30,9 @@ foxglove = pytest.importorskip("foxglove_schemas_protobuf.CompressedVideo_pb2")
 
 COUNT, WIDTH, HEIGHT, GROUP = 40, 96, 64, 12
 PERIOD_NS = 50_000_000
-ENCODERS = {"h264": "libx264", "hevc": "libx265", "vp9": "libvpx-vp9"}
+ENCODERS = {"h264": "libx264", "hevc": "libx265", "vp9": "libvpx-vp9", "av1": "libsvtav1"}
+FORMATS = {"h264": "h264", "hevc": "h265", "vp9": "vp9", "av1": "av1"}
+"""Names in foxglove.CompressedVideo (docs.foxglove.dev/docs/sdk/schemas/compressed-video)."""
 
 
 @cache
@@ -55,6 +58,7 @@ def packets(codec: str, b_frames: int = 0, x265: str = "") -> list[bytes]:
         "h264": {"crf": "12", "tune": "fastdecode" if b_frames else "zerolatency", "bf": str(b_frames)},
         "hevc": {"crf": "10", "x265-params": f"{x265}bframes={b_frames}:keyint={GROUP}:log-level=none:pools=1"},
         "vp9": {"crf": "8", "b": "0", "lag-in-frames": "0", "deadline": "realtime"},
+        "av1": {"crf": "16", "preset": "8", "svtav1-params": "scd=0" if b_frames else "pred-struct=1:scd=0"},
     }[codec]  # fmt: skip
     found = []
     for i, picture in enumerate(pictures()):
@@ -85,11 +89,11 @@ def test_any_frames_in_any_order_are_those_asked_for(codec: str, rows: Any) -> N
         assert close(video.frame(row), row), row
 
 
-@pytest.mark.parametrize("codec", ["h264", "hevc"])
+@pytest.mark.parametrize("codec", ["h264", "hevc", "av1"])
 def test_frames_that_come_out_later_than_their_packets(codec: str) -> None:
     payloads = packets(codec, 3)
     order = packets.pts[codec, 3]  # type: ignore[attr-defined]
-    assert order != sorted(order)  # the encoder did reorder
+    assert codec == "av1" or order != sorted(order)  # the encoder did reorder; AV1 hides that within a packet
     video = stream(codec, payloads)
     for row, number in enumerate(order):
         assert close(video.frame(row), number)
@@ -195,7 +199,9 @@ def test_what_is_video() -> None:
     assert codec_of("jpeg") == codec_of("bgr8; jpeg compressed bgr8") == codec_of("16UC1; compressedDepth png") == ""
 
 
-def messages(kind: str, payloads: list[bytes], first: int = 0) -> list[tuple[str, str, str, int, bytes]]:
+def messages(
+    kind: str, payloads: list[bytes], first: int = 0, codec: str = "h264"
+) -> list[tuple[str, str, str, int, bytes]]:
     """A log of the video from row `first` on, in one of the ways it is recorded."""
     ros = store(2)
     fields = (
@@ -214,26 +220,27 @@ def messages(kind: str, payloads: list[bytes], first: int = 0) -> list[tuple[str
         header = ros.types["std_msgs/msg/Header"](stamp=time, frame_id="camera")
         data = np.frombuffer(payload, np.uint8)
         if kind == "foxglove":
-            message = foxglove.CompressedVideo(frame_id="camera", data=payload, format="h264")
+            message = foxglove.CompressedVideo(frame_id="camera", data=payload, format=FORMATS[codec])
             message.timestamp.seconds, message.timestamp.nanos = stamp // 10**9, stamp % 10**9
             found.append(("/video", "foxglove.CompressedVideo", "protobuf", stamp, message.SerializeToString()))
             continue
         if kind == "compressed":
             name = "sensor_msgs/msg/CompressedImage"
-            message = ros.types[name](header=header, format="h264", data=data)
+            message = ros.types[name](header=header, format=FORMATS[codec], data=data)
         else:
             name = packet_type
             message = ros.types[name](
-                header=header, width=WIDTH, height=HEIGHT, encoding="h264;yuv420p;bgr8;bgr8", pts=i, flags=0,
-                is_bigendian=False, data=data,
+                header=header, width=WIDTH, height=HEIGHT, encoding=f"{ENCODERS[codec]};yuv420p;bgr8;bgr8", pts=i,
+                flags=0, is_bigendian=False, data=data,
             )  # fmt: skip
         found.append(("/video", name, "cdr", stamp, bytes(ros.serialize_cdr(message, name))))
     return found
 
 
+@pytest.mark.parametrize("codec", ENCODERS)
 @pytest.mark.parametrize("kind", ["foxglove", "compressed", "ffmpeg"])
-def test_video_in_a_log(kind: str, tmp_path: Path) -> None:
-    log = logs.open(write_raw(tmp_path / "drive.mcap", messages(kind, packets("h264"))))
+def test_video_in_a_log(kind: str, codec: str, tmp_path: Path) -> None:
+    log = logs.open(write_raw(tmp_path / "drive.mcap", messages(kind, packets(codec), codec=codec)))
     assert len(log.stamps()) == COUNT
     assert (log.camera().width, log.camera().height) == (WIDTH, HEIGHT)
     wanted = log.stamps()[[1, 14, 15, 33]]
@@ -258,14 +265,16 @@ def test_no_frame_is_lost_where_chunks_end(encoding: str, tmp_path: Path) -> Non
     assert close(last.decode().image, GROUP - 1)
 
 
-def test_frames_before_the_first_key_frame_are_left_out_and_counted(tmp_path: Path) -> None:
-    log = logs.open(write_raw(tmp_path / "drive.mcap", messages("foxglove", packets("h264"), first=5)))
+@pytest.mark.parametrize("codec", ENCODERS)
+def test_frames_before_the_first_key_frame_are_left_out_and_counted(codec: str, tmp_path: Path) -> None:
+    log = logs.open(write_raw(tmp_path / "drive.mcap", messages("foxglove", packets(codec), first=5, codec=codec)))
     stamps = log.stamps()
     assert stamps[0] == START_NS + GROUP * PERIOD_NS
     assert f"{GROUP - 5} images before the first key frame" in " ".join(log.warnings)
     for frame, row in zip(log.frames(stamps), range(GROUP, COUNT), strict=True):
         assert close(frame.decode().image, row)
-    log = logs.open(write_raw(tmp_path / "none.mcap", messages("foxglove", packets("h264")[:GROUP], first=1)))
+    group = messages("foxglove", packets(codec)[:GROUP], first=1, codec=codec)
+    log = logs.open(write_raw(tmp_path / "none.mcap", group))
     with pytest.raises(LogError, match="no readable image"):
         log.stamps()
 
@@ -294,6 +303,12 @@ def test_without_pyav_one_line_names_the_extra(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(LogError, match=r"/video is H\.264 video.*vplog\[video\]"):
         log.camera()
     assert any("vplog[video]" in line for line in log.info().warnings)
+
+
+def test_an_ffmpeg_without_the_decoder_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video_module, "_DECODERS", {"av1": "no_such_decoder"})
+    with pytest.raises(LogError, match=r"/video is AV1 video.*lacks its decoder, no_such_decoder"):
+        stream("av1", packets("av1")).frame(0)
 
 
 def test_luma_is_that_of_pictures() -> None:

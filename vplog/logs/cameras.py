@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Camera
+from vplog.logs.containers import Notes
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.logs.containers import Notes
     from vplog.logs.messages import CalibrationMessage
     from vplog.logs.transforms import FrameTree
 
@@ -31,6 +31,8 @@ _BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
 _LARGEST_PX = 1e7
 """px; a longer focal length is damage: telescopes have 1e6."""
+_SAME_PX = 1.0
+"""px that a calibration that came later may move the image's corners without being another: focus moves them."""
 _SAME_SHAPE = 0.01
 """Relative difference of the scales in x and y below which a resized image still fits its calibration: rounding."""
 
@@ -60,6 +62,28 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
         return unknown
     camera = replace(unknown, matrix=matrix, distortion_model=known[0], distortion=known[1])
     return _fit(camera, calibration, notes)
+
+
+def camera_from_image(
+    camera: Camera, size: tuple[int, int], calibration: CalibrationMessage | None
+) -> tuple[Floats | None, bool]:
+    """(2, 3) from px of an image of `size` to px of the camera, of the same lens, and whether the two are the same.
+
+    By the image's own calibration where it has one; else, where the shape is the same, as a scaled image of all that
+    the camera sees. Neither where the shape is another. A change below a px, as of a lens in focus, is none.
+    """
+    own = None if calibration is None else camera_of(camera.name, calibration, size, Notes())
+    if camera.matrix is not None and own is not None and own.matrix is not None:
+        found = (camera.matrix @ np.linalg.inv(own.matrix))[:2]
+    else:
+        x, y = camera.width / size[0], camera.height / size[1]
+        if abs(x - y) > _SAME_SHAPE * max(x, y):
+            return None, False
+        found = np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2]])
+    corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], np.float64)
+    moved = np.abs(corners @ found.T - corners[:, :2]).max()
+    same = size == (camera.width, camera.height) and moved < _SAME_PX
+    return (None, True) if same else (found, False)
 
 
 def is_rectified(topic: str) -> bool:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from vplog.logs.images import image_size, is_depth
+from vplog.image_file import image_size
+from vplog.logs.images import is_depth, is_image, may_be_thermal
 from vplog.logs.messages import BadMessageError, CalibrationMessage, ImageMessage, decode, kind_of
 from vplog.logs.select import Candidate
 from vplog.logs.transforms import clean
@@ -12,6 +15,10 @@ from vplog.logs.video import codec_of
 
 if TYPE_CHECKING:
     from vplog.logs.containers import Channel, Container, Contents
+
+
+_THERMAL = re.compile(r"therm|infra|lwir|flir|boson|lepton|(?<![a-z])ir(?![a-z])")
+"""Words for thermal cameras: their kind, their band, and the most common makes."""
 
 
 def read_candidates(container: Container, contents: Contents) -> list[Candidate]:
@@ -32,11 +39,12 @@ def read_candidates(container: Container, contents: Contents) -> list[Candidate]
             left.discard(message.channel)
         if not left:
             break
-    return [
+    found = [
         _candidate(channel, contents.counts[channel], kind, firsts.get(channel))
         for channel, kind in kinds.items()
         if kind
     ]
+    return [replace(c, role="image") if _is_thermal(c, firsts.get(c.channel), found) else c for c in found]
 
 
 def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | CalibrationMessage | None) -> Candidate:
@@ -50,7 +58,19 @@ def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | Ca
             role = "depth"
     calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
     frame = clean(first.frame) if first else ""
-    return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0))
+    supported = not isinstance(first, ImageMessage) or is_image(first)
+    return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0), supported)
+
+
+def _is_thermal(candidate: Candidate, first: object, candidates: list[Candidate]) -> bool:
+    """Whether images of 16UC1 are a thermal camera's, not depth: by the words of topic and frame; else where no camera
+    has their frame, to which depth would be registered, and every px has a value."""
+    if candidate.role != "depth" or not isinstance(first, ImageMessage) or not may_be_thermal(first):
+        return False
+    words = f"{candidate.channel.topic} {candidate.frame}".lower()
+    if "depth" in words or _THERMAL.search(words):
+        return "depth" not in words
+    return not any(c.role == "image" and c.frame == candidate.frame for c in candidates)
 
 
 def _named_depth(topic: str, first: ImageMessage) -> bool:

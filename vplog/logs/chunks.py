@@ -29,8 +29,8 @@ _THREADS = 2
 """Threads that read ahead, where there may be as many: each unpacks about 1 GB/s, and images are gone through twice as
 fast. More cost more time of the processor than they save."""
 _ALONE_S = 0.02
-"""Seconds of unpacking before other threads help. To start them and to hand over costs a few ms, and while a log is
-opened images are decoded on the other cores; what takes long to unpack, by its size or its packing, is there soon."""
+"""Seconds of unpacking before other threads help. To start them and to hand over costs a few ms; what takes long to
+unpack, by its size or its packing, is there soon."""
 _LEAST_BYTES = 64 * 2**10
 """Size of a chunk from which another thread unpacks it: handing over takes as long as some 50 kB."""
 _AHEAD_BYTES = 32 * 2**20

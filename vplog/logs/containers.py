@@ -132,8 +132,9 @@ class Container(Protocol):
         ...
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        """The same by the bytes they lie in, one block in memory at a time. Large messages of `brief` channels, in the
-        encodings of ROS, may be cut off behind the stamp in their header: they reach beyond the block's bytes."""
+        """The same by the bytes they lie in, one block in memory at a time. Of large messages of `brief` channels, in
+        the encodings of ROS, only the header's stamp is there: what follows it, up to their stop and beyond the end of
+        the block, are bytes of others. `read` gives them whole."""
         ...
 
     def read(self, place: Place) -> Octets:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.logs.containers import plural
-from vplog.logs.gather import Gathered, Images
+from vplog.logs.gather import Calibrations, Gathered, Images
 from vplog.logs.moving import MovingFrames
 from vplog.logs.stamps import nearest, share_clock
 from vplog.logs.tracks import FixTrack, PoseTrack
@@ -17,7 +17,6 @@ from vplog.logs.transforms import FrameTree
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry
     from vplog.logs.containers import Container, Notes, Place
-    from vplog.logs.early import EarlyImages
     from vplog.logs.messages import CalibrationMessage
     from vplog.logs.select import Selection
 
@@ -38,7 +37,9 @@ class Content:
     """Where the depth image of each lies."""
     right_places: list[Place | None]
     """Where the right image of each lies."""
-    calibration: CalibrationMessage | None
+    calibrations: list[CalibrationMessage]
+    """Those that are set, each other than the one before: the first is the camera's, a later one that of images behind
+    its stamp."""
     right_calibration: CalibrationMessage | None
     odometry: Odometry | None
     frames: list[str]
@@ -58,23 +59,22 @@ _TOGETHER_NS = 5_000_000
 """ns that the images of a pair may be apart: 5 cm at 10 m/s, a tenth of a usual baseline."""
 
 
-def read_content(container: Container, chosen: Selection, notes: Notes, early: EarlyImages) -> Content:
-    """Read the chosen topics once; what had to be repaired or left out is noted. `early` decodes images meanwhile."""
+def read_content(container: Container, chosen: Selection, notes: Notes) -> Content:
+    """Read the chosen topics once; what had to be repaired or left out is noted."""
     read = Gathered(
         Images(chosen.image),
         Images(chosen.depth),
         Images(chosen.right),
-        chosen.right_info,
+        Calibrations(chosen.camera_info),
+        Calibrations(chosen.right_info),
         PoseTrack(chosen.odometry.topic) if chosen.odometry and chosen.odometry not in chosen.tf else None,
         FixTrack(chosen.gps.topic) if chosen.gps else None,
         odometry=chosen.odometry,
-        info=chosen.camera_info,
         tf=chosen.tf,
         moving=MovingFrames(keep=chosen.odometry in chosen.tf),
     )
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
     for block in container.blocks(chosen.channels, stamped):
-        early.offer(block)
         read.take_block(block)
     read.finish_poses()
     for (reason, topic), runs in read.lost.items():
@@ -103,7 +103,9 @@ def read_content(container: Container, chosen: Selection, notes: Notes, early: E
     gps = read.fixes.finish(notes) if read.fixes else None
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
+    calibrations = read.calibrations.finish(notes)
+    right_calibration = next(iter(read.right_calibrations.finish(notes)), None)
     return Content(
-        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], read.calibration, read.right_calibration,
+        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], calibrations, right_calibration,
         odometry, frames, gps, tree, read.skew_ms(),
     )  # fmt: skip

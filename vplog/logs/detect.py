@@ -149,7 +149,15 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         endings = {file.suffix for file in images if file.suffix}
         damaged = {file for file in files if file.suffix in endings}.difference(images)
         return ImageFolder(path, [*images, *damaged], notes, choice, damaged)
+    inside = {folder.name: count for folder in sorted(path.iterdir()) if folder.is_dir() and (count := _images(folder))}
+    if inside:
+        found = ", ".join(f"{name} ({count})" for name, count in [*inside.items()][:_LISTED])
+        raise LogError(f"{path} holds no images itself; folders in it do: {found}. Give one of them.")
     raise LogError(_no_folder(path, files))
+
+
+def _images(folder: Path) -> int:
+    return sum(file.is_file() and image_folder.is_image(file) for file in folder.iterdir())
 
 
 def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
 
 from vplog.data import Frame
 from vplog.errors import LogError
+from vplog.logs.cameras import camera_from_image
 from vplog.logs.image_message import read_image
 from vplog.logs.images import depth_m, grey
 from vplog.logs.messages import BadMessageError, ImageMessage, decode
@@ -14,11 +19,10 @@ from vplog.logs.messages import BadMessageError, ImageMessage, decode
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
-
-    from vplog.data import Bytes, Camera, Float32s
-    from vplog.logs.containers import Channel, Octets
-    from vplog.logs.losses import Account
+    from vplog.data import Bytes, Camera, Float32s, Floats
+    from vplog.logs.containers import Channel, Notes, Octets
+    from vplog.logs.images import Levels
+    from vplog.logs.messages import CalibrationMessage
     from vplog.logs.stereo import Pair
 
 
@@ -39,10 +43,12 @@ class Encoded:
 
     channel: Channel
     data: Octets
+    levels: Levels | None = None
+    """Black and white of its topic, where that has 16 bits."""
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
-        return self._pixels(stamp_ns, grey)
+        return self._pixels(stamp_ns, partial(grey, levels=self.levels))
 
     def depth_m(self, stamp_ns: int) -> Float32s:
         """(H, W) float32 m, NaN where unknown. Raises LogError."""
@@ -81,8 +87,10 @@ class RecordedFrame:
     depth: Encoded | None
     right: Encoded | None
     pair: Pair | None
-    account: Account
+    notes: Notes
     """Of the log: what does not decode is counted there."""
+    calibration: CalibrationMessage | None = None
+    """That of the image, where it came later and is another than the camera's."""
 
     def decode(self) -> Frame:
         """Raises LogError with topic and stamp where the bytes are not an image.
@@ -95,20 +103,30 @@ class RecordedFrame:
             self._lose(self.image.channel)
             raise
         if self.pair is not None:
-            _check_size(self.image.channel, image, self.camera)
+            try:
+                _check_size(self.image.channel, image, self.camera)
+            except LogError as error:
+                self._lose(self.image.channel, str(error))
+                raise
             return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
+        try:
+            affine = affine_to_camera(self.image.channel.topic, image, self.camera, self.calibration, self.notes)
+        except LogError as error:
+            self._lose(self.image.channel, str(error))
+            raise
         if self.depth is None:
-            return Frame(self.stamp_ns, self.camera, image)
+            return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera))
         try:
             depth = self.depth.depth_m(self.stamp_ns)
         except LogError:
             self._lose(self.depth.channel)
-            return Frame(self.stamp_ns, self.camera, image)
+            return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera))
         if depth.shape != image.shape:
             raise LogError(
                 f"{self.depth.channel.topic} at {self.stamp_ns} ns is {size_of(depth)} px, but the image is "
                 f"{size_of(image)} px. Depth must be registered to the image; choose another with --depth-topic."
             )
+        image, depth = warped(image, affine, self.camera), _warped_depth(depth, affine, self.camera)
         return Frame(self.stamp_ns, self.camera, image, depth)
 
     def _right(self, pair: Pair) -> Bytes | None:
@@ -122,9 +140,9 @@ class RecordedFrame:
             return None
         return pair.rectify(image, 1)
 
-    def _lose(self, channel: Channel) -> None:
+    def _lose(self, channel: Channel, detail: str = "") -> None:
         at = self.stamp_ns
-        self.account.add("undecodable_image", {channel.topic: 1}, (channel.topic, at), [(at, at)])
+        self.notes.account.add("undecodable_image", {channel.topic: 1}, (channel.topic, at), [(at, at)], detail)
 
 
 def undecodable(channel: Channel, stamp_ns: int, reason: str) -> str:
@@ -133,6 +151,43 @@ def undecodable(channel: Channel, stamp_ns: int, reason: str) -> str:
 
 def size_of(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]}"
+
+
+def affine_to_camera(
+    topic: str, image: Bytes, camera: Camera, calibration: CalibrationMessage | None, notes: Notes
+) -> Floats | None:
+    """(2, 3) from px of the image to those of the camera; None where they are the same. Raises LogError."""
+    found, same = camera_from_image(camera, (image.shape[1], image.shape[0]), calibration)
+    size = f"{camera.width} x {camera.height} px"
+    if found is None and not same:
+        raise LogError(
+            f"{topic} has an image of {size_of(image)} px among those of {size}, of another shape and without a "
+            "calibration of its own; it is left out."
+        )
+    if found is not None:
+        notes.add(
+            f"The images of {topic} change their size or window; those that are not the first's, {size}, are "
+            "resampled to it."
+        )
+    return found
+
+
+def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
+    """The image in px of the camera; what it does not show repeats its edge, which has no corners."""
+    if affine is None:
+        return image
+    if (shrunk := 1 / affine[0, 0]) > 1:  # the usual blur before pixels are left out
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), max((shrunk - 1) / 2, 1e-3)), np.uint8)
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.warpAffine(image, affine, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _warped_depth(depth: Float32s, affine: Floats | None, camera: Camera) -> Float32s:
+    """The nearest measurement to each px of the camera, NaN beyond the image."""
+    if affine is None:
+        return depth
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.warpAffine(depth, affine, size, flags=cv2.INTER_NEAREST, borderValue=np.nan), np.float32)
 
 
 def _check_size(channel: Channel, image: np.ndarray, camera: Camera) -> None:

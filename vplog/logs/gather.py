@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.containers import Message
+from vplog.logs.containers import Message, plural
 from vplog.logs.losses import Runs
 from vplog.logs.messages import (
     BadMessageError,
@@ -26,11 +26,13 @@ from vplog.logs.stamps import NONE, Stamps
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.containers import Block, Channel, Notes, Place
+    from vplog.logs.containers import Block, Channel, Notes, Octets, Place
     from vplog.logs.tracks import FixTrack, PoseTrack
 
 _SMALL = 512
 """Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
+_HEADER = 12
+"""Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
 _TOGETHER = 1024
 """Messages of odometry that are read at once: 0.7 MB, with which the calls to set up take no time."""
 
@@ -93,18 +95,50 @@ class Images:
 
 
 @dataclass
+class Calibrations:
+    """Calibrations of one topic that are set and differ from the one before."""
+
+    channel: Channel | None
+    found: list[CalibrationMessage] = field(default_factory=list)
+    unset: int = 0
+    """Messages before the first that is set."""
+    _last: bytes = b""
+    _first: CalibrationMessage | None = None
+
+    def add(self, calibration: CalibrationMessage, data: Octets) -> None:
+        self._last = bytes(data[_HEADER:])
+        self._first = self._first or calibration
+        if not calibration.is_set:
+            self.unset += not self.found
+        elif not self.found or not self.found[-1].equals(calibration):
+            self.found.append(calibration)
+
+    def repeats(self, data: Octets) -> bool:
+        """Whether a message of ROS is that before it but for its stamp."""
+        ros = self.channel is not None and self.channel.encoding in ("cdr", "ros1")
+        return ros and bool(self.found) and data[_HEADER:] == self._last
+
+    def finish(self, notes: Notes) -> list[CalibrationMessage]:
+        """Those found; where none is set, the first."""
+        if self.unset and self.found and self.channel:
+            notes.add(
+                f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
+                f"{'is' if self.unset == 1 else 'are'} not set (K is zero); the first that is set is taken."
+            )
+        return self.found or ([self._first] if self._first else [])
+
+
+@dataclass
 class Gathered:
     """What has been collected so far."""
 
     images: Images
     depths: Images
     rights: Images
-    right_info: Channel | None
+    calibrations: Calibrations
+    right_calibrations: Calibrations
     poses: PoseTrack | None
     fixes: FixTrack | None
-    calibration: CalibrationMessage | None = None
-    """The first one speaks for the drive."""
-    right_calibration: CalibrationMessage | None = None
     transforms: list[TransformMessage] = field(default_factory=list)
     lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
     """By reason and topic."""
@@ -112,7 +146,6 @@ class Gathered:
     waiting: list[bytes] = field(default_factory=list)
     """Messages of odometry that are still to be added, and their log times."""
     waiting_ns: list[int] = field(default_factory=list)
-    info: Channel | None = None
     tf: tuple[Channel, ...] = ()
     moving: MovingFrames = field(default_factory=lambda: MovingFrames(keep=False))
 
@@ -124,6 +157,7 @@ class Gathered:
     def take_block(self, block: Block) -> None:
         """Add the messages of a block; those that drives are full of, all of a topic at once."""
         rows: dict[Channel, list[int]] = {}
+        view = memoryview(block.data)
         for row, channel in enumerate(block.channels):
             rows.setdefault(channel, []).append(row)
         others: list[int] = []
@@ -133,7 +167,9 @@ class Gathered:
             elif channel == self.odometry and self.poses:
                 self.waiting += [bytes(block.data[block.starts[row] : block.stops[row]]) for row in mine]
                 self.waiting_ns += [block.log_ns[row] for row in mine]
-            elif not self._is_settled(channel):
+            elif known := self.calibrations_of(channel):
+                others += [row for row in mine if not known.repeats(view[block.starts[row] : block.stops[row]])]
+            else:
                 others += mine
         for row in sorted(others):
             self.take(block.message(row))
@@ -170,11 +206,9 @@ class Gathered:
             if (reason, topic) in self.lost:
                 self.lost[reason, topic].sound()
 
-    def _is_settled(self, channel: Channel) -> bool:
-        """Calibrations that the first one has spoken for."""
-        return bool(
-            (channel == self.info and self.calibration) or (channel == self.right_info and self.right_calibration)
-        )
+    def calibrations_of(self, channel: Channel) -> Calibrations | None:
+        """The calibrations that a channel holds, if it is one of them."""
+        return next((one for one in (self.right_calibrations, self.calibrations) if one.channel == channel), None)
 
     def stamps(self) -> list[Stamps]:
         """Of every topic that is followed over time."""
@@ -193,13 +227,9 @@ class Gathered:
         if images := self.by_channel.get(channel):
             images.add(message)
             return
-        if self._is_settled(channel):
-            return
         match decode(channel, message.data):
-            case CalibrationMessage() as calibration if channel == self.right_info:
-                self.right_calibration = self.right_calibration or calibration
-            case CalibrationMessage() as calibration:
-                self.calibration = self.calibration or calibration
+            case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
+                known.add(calibration, message.data)
             case PoseMessage() as pose if self.poses:
                 self.poses.add(pose, message.log_ns)
             case FixMessage() as fix if self.fixes:

@@ -13,7 +13,9 @@ from vplog.data import Frame, LogInfo, Topic
 from vplog.errors import LogError
 from vplog.logs.beside import Beside
 from vplog.logs.cameras import camera_of
-from vplog.logs.images import grey
+from vplog.logs.frames import affine_to_camera, warped
+from vplog.logs.image_groups import of_one_camera
+from vplog.logs.images import drive_levels, grey, spread
 from vplog.logs.messages import BadMessageError, ImageMessage
 from vplog.logs.stamps import increasing, rows_of
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Bytes, Camera, Gps, Ints, Odometry
     from vplog.logs.containers import Notes
+    from vplog.logs.images import Levels
     from vplog.logs.losses import Account, Loss
     from vplog.logs.select import TopicChoice
 
@@ -71,17 +74,21 @@ class FileFrame:
     stamp_ns: int
     camera: Camera
     path: Path
-    account: Account
+    notes: Notes
     """Of the folder: what does not decode is counted there."""
+    levels: Levels | None = None
+    """Black and white of the folder, where its images have 16 bits."""
 
     def decode(self) -> Frame:
         """Raises LogError where the file is not an image."""
+        name, at = self.path.parent.name, self.stamp_ns
         try:
-            return Frame(self.stamp_ns, self.camera, _read(self.path))
-        except LogError:
-            name, at = self.path.parent.name, self.stamp_ns
-            self.account.add("undecodable_image", {name: 1}, (name, at), [(at, at)])
+            image = _read(self.path, self.levels)
+            affine = affine_to_camera(name, image, self.camera, None, self.notes)
+        except LogError as error:
+            self.notes.account.add("undecodable_image", {name: 1}, (name, at), [(at, at)], str(error))
             raise
+        return Frame(at, self.camera, warped(image, affine, self.camera))
 
 
 class ImageFolder:
@@ -91,7 +98,7 @@ class ImageFolder:
         self, path: Path, files: list[Path], notes: Notes, choice: TopicChoice, damaged: Collection[Path] = ()
     ) -> None:
         """`damaged` are those of `files` that are named like images, and are none: they had their time all the same."""
-        files = sorted(files, key=natural_order)
+        files = of_one_camera(path, sorted(files, key=natural_order), choice.image)
         times = stamps_of([file.stem for file in files])
         if times is None:
             notes.add(f"The names in {path.name} are not times; its images are taken to be 0.1 s apart.")
@@ -140,13 +147,17 @@ class ImageFolder:
 
     def frames(self, stamp_ns: Ints) -> Iterator[FileFrame]:
         for row in rows_of(self._stamp_ns, stamp_ns, self.name):
-            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row], self._notes.account)
+            yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row], self._notes, self._levels)
 
     def odometry(self) -> Odometry | None:
         return self._beside.odometry
 
     def gps(self) -> Gps | None:
         return None
+
+    @cached_property
+    def _levels(self) -> Levels | None:
+        return drive_levels(map(_message, self._files[:: spread(len(self._files))]))
 
     @cached_property
     def _camera(self) -> Camera:
@@ -168,8 +179,12 @@ class ImageFolder:
         raise LogError(f"{self._path} has no image that can be decoded. The first: {reason}")
 
 
-def _read(path: Path) -> Bytes:
+def _message(path: Path) -> ImageMessage:
+    return ImageMessage(0, "", path.suffix, path.read_bytes(), True)
+
+
+def _read(path: Path, levels: Levels | None = None) -> Bytes:
     try:
-        return grey(ImageMessage(0, "", path.suffix, path.read_bytes(), True))
+        return grey(_message(path), levels)
     except (OSError, BadMessageError) as error:
         raise LogError(f"{path} cannot be decoded: {error}.") from None

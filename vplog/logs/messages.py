@@ -51,6 +51,16 @@ class CalibrationMessage:
     rotation: Floats = field(default_factory=lambda: np.eye(3))
     """(3, 3) rectified_from_camera of a stereo pair; the identity or all zero without one."""
 
+    def equals(self, other: CalibrationMessage) -> bool:
+        """Whether all but the stamp is equal."""
+        mine, theirs = vars(self) | {"stamp_ns": 0}, vars(other) | {"stamp_ns": 0}
+        return all(np.array_equal(mine[name], theirs[name]) for name in mine)
+
+    @property
+    def is_set(self) -> bool:
+        """Not so where a driver has no calibration: ROS has zeros then (sensor_msgs/CameraInfo)."""
+        return bool(self.matrix[0, 0] > 0 or self.projection[0, 0] > 0)
+
 
 class PoseMessage(NamedTuple):
     """A tuple of plain numbers: drives have more of these than of anything else."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,15 +12,17 @@ import numpy as np
 from vplog.errors import LogError
 from vplog.logs.containers import plural
 from vplog.logs.frames import Decoded, Encoded, image_in
-from vplog.logs.images import grey
+from vplog.logs.images import drive_levels, grey, spread
 from vplog.logs.messages import BadMessageError, ImageMessage, decode
 from vplog.logs.video import VideoStream
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from vplog.data import Float32s
     from vplog.logs.containers import Channel, Container, Notes, Octets, Place
     from vplog.logs.content import Content
-    from vplog.logs.early import EarlyImages
+    from vplog.logs.images import Levels
 
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
@@ -33,18 +37,9 @@ def _frame_and_size(channel: Channel, data: Octets) -> tuple[str, tuple[int, int
 class Pictures:
     """Reads images where `content` says they lie."""
 
-    def __init__(
-        self,
-        container: Container,
-        image: Channel | None,
-        codec: str,
-        content: Content,
-        notes: Notes,
-        early: EarlyImages,
-    ) -> None:
-        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty. `early` has what is decoded
-        of `image` already."""
-        self._container, self._image, self._early = container, image, early
+    def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
+        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
+        self._container, self._image = container, image
         self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """What was read, without the images before a video's first key frame."""
@@ -53,21 +48,27 @@ class Pictures:
         if self._image is None:
             raise LogError("No image topic is chosen.")
         if self._video is None:
-            place = self.content.places[row]
-            return self._early.take(place) or Encoded(self._image, self._container.read(place))
+            return Encoded(self._image, self._container.read(self.content.places[row]), self._levels)
         try:
             return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])), "")
         except BadMessageError as error:
             return Decoded(self._image, None, str(error))
 
-    def forget_early(self) -> None:
-        """Give back the memory of images that nobody asked for."""
-        self._early.forget()
-
     def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
         """The depth or right image of a row; None where there is none."""
         place = places[row]
-        return None if channel is None or place is None else Encoded(channel, self._container.read(place))
+        return None if channel is None or place is None else Encoded(channel, self._container.read(place), self._levels)
+
+    @cached_property
+    def _levels(self) -> Levels | None:
+        """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
+        places = self.content.places
+        return None if self._image is None else drive_levels(self._sampled(self._image, places[:: spread(len(places))]))
+
+    def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
+        for place in places:
+            with suppress(BadMessageError):
+                yield image_in(channel, self._container.read(place))
 
     def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
         """Frame, and width and height of the first image that decodes.
@@ -77,8 +78,6 @@ class Pictures:
         video, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:
-                if channel == self._image and (found := self._early.frame_and_size(place)) is not None:
-                    return found
                 if video is None:
                     return _frame_and_size(channel, self._container.read(place))
                 message = decode(channel, self._container.read(place))

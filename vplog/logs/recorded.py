@@ -11,11 +11,11 @@ from vplog.errors import LogError
 from vplog.logs.beside import Beside
 from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
 from vplog.logs.candidates import read_candidates
+from vplog.logs.containers import Notes
 from vplog.logs.content import read_content
-from vplog.logs.early import EarlyImages
 from vplog.logs.frames import RecordedFrame, size_of
-from vplog.logs.losses import Account
 from vplog.logs.pictures import Pictures
+from vplog.logs.ros2_folder import messages_unpacked
 from vplog.logs.select import TopicChoice, select
 from vplog.logs.stamps import rows_of
 from vplog.logs.stereo import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Bytes, Camera, Gps, Ints, Odometry
-    from vplog.logs.containers import Channel, Container, Contents, Notes
+    from vplog.logs.containers import Channel, Container, Contents
     from vplog.logs.content import Content
-    from vplog.logs.losses import Loss
+    from vplog.logs.losses import Account, Loss
+    from vplog.logs.messages import CalibrationMessage
     from vplog.logs.stereo import Pair
 
 _LISTED = 8
@@ -40,9 +41,10 @@ class RecordedLog:
     def __init__(
         self, path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice
     ) -> None:
-        self._path, self._name, self._kind, self._container, self._notes = path, name, kind, container, notes
+        self._path, self._name, self._kind, self._notes = path, name, kind, notes
         self._contents: Contents = container.contents()
-        self._candidates = read_candidates(container, self._contents)
+        self._container = messages_unpacked(container, self._contents, notes)
+        self._candidates = read_candidates(self._container, self._contents)
         self._selection = select(self._candidates, choice, path.name)
         self._beside_log = Beside(choice, notes)
 
@@ -104,7 +106,6 @@ class RecordedLog:
         camera = self.camera()
         for row in rows_of(self._content.stamp_ns, stamp_ns, self._name):
             yield self._frame(row, camera)
-        self._pictures.forget_early()
 
     def odometry(self) -> Odometry | None:
         return self._beside_log.odometry or self._content.odometry
@@ -125,7 +126,9 @@ class RecordedLog:
         if self._selection.image is None:
             names = list(dict.fromkeys(channel.topic for channel in self._contents.counts))
             listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
-            raise LogError(f"No camera images in {self._path.name}. Topics: {listed or 'none'}.")
+            depth = [c.channel.topic for c in self._candidates if c.role == "depth" and c.encoding.startswith("16UC1")]
+            hint = f" If {depth[0]} is a thermal camera's, take it with --image-topic {depth[0]}." if depth else ""
+            raise LogError(f"No camera images in {self._path.name}. Topics: {listed or 'none'}.{hint}")
         if not len(self._content.stamp_ns):
             raise LogError(f"{self._selection.image.topic} in {self._path.name} has no readable image.")
         return self._selection.image
@@ -135,7 +138,15 @@ class RecordedLog:
         right = None if pair is None else pictures.beside(self._selection.right, content.right_places, row)
         depth = pictures.beside(self._depth, content.depth_places, row)
         stamp_ns, image = int(content.stamp_ns[row]), pictures.image(row)
-        return RecordedFrame(stamp_ns, camera, image, depth, right, pair, self._notes.account)
+        own = self._calibration_at(stamp_ns)
+        return RecordedFrame(stamp_ns, camera, image, depth, right, pair, self._notes, own)
+
+    def _calibration_at(self, stamp_ns: int) -> CalibrationMessage | None:
+        """The calibration in force at a stamp, where it is another than the camera's."""
+        found = self._content.calibrations[1:]
+        if not found or self._beside_log.camera(self._image_channel().topic) is not None:
+            return None
+        return max((c for c in found if c.stamp_ns <= stamp_ns), key=lambda c: c.stamp_ns, default=None)
 
     def _codec(self, channel: Channel | None) -> str:
         return next((candidate.codec for candidate in self._candidates if candidate.channel == channel), "")
@@ -163,9 +174,8 @@ class RecordedLog:
     def _pictures(self) -> Pictures:
         image = self._selection.image
         codec = self._codec(image)
-        with EarlyImages(self._container, None if codec else image) as early:
-            content = read_content(self._container, self._selection, self._notes, early)
-        return Pictures(self._container, image, codec, content, self._notes, early)
+        content = read_content(self._container, self._selection, self._notes)
+        return Pictures(self._container, image, codec, content, self._notes)
 
     @property
     def _content(self) -> Content:
@@ -182,7 +192,8 @@ class RecordedLog:
         content, notes = self._content, self._notes
         frame, size = self._pictures.first(image, [*content.places], self._path.name)
         known = self._beside_log.camera(image.topic)
-        camera = camera_of(image.topic, known.calibration if known else content.calibration, size, notes)
+        calibration = known.calibration if known else next(iter(content.calibrations), None)
+        camera = camera_of(image.topic, calibration, size, notes)
         named = content.body and frame and content.tree.between(content.body, frame) is not None
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
@@ -206,7 +217,7 @@ class RecordedLog:
             known = [self._beside_log.camera(channel.topic) for channel in (image, right)]
             calibrations = [camera.calibration if camera else None for camera in known]
             if known[0] is None:
-                calibrations = [content.calibration, content.right_calibration]
+                calibrations = [next(iter(content.calibrations), None), content.right_calibration]
             if calibrations[0] is None or calibrations[1] is None:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._pictures.first(right, content.right_places, self._path.name)
@@ -234,7 +245,7 @@ class RecordedLog:
             image, beside = pictures.image(row), pictures.beside(right, content.right_places, row)
             stamp_ns = int(content.stamp_ns[row])
             try:  # nothing of a trial is counted
-                frame = RecordedFrame(stamp_ns, camera, image, None, beside, pair, Account()).decode()
+                frame = RecordedFrame(stamp_ns, camera, image, None, beside, pair, Notes()).decode()
             except LogError:
                 continue
             if frame.right is not None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import yaml
+import zstandard
 
 from vplog.logs.compression import BadChunkError, unpack_zstd_message
 from vplog.logs.containers import Contents, Message, Notes, by_topic, in_blocks, ordered
@@ -27,6 +29,10 @@ _MOST_MESSAGES = 2**48
 _DEEPEST = 64
 """Levels of lists and maps in metadata.yaml; rosbag2 writes 8."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+_TRIED = 10
+"""Messages that are looked at for whether each is packed: a damaged one does not decide it."""
 
 
 class MetadataError(Exception):
@@ -143,6 +149,15 @@ class ZstdMessages:
             return unpack_zstd_message(self._packed.read(place))
         except BadChunkError:
             return b""
+
+
+def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
+    """The container, or one that unpacks its messages where each is a zstd frame: a storage file of rosbag2's
+    compression mode MESSAGE, given without the metadata that say so. No CDR begins as a frame of zstd does."""
+    channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
+    firsts = islice(container.messages(channels), _TRIED) if channels else ()
+    packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)
+    return ZstdMessages(container, notes) if packed else container
 
 
 def read_metadata(folder: Path) -> Metadata:

@@ -1,9 +1,12 @@
 """Which topic of a log plays which part.
 
-An image topic is depth where its encoding is 16UC1 or 32FC1, or compressedDepth, or mono16 under a name with `depth`.
+An image topic is depth where its encoding is 16UC1, 16SC1, 32FC1 or 64FC1, or compressedDepth, or mono16 under a name
+with `depth`; 16UC1 without px that lack a measurement is a thermal camera's, where its name says so or no camera shares
+its frame.
 Static transforms are those of all topics whose name ends in `static`. Of several topics that could play one of the
 other parts the first by these rules does, unless TopicChoice names another:
-- image: calibrated first, then those that are not the right one of a pair, then most messages, then name;
+- image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
+  right one of a pair, then most messages, then name;
 - right: the topic named like the image's with `right` for `left` (or another of _PAIRS), where no depth is used;
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
@@ -67,6 +70,8 @@ class Candidate:
     """Pixel layout of the images, or their format where compressed, as the first message names it."""
     size: tuple[int, int] = (0, 0)
     """Width and height in px of the first image, 0 where it is not told without decoding it."""
+    supported: bool = True
+    """Whether images of its encoding can be decoded to grey."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +121,12 @@ _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "i
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
 
-    def pick(role: str, key: Callable[[Candidate], tuple], also: str = "") -> Candidate | None:
+    def pick(
+        role: str, key: Callable[[Candidate], tuple], also: str = "", taken: Candidate | None = None
+    ) -> Candidate | None:
         wanted = getattr(choice, role)
         found = sorted((c for c in candidates if c.role == _ROLES.get(role, role) and c.count), key=key)
+        found = [c for c in found if c is not taken]
         if wanted is None:
             return found[0] if found else None
         if wanted == "":
@@ -137,13 +145,14 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
 
     def as_image(c: Candidate) -> tuple:
         uncalibrated = not any(info.calibrated for info in calibrations(c)[:1])
-        return uncalibrated, _partner(c, candidates, back=True) is not None, *by_size(c)
+        sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
+        return not c.supported, sixteen_bits, uncalibrated, _partner(c, candidates, back=True) is not None, *by_size(c)
 
     image = pick("image", as_image, "depth")
     depth = calibration = right = right_info = None
     if image is not None:
         if choice.depth is not None or not choice.right:
-            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *by_size(c)), "image")
+            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *by_size(c)), "image", image)
         right = pick("right", by_size) if choice.right is not None else _partner(image, candidates)
         if right is not None and depth is not None:
             if choice.right and choice.depth:

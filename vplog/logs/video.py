@@ -31,7 +31,9 @@ _CODECS = {
     "vp9": ("vp9", "VP9"),
     "av1": ("av1", "AV1"),
 }
-"""What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's decoder, and the name people know."""
+"""What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
+_DECODERS = {"av1": "libdav1d"}
+"""FFmpeg's decoder where that of the codec's own name needs hardware: its `av1` is for graphics cards alone."""
 MAX_PIXELS = 2**25
 """px of a video frame that is decoded: 8K (7680 x 4320); a decoder keeps up to 16 of them."""
 _DELAY = 64
@@ -43,7 +45,7 @@ _UNSEEN, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
 
 
 def codec_of(encoding: str) -> str:
-    """FFmpeg's decoder for a compressed image message's format; empty where it is no video."""
+    """FFmpeg's codec for a compressed image message's format; empty where it is no video."""
     first = encoding.split(";", maxsplit=1)[0].lower()
     return next((codec for word, (codec, _) in _CODECS.items() if word in first), "")
 
@@ -112,7 +114,15 @@ class VideoStream:
 
     def _restart(self, key: int) -> None:
         self._av = _av(self._codec, self._topic)
-        self._decoder = self._av.CodecContext.create(self._codec, "r")
+        name = _DECODERS.get(self._codec, self._codec)
+        try:
+            self._decoder = self._av.CodecContext.create(name, "r")
+        except ValueError:  # PyAV's UnknownCodecError
+            raise LogError(
+                f"{self._topic} is {_name(self._codec)} video, and the FFmpeg of this PyAV lacks its decoder, {name}. "
+                "Install PyAV's own wheel (pip install --force-reinstall av), or choose another topic with "
+                "--image-topic."
+            ) from None
         # a wrong picture is no picture
         self._decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
         self._decoder.thread_count = 1  # with more, what damage does is a matter of chance
@@ -221,14 +231,17 @@ def _grey(frame: Any) -> Bytes:
     return rows.copy() if full else _STRETCH[rows]
 
 
+def _name(codec: str) -> str:
+    return next(name for known, name in _CODECS.values() if known == codec)
+
+
 def _av(codec: str, topic: str) -> Any:
     """PyAV, an extra. Raises LogError where it is not installed."""
     try:
         import av
     except ImportError:
-        name = next(name for decoder, name in _CODECS.values() if decoder == codec)
         raise LogError(
-            f"{topic} is {name} video, and PyAV, which decodes it, is not installed. Install vplog[video] "
+            f"{topic} is {_name(codec)} video, and PyAV, which decodes it, is not installed. Install vplog[video] "
             "(pip install 'vplog[video]'), or choose another topic with --image-topic."
         ) from None
     return av

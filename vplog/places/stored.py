@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
+from vplog.image_file import BadImageError, decode_image
 from vplog.parquet_bounds import check_file, open_table, read_table
 
 if TYPE_CHECKING:
@@ -184,6 +185,6 @@ def _table(path: Path, schema: pa.Schema) -> pa.Table:
 
 def _decode(data: bytes) -> np.ndarray | None:
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # no bytes at all, or a size that OpenCV refuses
+        return decode_image(data)
+    except BadImageError:
         return None

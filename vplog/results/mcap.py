@@ -281,7 +281,6 @@ def _loop_closure(
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
     """Width and height in px."""
-    import cv2
+    from vplog.image_file import image_size
 
-    height, width = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)).shape
-    return width, height
+    return image_size(data) or (0, 0)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from vplog.image_file import decode_image
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -71,4 +72,4 @@ class Previews:
 
     def image(self, row: int) -> Bytes:
         """(h, w) uint8 grey."""
-        return np.asarray(cv2.imdecode(np.frombuffer(self[row], np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
+        return decode_image(self[row])

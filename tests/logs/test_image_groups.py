@@ -1,0 +1,127 @@
+"""A folder of images of several cameras is refused in one line, or read as the one that is chosen."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from vplog import logs
+from vplog.errors import LogError
+from vplog.logs.select import TopicChoice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+RNG = np.random.default_rng(5)
+
+
+def picture(bits: int = 8, size: tuple[int, int] = (48, 64)) -> np.ndarray:
+    return RNG.integers(0, 2**bits, size).astype(np.uint16 if bits == 16 else np.uint8)
+
+
+def write(folder: Path, names: Iterator[str] | list[str], **options: Any) -> None:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), picture(**options))
+
+
+MIXED: dict[str, tuple[list[tuple[str, dict[str, Any]]], set[str]]] = {
+    "left and right": ([("left_{:03}.png", {}), ("right_{:03}.png", {})], {"left_*.png", "right_*.png"}),
+    "numbers first": ([("{:06}_l.jpg", {}), ("{:06}_r.jpg", {})], {"*_l.jpg", "*_r.jpg"}),
+    "ScanNet": (
+        [("frame-{:06}.color.jpg", {}), ("frame-{:06}.depth.png", {"bits": 16})],
+        {"frame-*.color.jpg", "frame-*.depth.png"},
+    ),
+    "same number, two formats": ([("{:04}.jpg", {}), ("{:04}.png", {"bits": 16})], {"*.jpg", "*.png"}),
+    "by bits": ([("1{:09}.png", {}), ("1{:09}5.png", {"bits": 16})], {"8 bits", "16 bits"}),
+    "by size": ([("2{:09}.png", {}), ("2{:09}5.png", {"size": (40, 40)})], {"64x48", "40x40"}),
+    "stamps of their own": (
+        [("rgb_10000{:05}.100000.png", {}), ("depth_10000{:05}.130000.png", {"bits": 16})],
+        {"rgb_*.*.png", "depth_*.*.png"},
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", MIXED)
+def test_several_cameras_are_named_and_one_may_be_chosen(kind: str, tmp_path: Path) -> None:
+    parts, names = MIXED[kind]
+    folder = tmp_path / "drive"
+    for pattern, options in parts:
+        write(folder, [pattern.format(i) for i in range(10)], **options)
+    with pytest.raises(LogError, match="holds images of several cameras") as found:
+        logs.open(folder)
+    assert "\n" not in str(found.value)
+    for name in names:
+        assert f"{name} (10)" in str(found.value)
+        log = logs.open(folder, TopicChoice(image=name))
+        assert len(log.stamps()) == 10
+        assert len({frame.decode().image.shape for frame in log.frames(log.stamps())}) == 1
+
+
+ONE = {
+    "numbers": [f"{i}.png" for i in range(12)],
+    "stamps": [f"{1_600_000_000 + i}.{i:06}.png" for i in range(12)],
+    "parts": [f"part{part}_{i:03}.png" for part in range(3) for i in range(4)],
+    "one after the other": [*(f"a_{i:03}.png" for i in range(6)), *(f"b_{i:03}.png" for i in range(6, 12))],
+    "two formats in turn": [f"{i:03}.{'png' if i % 2 else 'jpg'}" for i in range(12)],
+    "random": ["".join(RNG.choice(list("0123456789abcdef"), 12)) + ".png" for _ in range(30)],
+}
+
+
+@pytest.mark.parametrize("kind", ONE)
+def test_one_camera_is_one(kind: str, tmp_path: Path) -> None:
+    write(tmp_path / "drive", ONE[kind])
+    assert len(logs.open(tmp_path / "drive").stamps()) == len(ONE[kind])
+
+
+def test_a_few_images_of_another_size_are_resampled_or_left_out(tmp_path: Path) -> None:
+    write(tmp_path, [f"{i:03}.png" for i in range(40)])
+    write(tmp_path, ["007.png"], size=(24, 32))
+    write(tmp_path, ["009.png"], size=(24, 24))
+    log: Any = logs.open(tmp_path)
+    decoded = []
+    for frame in log.frames(log.stamps()):
+        try:
+            decoded.append(frame.decode().image.shape)
+        except LogError as error:
+            assert "24 x 24 px among those of 64 x 48 px" in str(error)
+    assert decoded == 39 * [(48, 64)]
+    assert any("resampled" in line for line in log.warnings)
+    assert [loss.messages for loss in log.account.losses] == [1]
+
+
+def test_folders_in_a_folder_are_named(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        write(tmp_path / name, [f"{i}.png" for i in range(4)])
+    with pytest.raises(LogError, match=r"folders in it do: left \(4\), right \(4\)\. Give one of them\."):
+        logs.open(tmp_path)
+
+
+@pytest.mark.parametrize("verb", ["info", "run", "library", "compare"])
+def test_every_verb_refuses_in_one_line(verb: str, tmp_path: Path) -> None:
+    folder = tmp_path / "drive"
+    write(folder, [f"{side}_{i}.png" for side in ("left", "right") for i in range(5)])
+    options = {"compare": ["--truth", "index", "--methods", "bovf"], "info": []}.get(
+        verb, ["-o", str(tmp_path / "out")]
+    )
+    logs_given = [str(folder)]
+    if verb == "compare":
+        write(tmp_path / "map", [f"{i}.png" for i in range(5)])
+        logs_given.append(str(tmp_path / "map"))
+    done = subprocess.run(
+        [sys.executable, "-m", "vplog", verb, *logs_given, *options], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    assert "left_*.png (5), right_*.png (5). Choose one with --image-topic 'left_*.png'" in line
+    if verb == "info":
+        chosen = [sys.executable, "-m", "vplog", "info", str(folder), "--image-topic", "left_*.png", "--json"]
+        found = subprocess.run(chosen, capture_output=True, text=True, check=True)
+        assert json.loads(found.stdout)["messages"] == 5

@@ -1,0 +1,205 @@
+"""Image files: their size by their own header, and their pixels, in bounded memory and without a word on stderr.
+
+libpng and libjpeg print what they find on stderr, in OpenCV too. So JPEGs are decoded by simplejpeg, which raises
+instead, and OpenCV is given only PNGs that libpng has nothing to say of.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import simplejpeg
+
+try:
+    from isal import isal_zlib as zlib
+except ImportError:  # no wheel for this processor
+    import zlib
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says of files is raised here
+
+MAX_PIXELS = 2**26
+"""px of a compressed image that are decoded (67 million: above the cameras of vehicles and robots)."""
+MAX_PIXELS_PER_BYTE = 1100
+"""px that a byte of a compressed image may claim: deflate, the tightest of PNG, reaches 1032 bytes per byte, baseline
+and progressive JPEG stay below 512 px. WebP has no such limit; MAX_PIXELS alone bounds it."""
+PNG = b"\x89PNG\r\n\x1a\n"
+JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+"""Markers that a JPEG begins and ends with: ITU T.81, table B.1. Some cameras write more behind its end."""
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers that a frame starts with: ITU T.81, table B.1."""
+_JPEG_MARKER = struct.Struct(">BBHxHH")
+"""A marker and the length behind it; where a frame starts its precision, height and width: ITU T.81, figure B.3."""
+_SIMPLEJPEG_ERRORS = (ValueError, KeyError)
+"""What simplejpeg raises; a KeyError where the header names a sampling of colours that it does not know."""
+_PNM_HEAD = 4096
+"""Bytes in which a PNM file must have named its size; comments may stand before it."""
+_PNG_SAMPLES = {0: (1, (1, 2, 4, 8, 16)), 2: (3, (8, 16)), 3: (1, (1, 2, 4, 8)), 4: (2, (8, 16)), 6: (4, (8, 16))}
+"""Samples of a px and bits that each may have, by colour type: PNG 1.2, 4.1.1."""
+_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+"""First column and row of each pass of an interlaced image, and its steps in x and y: PNG 1.2, 8.2."""
+_LAST_FILTER = 4
+"""Paeth; every row begins with its filter: PNG 1.2, 6."""
+
+
+class BadImageError(ValueError):
+    """Bytes that are no image, or no whole one; the message says why."""
+
+
+def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
+    """(H, W) grey of 8 bits, or of 16 where the file has as many. `unchanged`: (H, W) or (H, W, C) as OpenCV orders
+    colours. Raises BadImageError where the header's size is not believable or the pixels are not whole."""
+    if data[:2] != JPEG:
+        data = bytes(data)
+    size = image_size(data)
+    if size is None:
+        raise BadImageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP or PNM image")
+    limit = MAX_PIXELS if data[:4] == b"RIFF" else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
+    if not 0 < size[0] * size[1] <= limit:
+        raise BadImageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
+    if data[:2] == JPEG:
+        return _decode_jpeg(data, unchanged)
+    if data[:8] == PNG:
+        data = _checked_png(bytes(data))
+    flags = cv2.IMREAD_UNCHANGED if unchanged else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    try:
+        # IGNORE_ORIENTATION: calibration and odometry belong to the sensor's own rows.
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise BadImageError(f"its {len(data)} bytes are not an image that OpenCV decodes")
+    return image
+
+
+def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
+    """Width and height that an image file claims in its header; None where it is of another kind or damaged."""
+    if data[:2] == JPEG:
+        return _jpeg_size(data)
+    size, data = None, bytes(data)
+    if data.startswith(PNG):
+        size = _png_size(data)
+    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
+        size = _webp_size(data)
+    elif data[:2] == b"BM" and len(data) >= 26:
+        size = tuple(abs(side) for side in struct.unpack_from("<ii", data, 18))  # rows from the top count negative
+    elif match := re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD]):
+        size = int(match[1]), int(match[2])
+    return None if size is None else (size[0], size[1])
+
+
+def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
+    try:
+        if unchanged and simplejpeg.decode_jpeg_header(data, strict=False)[2] != "Gray":
+            return simplejpeg.decode_jpeg(data, colorspace="BGR", strict=False)
+        return simplejpeg.decode_jpeg(data, colorspace="GRAY", strict=False)[:, :, 0]
+    except _SIMPLEJPEG_ERRORS as error:
+        reason = error
+    try:  # four inks, which programs for print write inverted: their product is the colour
+        inks = simplejpeg.decode_jpeg(data, colorspace="CMYK", strict=False)
+    except _SIMPLEJPEG_ERRORS:
+        raise BadImageError(f"its JPEG is damaged ({str(reason).rstrip('.')})") from None
+    colours = cv2.multiply(inks[:, :, :3], cv2.merge([inks[:, :, 3]] * 3), scale=1 / 255)
+    return cv2.cvtColor(colours, cv2.COLOR_RGB2BGR if unchanged else cv2.COLOR_RGB2GRAY)
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Type of each chunk, and where it starts and stops, up to IEND. Ends before a chunk that is not whole."""
+    position = len(PNG)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        stop = position + 12 + length  # length, type, data, CRC
+        if stop > len(data):
+            return
+        yield kind, position, stop
+        if kind == b"IEND":
+            return
+        position = stop
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    """None too where a chunk is longer than the file: OpenCV 5.0 allocates what it claims, up to 4 GB."""
+    if data[12:16] != b"IHDR" or len(data) < 33:
+        return None
+    *_, (kind, _, _) = [(b"", 0, 0), *_png_chunks(data)]
+    return struct.unpack_from(">II", data, 16) if kind == b"IEND" else None
+
+
+def _checked_png(data: bytes) -> bytes:
+    """The file with the chunks that make its pixels alone. Raises BadImageError where libpng would find fault.
+
+    What else a file may hold (colour profile, gamma, text) changes no pixel here, and libpng says much of it.
+    """
+    view = memoryview(data)
+    parts: list[bytes | memoryview] = [PNG]
+    packed: list[memoryview] = []
+    for kind, start, stop in _png_chunks(data):
+        if zlib.crc32(view[start + 4 : stop - 4]) != int.from_bytes(data[stop - 4 : stop], "big"):
+            raise BadImageError("the checksum of its PNG does not match")
+        if kind in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):
+            parts.append(view[start:stop])
+        if kind == b"IDAT":
+            packed.append(view[start + 8 : stop - 4])
+    width, height, bits, colour, _, _, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+    samples, depths = _PNG_SAMPLES.get(colour, (0, ()))
+    if bits not in depths or interlaced > 1:
+        raise BadImageError(f"its PNG has {bits} bits in colour type {colour}, which PNG does not know")
+    passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
+    sizes = [(-(-max(width - x, 0) // dx), -(-max(height - y, 0) // dy)) for x, y, dx, dy in passes]
+    rows = [(tall, 1 + -(-wide * samples * bits // 8)) for wide, tall in sizes if wide and tall]
+    if not _deflates_to(b"".join(packed), rows):
+        raise BadImageError("the pixels of its PNG do not unpack to its size")
+    return b"".join(parts)
+
+
+def _deflates_to(packed: bytes, rows: list[tuple[int, int]]) -> bool:
+    """Whether a zlib stream is whole and holds these rows: for each pass how many, and how many bytes each."""
+    size = sum(count * length for count, length in rows)
+    stream = zlib.decompressobj()
+    try:
+        data = np.frombuffer(stream.decompress(packed, size + 1), np.uint8)
+    except zlib.error:  # pyright: ignore[reportGeneralTypeIssues]
+        return False
+    if len(data) != size or not stream.eof or stream.unused_data:
+        return False
+    at = 0
+    for count, length in rows:
+        if int(data[at : at + count * length : length].max()) > _LAST_FILTER:
+            return False
+        at += count * length
+    return True
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """developers.google.com/speed/webp/docs/riff_container; the sides of VP8 and VP8L have 14 bits."""
+    if data[12:16] == b"VP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if data[12:16] == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if data[12:16] == b"VP8 ":
+        return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
+    return None
+
+
+def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
+    position, last = 2, len(data) - _JPEG_MARKER.size
+    while position <= last:
+        begin, marker, length, height, width = _JPEG_MARKER.unpack_from(data, position)
+        if begin != 0xFF:
+            return None
+        if marker == 0xFF:  # fill byte: ITU T.81, B.1.1.2
+            position += 1
+        elif marker in _JPEG_FRAMES:
+            # Without an end marker behind this (thumbnails lie before it) the file is cut; OpenCV would grey the rest.
+            ends = data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > position
+            return (width, height) if ends else None
+        else:
+            position += 2 + length
+    return None
