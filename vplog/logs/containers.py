@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from collections.abc import Mapping
 from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from vplog.logs.losses import Account
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator
 
 Octets = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
@@ -25,6 +26,10 @@ class Channel(NamedTuple):
     """As the file names it: `sensor_msgs/msg/Image`, `sensor_msgs/Image`, `foxglove.RawImage`."""
     encoding: str
     """`cdr`, `ros1`, `protobuf`, `json`, or another that vplog lists but does not decode."""
+
+
+UNDEFINED = Channel("", "", "")
+"""What a message belongs to that nothing defines a channel for."""
 
 
 class Message(NamedTuple):
@@ -150,10 +155,10 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
+def by_topic(counts: Mapping[Channel, int] | Iterable[tuple[Channel, int]]) -> dict[str, int]:
     """Counts of topics, whatever the types under one name."""
     result: dict[str, int] = {}
-    for channel, count in counts.items():
+    for channel, count in counts.items() if isinstance(counts, Mapping) else counts:
         result[channel.topic] = result.get(channel.topic, 0) + count
     return result
 
