@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from collections.abc import Mapping
 from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from vplog.logs.losses import Account
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
 Octets = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
@@ -26,10 +25,6 @@ class Channel(NamedTuple):
     """As the file names it: `sensor_msgs/msg/Image`, `sensor_msgs/Image`, `foxglove.RawImage`."""
     encoding: str
     """`cdr`, `ros1`, `protobuf`, `json`, or another that vplog lists but does not decode."""
-
-
-UNDEFINED = Channel("", "", "")
-"""What a message belongs to that nothing defines a channel for."""
 
 
 class Message(NamedTuple):
@@ -155,11 +150,21 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def by_topic(counts: Mapping[Channel, int] | Iterable[tuple[Channel, int]]) -> dict[str, int]:
+def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
     """Counts of topics, whatever the types under one name."""
     result: dict[str, int] = {}
-    for channel, count in counts.items() if isinstance(counts, Mapping) else counts:
+    for channel, count in counts.items():
         result[channel.topic] = result.get(channel.topic, 0) + count
+    return result
+
+
+def topics_of(counts: Mapping[int, int], channels: Mapping[int, Channel]) -> dict[str, int]:
+    """Counts by topic of counts by channel number, zero and less left out; those that nothing defines of no topic."""
+    result: dict[str, int] = {}
+    for number, count in counts.items():
+        if count > 0:
+            topic = channels[number].topic if number in channels else ""
+            result[topic] = result.get(topic, 0) + count
     return result
 
 

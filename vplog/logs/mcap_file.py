@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from vplog.logs.checksum import crc32
 from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import UNDEFINED, Channel, Contents, Notes, by_topic, ordered, plural
+from vplog.logs.containers import Channel, Contents, Notes, by_topic, ordered, plural, topics_of
 from vplog.logs.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.logs.mcap_walk import Walk
 from vplog.remote import RemotePath
@@ -121,17 +121,19 @@ class McapFile:
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
         """What the walk could not find, and how much of what was recorded that is."""
         layout, account, name = self._layout, self._notes.account, self._name
-        recorded = self._topics(layout.recorded)
+        recorded = topics_of(layout.recorded, self._channels)
         lost = dict(found)
         for chunk in layout.missing:
-            counts = self._topics(chunk.counts)
-            account.add("damaged_bytes", counts or None, (name, chunk.start), [(chunk.first_ns, chunk.last_ns)])
+            counts = topics_of(chunk.counts, self._channels)
+            spans = [(chunk.first_ns, chunk.last_ns)]
+            spans = spans if chunk.last_ns else self._between(chunk.start, start_ns, end_ns)
+            account.add("damaged_bytes", counts or None, (name, chunk.start), spans)
             for topic, count in counts.items():
                 lost[topic] = lost.get(topic, 0) + count
-        for start, stop, chunks in layout.gaps:
+        for start, stop in layout.gaps:
             if not any(start <= chunk.start < stop for chunk in layout.missing):
                 detail = f"{name} is damaged near byte {start}; it is read again from byte {stop} on."
-                account.add("damaged_bytes", None, (name, start), self._between(chunks, start_ns, end_ns), detail)
+                account.add("damaged_bytes", None, (name, start), self._between(start, start_ns, end_ns), detail)
         if layout.unknown_at is not None and (not recorded or sum(lost.values()) < sum(recorded.values())):
             detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
             account.add("damaged_bytes", None, (name, layout.unknown_at), [(start_ns, end_ns)], detail)
@@ -149,17 +151,12 @@ class McapFile:
         account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
         account.settle({name}, recorded, found)
 
-    def _between(self, chunks: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-        """The time between the chunk before a gap and the one behind it."""
+    def _between(self, position: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+        """The time between the chunk before a damaged place and the one behind it."""
         found = self._layout.chunks
-        before = found[chunks - 1].last_ns if 0 < chunks <= len(found) else start_ns
-        behind = found[chunks].first_ns if chunks < len(found) else end_ns
+        before = max((chunk.last_ns for chunk in found if chunk.stop <= position), default=start_ns)
+        behind = min((chunk.first_ns for chunk in found if chunk.start > position), default=end_ns)
         return [(min(before, behind), max(before, behind))]
-
-    def _topics(self, counts: dict[int, int]) -> dict[str, int]:
-        """Counts of channel ids by topic, zero and less left out; of no topic those that nothing defines."""
-        known = ((self._channels.get(i, UNDEFINED), count) for i, count in counts.items() if count > 0)
-        return by_topic(known)
 
     def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
         stream = ReadDataStream(io.BytesIO(data))
@@ -200,9 +197,9 @@ class McapFile:
         """What a chunk is short of that was walked."""
         key, account, seen = (self._name, chunk.start), self._notes.account, walk.seen
         known = {i: n for i, n in chunk.counts.items() if i in self._channels}
-        fewer = not self._sound[walk.number] and any(seen[i] < n for i, n in known.items())
+        fewer = not self._sound[walk.number] and seen.total() < sum(chunk.counts.values())
         if walk.end and not chunk.cut and (walk.position < walk.end or fewer):
-            short = self._topics({i: n - seen[i] for i, n in known.items()})
+            short = topics_of({i: n - seen[i] for i, n in known.items()}, self._channels)
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
             last_ns = chunk.first_ns if walk.last_ns is None else walk.last_ns
             span = (min(last_ns, chunk.last_ns), chunk.last_ns)
@@ -233,7 +230,7 @@ class McapFile:
         chunk = self._layout.chunks[number]
         detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
         span = (chunk.first_ns, max(chunk.first_ns, chunk.last_ns))
-        counts = self._topics(chunk.counts) if chunk.counts else None
+        counts = topics_of(chunk.counts, self._channels) if chunk.counts else None
         self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), [span], detail)
 
     def _is_kept(self, number: int) -> bool:

@@ -60,7 +60,7 @@ _SHAPES: dict[int, tuple[int | str, ...]] = {
     Opcode.SUMMARY_OFFSET: (17,),
     Opcode.DATA_END: (4,),
 }
-"""Fields of each kind of record but messages: bytes of numbers, and I or Q for bytes behind a length of 4 or 8 bytes."""
+"""Fields of each kind of record but messages: bytes of numbers; I, Q for bytes behind a length of 4 or 8 bytes."""
 _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
@@ -97,8 +97,8 @@ class Layout:
     """Chunks that lie in damaged bytes, as the index at the end or their own message indexes tell of them."""
     recorded: dict[int, int] = field(default_factory=dict)
     """Messages per channel id by the file's statistics; empty where it has none."""
-    gaps: list[tuple[int, int, int]] = field(default_factory=list)
-    """Where damage may begin, where the walk goes on, and the number of chunks before."""
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+    """Where damage may begin, and where the walk goes on."""
     cut_at: int | None = None
     """Byte behind which nothing can be read, where messages may have been."""
     unknown_at: int | None = None
@@ -173,9 +173,7 @@ class _Walk:
             ] <= self._length:  # it was jumped over
                 self._add_chunk(offset + RECORD.size, bounds[1], cut=False)
                 self.layout.chunks[-1].counts = self._counts(indexes)
-            elif any(
-                start <= offset < stop for start, stop, _ in self.layout.gaps
-            ):  # else the index is what is damaged
+            elif any(start <= offset < stop for start, stop in self.layout.gaps):  # else the index is what is damaged
                 listed.counts = self._counts(indexes)
                 self.layout.missing.append(listed)
         self.layout.chunks.sort(key=lambda chunk: chunk.start)
@@ -213,13 +211,15 @@ class _Walk:
         if opcode == Opcode.MESSAGE and length >= _MESSAGE_HEAD.size and stop <= self._length and not self._chunked:
             return opcode, stop
         for kind in (opcode, Opcode.CHUNK, Opcode.MESSAGE_INDEX):  # of which damage may have changed the opcode
-            if self._length_by_fields(kind, start) == length and (stop <= self._length or kind == Opcode.CHUNK):
-                if kind != Opcode.CHUNK or self._is_chunk(position, length):
-                    return kind, stop
+            agrees = self._length_by_fields(kind, start) == length
+            if agrees and (self._is_chunk(position, length) if kind == Opcode.CHUNK else stop <= self._length):
+                return kind, stop
         by_fields = start + (self._length_by_fields(opcode, start) or 0)
         for end in sorted({stop, by_fields}):
-            if (opcode in _SHAPES and end > start or end == stop) and self._is_record(end, behind=opcode):
+            if ((opcode in _SHAPES and end > start) or end == stop) and self._is_record(end, behind=opcode):
                 return opcode, end
+        if (0 < by_fields < stop or opcode >= _PRIVATE) and self._is_record(stop, behind=opcode, longer=True):
+            return opcode, stop  # with fields of a later version, which are ignored
         return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
@@ -233,9 +233,9 @@ class _Walk:
             position += width + int.from_bytes(self.at(position, width), "little")
         return position - start if opcode in _SHAPES else None
 
-    def _is_record(self, position: int, behind: int = 0) -> bool:
-        """Whether a record lies here whose two lengths agree, or the end of the file. Behind a chunk it is none of those
-        that lie in chunks."""
+    def _is_record(self, position: int, behind: int = 0, longer: bool = False) -> bool:
+        """Whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of the
+        file. Behind a chunk it is none of those that lie in chunks."""
         head = self.at(position, RECORD.size)
         if len(head) < RECORD.size:
             return position == self._length or (head == MAGIC and position + len(head) == self._length)
@@ -245,7 +245,8 @@ class _Walk:
             return False
         if opcode == Opcode.MESSAGE:
             return length >= _MESSAGE_HEAD.size
-        return self._length_by_fields(opcode, position + RECORD.size) == length
+        by_fields = self._length_by_fields(opcode, position + RECORD.size)
+        return by_fields == length or (longer and by_fields is not None and by_fields < length)
 
     def _record(self, opcode: int, position: int, stop: int, cut: bool) -> None:
         start = position + RECORD.size
@@ -333,7 +334,7 @@ class _Walk:
         if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
             self._indexing = Chunk(position, found, "", 0, 0, 0, 0)
             self.layout.missing.append(self._indexing)
-        self.layout.gaps.append((position, found, len(chunks)))
+        self.layout.gaps.append((position, found))
         return found
 
     def check_summary(self) -> None:

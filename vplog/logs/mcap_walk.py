@@ -40,8 +40,9 @@ class Walk:
         brief: Collection[Channel] = (),
         cut: bool = False,
     ) -> None:
-        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are kept (None: on all); those on `brief` ones need not be
-        whole. `define` takes a schema or channel record and may add to `channels`."""
+        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are kept (None: on
+        all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
+        `channels`."""
         self.position = 0
         self.unknown = 0
         """Messages of channels that nothing defined so far."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import UNDEFINED, Block, Channel, Contents, Notes, by_topic, ordered, plural
+from vplog.logs.containers import Block, Channel, Contents, Notes, by_topic, ordered, plural, topics_of
 from vplog.logs.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.remote import RemotePath
 
@@ -96,7 +96,7 @@ class Ros1Bag:
         layout, account, name = self._layout, self._notes.account, self._name
         recorded = dict(found)
         for chunk in layout.missing:
-            counts = self._topics(chunk.counts)
+            counts = topics_of(chunk.counts, self._channels)
             before = max((c.last_ns for c in layout.chunks if c.stop <= chunk.record), default=start_ns)
             behind = min((c.first_ns for c in layout.chunks if c.start > chunk.record and c.first_ns), default=end_ns)
             first_ns, last_ns = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else (before, behind)
@@ -116,10 +116,6 @@ class Ros1Bag:
             )
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         account.know(name, recorded if whole else {}, start_ns)
-
-    def _topics(self, counts: dict[int, int]) -> dict[str, int]:
-        """Counts of connections by topic, zero and less left out; of no topic those that nothing defines."""
-        return by_topic((self._channels.get(i, UNDEFINED), count) for i, count in counts.items() if count > 0)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
@@ -160,7 +156,7 @@ class Ros1Bag:
         span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
         unknown = sum(messages for connection, messages in seen.items() if connection not in self._channels)
         if damaged:
-            short = self._topics({i: messages - seen[i] for i, messages in chunk.counts.items()})
+            short = topics_of({i: messages - seen[i] for i, messages in chunk.counts.items()}, self._channels)
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
             account.add("damaged_chunk", short if chunk.counts else None, key, span, detail)
         if unknown:
@@ -181,5 +177,5 @@ class Ros1Bag:
         chunk = self._layout.chunks[count]
         detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
         span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
-        counts = self._topics(chunk.counts) if chunk.counts else None
+        counts = topics_of(chunk.counts, self._channels) if chunk.counts else None
         self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), span, detail)

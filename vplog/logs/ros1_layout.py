@@ -35,12 +35,13 @@ _FIELDS = {
 """What the header of each kind of record outside the chunks has."""
 _ENTRY = {_INDEX: 12, _CHUNK_INFO: 8}
 """Bytes of each of the `count` entries of a record: time and offset of a message; a connection and its count."""
-_RECORD_START = re.compile(
-    rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=(?:op|compression|size|ver|conn|count|chunk_pos|start_time|end_time)=)",
-    re.DOTALL,
-)
+_FIRST = re.compile(rb"(?:op|compression|size|ver|conn|count|chunk_pos|start_time|end_time)=")
+"""Names in the headers of chunks and of indexes."""
+_RECORD_START = re.compile(rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=%s)" % _FIRST.pattern, re.DOTALL)
 """Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
-_NAME = re.compile(rb"(compression|size)=|(?:ver|topic|index_pos|chunk_pos)=")
+_HEAD = 256
+"""Bytes in which the head of a record ends, but for a connection's of a long topic."""
+_NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn_count|chunk_count|chunk_pos)=")
 """Names in the header of a chunk, and those that no chunk has."""
 
 
@@ -102,10 +103,13 @@ class _Walk:
     def records(self, position: int) -> None:
         while position < self._length:
             header, start, stop = self._head(position)
-            if header is None or not self._is_sound(header) or not self._is_record(stop):
+            inside = header is not None and number(header, b"op") == _CHUNK
+            if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
                 found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
                 if header is None or not self._is_sound(header):
                     if found is None:
+                        if self._indexing is not None:
+                            self._indexing.doubtful = True
                         self.layout.cut_at = position
                         return
                     self._skip(position, found)
@@ -123,12 +127,21 @@ class _Walk:
         length = self._length_by_header(header)
         if length is not None and self._is_record(start + length):
             return start + length
-        return stop if found is None or stop < found else found
+        if found is None or (stop < found and self._is_damaged_head(stop)):
+            return stop
+        self.layout.gaps.append((stop, found))
+        return found
+
+    def _is_damaged_head(self, position: int) -> bool:
+        """Whether two of three signs are there of a header: its length, and length and name of its first field."""
+        data = self.at(position, 8 + 16)
+        header, first = (int.from_bytes(data[at : at + 4], "little") for at in (0, 4))
+        return (header <= _MAX_HEADER) + (first < _HEAD) + bool(_FIRST.match(data, 8)) >= 2
 
     def _skip(self, position: int, found: int) -> None:
         """Take note of bytes without a record, and of the chunk that may lie in them."""
         self.layout.gaps.append((position, found))
-        named = _NAME.search(self.at(position, min(256, found - position)))
+        named = _NAME.search(self.at(position, min(_HEAD, found - position)))
         if self._indexing is not None and named is not None and named[1] is None:
             self._indexing.doubtful = True
         if named is None or named[1] is not None:
@@ -190,10 +203,13 @@ class _Walk:
             return number(header, b"size") if header[b"compression"] == b"none" else None
         return _ENTRY[op] * number(header, b"count") if op in _ENTRY else None
 
-    def _is_record(self, position: int) -> bool:
-        """Whether the head of a record outside the chunks lies here, or the end of the file."""
+    def _is_record(self, position: int, behind_chunk: bool = True) -> bool:
+        """Whether the head of a record lies here, or the end of the file. Connections lie in chunks too, but behind one
+        only where the index begins."""
         header, _, _ = self._head(position)
-        return position == self._length or (header is not None and self._is_sound(header))
+        if header is None or not self._is_sound(header):
+            return position == self._length
+        return not behind_chunk or number(header, b"op") != CONNECTION or 0 < self._index_at <= position
 
     def _is_chunk(self, position: int) -> bool:
         header, _, stop = self._head(position)
@@ -203,12 +219,7 @@ class _Walk:
 
     def _next_record(self, position: int) -> int | None:
         """The next chunk, or record of an index, behind `position`; connections may as well lie in a chunk."""
-
-        def is_outside(at: int) -> bool:
-            header, _, _ = self._head(at)
-            return self._is_record(at) and (number(header or {}, b"op") != CONNECTION or 0 < self._index_at <= at)
-
-        return self._search.first(_RECORD_START, position + 1, is_outside)
+        return self._search.first(_RECORD_START, position + 1, self._is_record)
 
     def _record(self, op: int, header: dict[bytes, bytes], position: int, start: int, stop: int) -> None:
         if op == _CHUNK:
