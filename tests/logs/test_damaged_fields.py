@@ -141,7 +141,7 @@ FORMATS = {
     },
     "bag-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "LZ4")), checked=False, cut=True),
     "bag-none-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "")), checked=False, cut=True),
-    "db3": Format(lambda p: write_db3(p / "log.db3"), checked=False),
+    "db3": Format(lambda p: write_db3(p / "log.db3"), counted=False, checked=False),
 }
 
 

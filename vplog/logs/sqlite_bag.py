@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,23 +70,45 @@ class SqliteBag:
             times = [_integer(time_ns) for time_ns in times]
         start_ns, end_ns = times or (0, 0)
         account, name = self._notes.account, self._name
+        missing = 0 if self._damaged else self._missing_by_index(sum(counts.values()) + unknown)
+        if missing:
+            self._damaged = True
+            detail = f"{name} is damaged: an index of its messages lists more of them."
+            account.add("damaged_bytes", {"": missing}, (name, 0), [], detail)
         if unknown:
             account.add("unknown_channel", {"": unknown}, (name, 0), [])
         account.know(name, {} if self._damaged else by_topic(counts), start_ns)
         return Contents(ordered(counts), start_ns, end_ns)
 
+    def _missing_by_index(self, rows: int) -> int:
+        """Messages that an index of the table lists and the table, in which `rows` are found, has not."""
+        table = "SELECT rowid FROM messages"
+        try:
+            for _, index, *_ in self._db.execute("PRAGMA index_list(messages)").fetchall():
+                listed = f"{table} INDEXED BY \"{index.replace(chr(34), chr(34) * 2)}\""
+                number = self._db.execute(f"SELECT count(*) FROM ({listed})").fetchone()[0]  # noqa: S608 - quoted
+                if number > rows:
+                    missing = f"SELECT count(*) FROM ({listed} WHERE rowid <= ? EXCEPT {table} NOT INDEXED)"  # noqa: S608
+                    return self._db.execute(missing, [number]).fetchone()[0]
+        except _DAMAGE:
+            pass  # the index is what is damaged
+        return 0
+
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
         for row, topic, time_ns, data in self._salvaged("rowid, topic_id, timestamp, data", ids):
-            if isinstance(data, bytes):
-                yield Message(self._topics[topic], _integer(time_ns), data, (row,))
+            if isinstance(data, bytes) and isinstance(time_ns, int):
+                yield Message(self._topics[topic], time_ns, data, (row, time_ns))
+            else:
+                self._lose_data(row, f"{self._name} is damaged: row {row} holds no message.")
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         return in_blocks(self.messages(channels))
 
     def read(self, place: Place) -> bytes:
         try:
-            found = self._db.execute("SELECT data FROM messages WHERE rowid = ?", list(place)).fetchone()
+            query = "SELECT data FROM messages WHERE rowid = ? AND timestamp = ?"
+            found = self._db.execute(query, list(place)).fetchone()
         except _DAMAGE:
             return b""
         return found[0] if found and isinstance(found[0], bytes) else b""
@@ -93,18 +116,24 @@ class SqliteBag:
     def _salvaged(self, columns: str, topics: list[int] | None = None) -> Iterator[tuple]:
         """Rows of the table of messages in its order: row id, topic, time, and more columns; over damage, row by row.
 
-        Recorders number the rows without a gap, so that a number that is not there is a message that is lost.
+        Recorders number the rows without a gap, so that a number that is not there is a message that is lost. A row
+        before one of a lower number is taken to have a wrong one, and looked for again by the numbers between.
         """
         chosen = "" if topics is None else f"topic_id IN ({','.join('?' * len(topics))}) AND"
         query = f"SELECT {columns} FROM messages WHERE {chosen} rowid > ? ORDER BY rowid"  # noqa: S608 - names of ours
         last, last_ns, tried = 0, 0, 0
         while True:
+            waiting = None
             try:
                 for row in self._db.execute(query, [*(topics or []), last]):
-                    if row[0] <= last:
+                    if row[0] <= (waiting[0] if waiting else last):
                         raise sqlite3.DatabaseError("rows come again")
-                    last, last_ns = row[0], _integer(row[2])
-                    yield row
+                    if waiting:
+                        last, last_ns = waiting[0], _integer(waiting[2])
+                        yield waiting
+                    waiting = row
+                if waiting:
+                    yield waiting
                 return
             except _DAMAGE as error:
                 detail = f"{self._name} is damaged: {error}."
@@ -118,13 +147,13 @@ class SqliteBag:
             if found is not None and topics is None:
                 self._holes[before] = last
             if found is None:
-                self._last_row = before
-                if topics is None:
+                first_time, self._last_row = self._last_row is None, before
+                if topics is None or first_time:
                     span = [(last_ns, last_ns)] if last_ns else []
                     self._notes.account.add("cut", None, (self._name, 0), span, detail)
                 return
             before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
-            if topics is None and last - before > 1:
+            if last - before > 1:
                 span = [(min(before_ns, last_ns), max(before_ns, last_ns))]
                 self._notes.account.add("damaged_bytes", {"": last - before - 1}, (self._name, before), span, detail)
             if topics is None or found[1] in topics:
@@ -175,6 +204,8 @@ class SqliteBag:
         rows = self._rows("SELECT id, name, type, serialization_format FROM topics")
         # damage may have put anything, or nothing, in any column
         rows = sorted(row for row in rows if [type(value) for value in row] == [int, str, str, str])
+        times = Counter(row[0] for row in rows)  # of two topics of one number, none can be told from the other
+        rows = [row for row in rows if times[row[0]] == 1]
         return {number: Channel(name, kind, encoding) for number, name, kind, encoding in rows}
 
     def _rows(self, query: str, values: list[int] | None = None) -> Iterator[tuple]:
