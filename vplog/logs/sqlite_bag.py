@@ -83,15 +83,15 @@ class SqliteBag:
     def _missing_by_index(self, rows: int) -> int:
         """Messages that an index of the table lists and the table, in which `rows` are found, has not."""
         table = "SELECT rowid FROM messages"
-        try:
-            for _, index, *_ in self._db.execute("PRAGMA index_list(messages)").fetchall():
-                listed = f"{table} INDEXED BY \"{index.replace(chr(34), chr(34) * 2)}\""
+        for name in self._indexes():
+            listed = f"{table} INDEXED BY {name}"
+            try:
                 number = self._db.execute(f"SELECT count(*) FROM ({listed})").fetchone()[0]  # noqa: S608 - quoted
                 if number > rows:
                     missing = f"SELECT count(*) FROM ({listed} WHERE rowid <= ? EXCEPT {table} NOT INDEXED)"  # noqa: S608
                     return self._db.execute(missing, [number]).fetchone()[0]
-        except _DAMAGE:
-            pass  # the index is what is damaged
+            except _DAMAGE:
+                continue  # the index is what is damaged
         return 0
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
@@ -119,15 +119,16 @@ class SqliteBag:
         Recorders number the rows without a gap, so that a number that is not there is a message that is lost. A row
         before one of a lower number is taken to have a wrong one, and looked for again by the numbers between.
         """
-        chosen = "" if topics is None else f"topic_id IN ({','.join('?' * len(topics))}) AND"
-        query = f"SELECT {columns} FROM messages WHERE {chosen} rowid > ? ORDER BY rowid"  # noqa: S608 - names of ours
+        chosen = "1" if topics is None else f"topic_id IN ({','.join('?' * len(topics))})"
         last, last_ns, tried = 0, 0, 0
         while True:
-            waiting = None
+            query = f"SELECT {columns} FROM messages WHERE {chosen}{' AND rowid > ?' if last else ''} ORDER BY rowid"  # noqa: S608 - names of ours
+            waiting, again = None, False
             try:
-                for row in self._db.execute(query, [*(topics or []), last]):
-                    if row[0] <= (waiting[0] if waiting else last):
-                        raise sqlite3.DatabaseError("rows come again")
+                for row in self._db.execute(query, [*(topics or []), *([last] if last else [])]):
+                    again = row[0] <= (waiting[0] if waiting else last)
+                    if again:
+                        raise sqlite3.DatabaseError("the numbers of its rows do not increase")
                     if waiting:
                         last, last_ns = waiting[0], _integer(waiting[2])
                         yield waiting
@@ -137,37 +138,56 @@ class SqliteBag:
                 return
             except _DAMAGE as error:
                 detail = f"{self._name} is damaged: {error}."
-            self._damaged, before, found = True, last, None
-            end = self._end_behind(last)
-            while found is None and tried < _MOST_TRIED and last < end:
-                tried, last = tried + 1, max(last + 1, self._holes.get(last, 0))
-                found = self._row(last, columns)
-                if found is None and topics is not None:
-                    self._lose_data(last, detail)
-            if found is not None and topics is None:
-                self._holes[before] = last
+            if waiting and not again:
+                last, last_ns = waiting[0], _integer(waiting[2])
+                yield waiting
+            self._damaged, before, found, missing = True, last, None, 0
+            least = last + 2 if again else 0  # the row with a wrong number may have that of the one before it
+            end, is_listed = self._end_behind(last)
+            while tried < _MOST_TRIED and last < end and (found is None or last < least):
+                step = max(last + 1, self._holes.get(last, 0))
+                tried, missing, last = tried + 1, missing + step - last - 1, step
+                row = self._row(last, columns)
+                if row is None:
+                    missing += topics is None or not self._lose_data(last, detail)
+                    continue
+                found = row
+                if topics is None or row[1] in topics:
+                    yield row
             if found is None:
                 first_time, self._last_row = self._last_row is None, before
                 if topics is None or first_time:
                     span = [(last_ns, last_ns)] if last_ns else []
-                    self._notes.account.add("cut", None, (self._name, 0), span, detail)
+                    counts = {"": missing} if is_listed and last >= end else None
+                    self._notes.account.add("cut", counts, (self._name, 0), span, detail)
                 return
+            if topics is None and not again:
+                self._holes[before] = last
             before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
-            if last - before > 1:
+            if missing:
                 span = [(min(before_ns, last_ns), max(before_ns, last_ns))]
-                self._notes.account.add("damaged_bytes", {"": last - before - 1}, (self._name, before), span, detail)
-            if topics is None or found[1] in topics:
-                yield found
+                self._notes.account.add("damaged_bytes", {"": missing}, (self._name, before), span, detail)
 
-    def _end_behind(self, row: int) -> int:
-        """The last row to look for, where none is found behind `row`."""
+    def _end_behind(self, row: int) -> tuple[int, bool]:
+        """The last row to look for, where none is found behind `row`, and whether an index of the table lists it."""
         if self._last_row is not None:
-            return self._last_row
+            return self._last_row, False
+        for table in (*(f"messages INDEXED BY {name}" for name in self._indexes()), "messages"):
+            try:
+                last = self._db.execute(f"SELECT max(rowid) FROM (SELECT rowid FROM {table})").fetchone()[0]  # noqa: S608
+            except _DAMAGE:
+                continue
+            if isinstance(last, int):
+                return last, table != "messages"
+        return row + _MOST_MISSED, False
+
+    def _indexes(self) -> list[str]:
+        """Quoted names of the indexes of the table of messages."""
         try:
-            last = self._db.execute("SELECT max(rowid) FROM messages").fetchone()[0]
+            found = self._db.execute("PRAGMA index_list(messages)").fetchall()
         except _DAMAGE:
-            last = None
-        return last if isinstance(last, int) else row + _MOST_MISSED
+            return []
+        return ['"' + name.replace('"', '""') + '"' for _, name, *_ in found]
 
     def _row(self, row: int, columns: str) -> tuple | None:
         try:
@@ -175,12 +195,14 @@ class SqliteBag:
         except _DAMAGE:
             return None
 
-    def _lose_data(self, row: int, detail: str) -> None:
+    def _lose_data(self, row: int, detail: str) -> bool:
         """A message whose topic and time can be read, but not the rest; others were missed when they were counted."""
         found = self._row(row, "rowid, topic_id, timestamp")
         if found is not None and found[1] in self._topics:
             span, lost = (_integer(found[2]), _integer(found[2])), {self._topics[found[1]].topic: 1}
             self._notes.account.add("damaged_chunk", lost, (self._name, row), [span], detail)
+            return True
+        return False
 
     def _connect(self, mode: str) -> sqlite3.Connection:
         db = sqlite3.connect(f"{self._path.resolve().as_uri()}?{mode}", uri=True)
@@ -201,7 +223,8 @@ class SqliteBag:
             raise LogError(
                 f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages."
             )
-        rows = self._rows("SELECT id, name, type, serialization_format FROM topics")
+        # All columns, as SQLite holds the lengths of a row's against its own only where it reads the last.
+        rows = (row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics"))
         # damage may have put anything, or nothing, in any column
         rows = sorted(row for row in rows if [type(value) for value in row] == [int, str, str, str])
         times = Counter(row[0] for row in rows)  # of two topics of one number, none can be told from the other
