@@ -26,6 +26,10 @@ _LONGEST = 2**28
 """Bytes of a message that is read: an image of as many pixels as are decoded, of four bytes each."""
 
 
+class _OrderError(sqlite3.DatabaseError):
+    """Rows come again, or one of them has a wrong number."""
+
+
 class SqliteBag:
     """A Container over one .db3 file."""
 
@@ -119,16 +123,11 @@ class SqliteBag:
         Recorders number the rows without a gap, so that a number that is not there is a message that is lost. A row
         before one of a lower number is taken to have a wrong one, and looked for again by the numbers between.
         """
-        chosen = "1" if topics is None else f"topic_id IN ({','.join('?' * len(topics))})"
         last, last_ns, tried = 0, 0, 0
         while True:
-            query = f"SELECT {columns} FROM messages WHERE {chosen}{' AND rowid > ?' if last else ''} ORDER BY rowid"  # noqa: S608 - names of ours
-            waiting, again = None, False
+            waiting = None
             try:
-                for row in self._db.execute(query, [*(topics or []), *([last] if last else [])]):
-                    again = row[0] <= (waiting[0] if waiting else last)
-                    if again:
-                        raise sqlite3.DatabaseError("the numbers of its rows do not increase")
+                for row in self._in_order(columns, topics, last):
                     if waiting:
                         last, last_ns = waiting[0], _integer(waiting[2])
                         yield waiting
@@ -137,6 +136,7 @@ class SqliteBag:
                     yield waiting
                 return
             except _DAMAGE as error:
+                again = isinstance(error, _OrderError)
                 detail = f"{self._name} is damaged: {error}."
             if waiting and not again:
                 last, last_ns = waiting[0], _integer(waiting[2])
@@ -155,18 +155,33 @@ class SqliteBag:
                 if topics is None or row[1] in topics:
                     yield row
             if found is None:
-                first_time, self._last_row = self._last_row is None, before
-                if topics is None or first_time:
-                    span = [(last_ns, last_ns)] if last_ns else []
-                    counts = {"": missing} if is_listed and last >= end else None
-                    self._notes.account.add("cut", counts, (self._name, 0), span, detail)
+                if topics is None or self._last_row is None:
+                    self._cut(last_ns, missing if is_listed and last >= end else None, detail)
+                self._last_row = before
                 return
             if topics is None and not again:
                 self._holes[before] = last
             before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
-            if missing:
-                span = [(min(before_ns, last_ns), max(before_ns, last_ns))]
-                self._notes.account.add("damaged_bytes", {"": missing}, (self._name, before), span, detail)
+            self._lose_rows(before, missing, (before_ns, last_ns), detail)
+
+    def _lose_rows(self, before: int, missing: int, span: tuple[int, int], detail: str) -> None:
+        if missing:
+            self._notes.account.add("damaged_bytes", {"": missing}, (self._name, before), [span], detail)
+
+    def _cut(self, last_ns: int, missing: int | None, detail: str) -> None:
+        span = [(last_ns, last_ns)] if last_ns else []
+        self._notes.account.add("cut", None if missing is None else {"": missing}, (self._name, 0), span, detail)
+
+    def _in_order(self, columns: str, topics: list[int] | None, last: int) -> Iterator[tuple]:
+        """Rows behind row `last`. Raises _OrderError where one is not behind the one before it, and _DAMAGE."""
+        chosen = "1" if topics is None else f"topic_id IN ({','.join('?' * len(topics))})"
+        behind = " AND rowid > ?" if last else ""
+        query = f"SELECT {columns} FROM messages WHERE {chosen}{behind} ORDER BY rowid"  # noqa: S608 - names of ours
+        for row in self._db.execute(query, [*(topics or []), *([last] if last else [])]):
+            if row[0] <= last:
+                raise _OrderError("the numbers of its rows do not increase")
+            last = row[0]
+            yield row
 
     def _end_behind(self, row: int) -> tuple[int, bool]:
         """The last row to look for, where none is found behind `row`, and whether an index of the table lists it."""
