@@ -43,7 +43,7 @@ def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
         raise BadChunkError(f"{len(data)} bytes claim to unpack to {size}")
     else:
         try:
-            result = _DECODERS[kind](data, size)
+            result = _DECODERS[kind](data, size + 1)  # one more, so that one that holds more than that shows
         except (RuntimeError, OSError, ValueError, EOFError, zstandard.ZstdError) as error:
             raise BadChunkError(str(error).splitlines()[0] if str(error) else type(error).__name__) from None
     if len(result) != size and not partial:
@@ -51,16 +51,16 @@ def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
     return result
 
 
-def _zstd(data: bytes, size: int) -> bytes:
+def _zstd(data: bytes, most: int) -> bytes:
     try:
         # One frame, as most writers make it; -1 where it does not say its size, as those that stream leave it.
-        if zstandard.frame_content_size(data) in (size, -1):
-            result = _zstd_decompressor().decompress(data, max_output_size=size)
-            if len(result) == size:
+        if zstandard.frame_content_size(data) in (most - 1, -1):
+            result = _zstd_decompressor().decompress(data, max_output_size=most)
+            if len(result) == most - 1:
                 return result
     except zstandard.ZstdError:
         pass  # what there is of a cut one comes out below
-    parts, left = [], size
+    parts, left = [], most
     with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
         while left and (part := stream.read(min(left, 2**20))):
             parts.append(part)
@@ -78,12 +78,12 @@ def _zstd_decompressor() -> zstandard.ZstdDecompressor:
 _OF_THREAD = threading.local()
 
 
-def _lz4(data: bytes, size: int) -> bytes:
-    return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+def _lz4(data: bytes, most: int) -> bytes:
+    return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most)
 
 
-def _bz2(data: bytes, size: int) -> bytes:
-    return bz2.BZ2Decompressor().decompress(data, max_length=size)
+def _bz2(data: bytes, most: int) -> bytes:
+    return bz2.BZ2Decompressor().decompress(data, max_length=most)
 
 
 _DECODERS = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}

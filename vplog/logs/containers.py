@@ -159,6 +159,16 @@ def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
     return result
 
 
+def topics_of(counts: Mapping[int, int], channels: Mapping[int, Channel]) -> dict[str, int]:
+    """Counts by topic of counts by channel number, zero and less left out; those that nothing defines of no topic."""
+    result: dict[str, int] = {}
+    for number, count in counts.items():
+        if count > 0:
+            topic = channels[number].topic if number in channels else ""
+            result[topic] = result.get(topic, 0) + count
+    return result
+
+
 def count_messages(messages: Iterable[Message], channels: Iterable[Channel]) -> Contents:
     """Contents by reading every message; `channels` may turn out to be empty."""
     counts: dict[Channel, int] = {}

@@ -96,6 +96,7 @@ class Account:
         """
         if (reason, key) in self._settled and (counts is None or "" in counts):
             return
+        self._found.get((reason, ""), {}).pop(key, None)  # their topic, or how many, may be known by now
         spans = [(min(span), max(span)) for span in spans]  # damage may have turned them around
         for topic, count in ({"": None} if counts is None else counts).items():
             self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import struct
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from mcap import records
@@ -17,13 +18,13 @@ from mcap.opcode import Opcode
 from vplog.logs.checksum import crc32
 from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import Channel, Contents, Notes, by_topic, ordered, plural
+from vplog.logs.containers import Channel, Contents, Notes, by_topic, ordered, plural, topics_of
 from vplog.logs.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.logs.mcap_walk import Walk
 from vplog.remote import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
     from vplog.logs.containers import Block, Message, Octets, Place
@@ -56,28 +57,39 @@ class McapFile:
         self._data = Chunks(self._unpack, self._lose, sizes.__getitem__, self._is_kept, self._local)
 
     def contents(self) -> Contents:
-        """Counted by the indexes behind the chunks; a chunk without is unpacked."""
-        counts: dict[Channel, int] = {}
+        """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
+        say something else."""
+        layout = self._layout
+        if layout.spare:
+            self._define_doubtful()
+        by_id, times = self._counted(unpack_all=False)
+        missing = [chunk.counts for chunk in layout.missing]
+        if layout.recorded and layout.recorded != _total([by_id, *missing]) and layout.chunks:
+            by_id, times = self._counted(unpack_all=True)
+        counts: dict[Channel, int] = dict.fromkeys(self._channels.values(), 0)
+        for channel_id, count in by_id.items():
+            if channel_id in self._channels:
+                counts[self._channels[channel_id]] += count
+        start_ns, end_ns = times or (0, 0)
+        self._account_for(by_topic(counts), start_ns, end_ns)
+        return Contents(ordered(counts), start_ns, end_ns)
+
+    def _counted(self, unpack_all: bool) -> tuple[dict[int, int], list[int]]:
+        """Messages by channel id, and the first and last log time."""
+        counts: list[dict[int, int]] = []
         times: list[int] = []
         for number, chunk in enumerate(self._layout.chunks):
-            if chunk.counts and chunk.counts.keys() <= self._channels.keys():
-                found = chunk.counts
+            if chunk.counts and chunk.counts.keys() <= self._channels.keys() and not unpack_all:
+                counts.append(chunk.counts)
                 times += (chunk.first_ns, chunk.last_ns)
             else:
                 data = self._data(number)
-                walk = Walk(number, len(data), self._channels, self._define, None)
+                walk = Walk(number, len(data), self._channels, self._define, None, cut=chunk.cut)
                 times += walk.whole(data).log_ns
-                found = walk.seen
+                counts.append(walk.seen)
                 self._account_for_chunk(chunk, walk)
-            for channel_id, count in found.items():
-                if channel_id in self._channels:
-                    channel = self._channels[channel_id]
-                    counts[channel] = counts.get(channel, 0) + count
             times = [min(times), max(times)] if times else []
-        counts = ordered(dict.fromkeys(self._channels.values(), 0) | counts)
-        start_ns, end_ns = (times[0], times[-1]) if times else (0, 0)
-        self._account_for(by_topic(counts), start_ns, end_ns)
-        return Contents(counts, start_ns, end_ns)
+        return _total(counts), times
 
     def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         for block in self.blocks(channels):
@@ -92,7 +104,7 @@ class McapFile:
             if not self._may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
             end = chunk.stop - chunk.start if data is None else len(data)
-            walk = Walk(number, end, self._channels, self._define, wanted, brief)
+            walk = Walk(number, end, self._channels, self._define, wanted, brief, chunk.cut)
             if data is None:
                 yield walk.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
@@ -109,17 +121,22 @@ class McapFile:
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
         """What the walk could not find, and how much of what was recorded that is."""
         layout, account, name = self._layout, self._notes.account, self._name
-        recorded = self._topics(layout.recorded)
+        recorded = topics_of(layout.recorded, self._channels)
         lost = dict(found)
         for chunk in layout.missing:
-            counts = self._topics(chunk.counts)
-            account.add("damaged_bytes", counts or None, (name, chunk.start), [(chunk.first_ns, chunk.last_ns)])
+            counts = topics_of(chunk.counts, self._channels)
+            spans = [(chunk.first_ns, chunk.last_ns)]
+            spans = spans if chunk.last_ns else self._between(chunk.start, start_ns, end_ns)
+            account.add("damaged_bytes", counts or None, (name, chunk.start), spans)
             for topic, count in counts.items():
                 lost[topic] = lost.get(topic, 0) + count
-        for start, stop, chunks in layout.gaps:
-            if not layout.missing:
+        for start, stop in layout.gaps:
+            if not any(start <= chunk.start < stop for chunk in layout.missing):
                 detail = f"{name} is damaged near byte {start}; it is read again from byte {stop} on."
-                account.add("damaged_bytes", None, (name, start), self._between(chunks, start_ns, end_ns), detail)
+                account.add("damaged_bytes", None, (name, start), self._between(start, start_ns, end_ns), detail)
+        if layout.unknown_at is not None and (not recorded or sum(lost.values()) < sum(recorded.values())):
+            detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
+            account.add("damaged_bytes", None, (name, layout.unknown_at), [(start_ns, end_ns)], detail)
         if layout.cut_at is not None:
             total = sum(found.values())
             detail = (
@@ -134,20 +151,12 @@ class McapFile:
         account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
         account.settle({name}, recorded, found)
 
-    def _between(self, chunks: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-        """The time between the chunk before a gap and the one behind it."""
+    def _between(self, position: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+        """The time between the chunk before a damaged place and the one behind it."""
         found = self._layout.chunks
-        before = found[chunks - 1].last_ns if 0 < chunks <= len(found) else start_ns
-        behind = found[chunks].first_ns if chunks < len(found) else end_ns
+        before = max((chunk.last_ns for chunk in found if chunk.stop <= position), default=start_ns)
+        behind = min((chunk.first_ns for chunk in found if chunk.start > position), default=end_ns)
         return [(min(before, behind), max(before, behind))]
-
-    def _topics(self, counts: dict[int, int]) -> dict[str, int]:
-        """Counts of channel ids by topic, zero and less left out."""
-        result: dict[str, int] = {}
-        for channel_id, count in counts.items():
-            if count > 0 and (channel := self._channels.get(channel_id)) is not None:
-                result[channel.topic] = result.get(channel.topic, 0) + count
-        return result
 
     def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
         stream = ReadDataStream(io.BytesIO(data))
@@ -166,6 +175,15 @@ class McapFile:
         except (struct.error, UnicodeDecodeError, McapError):
             self._notes.add(f"{self._name} holds a damaged schema or channel; its messages are left out.")
 
+    def _define_doubtful(self) -> None:
+        """Take schemas and channels of a damaged summary where no chunk has them."""
+        for number in range(len(self._layout.chunks)):
+            data = self._data(number)
+            Walk(number, len(data), self._channels, self._define, None).whole(data)
+        for opcode, data in self._layout.spare:
+            self._define(opcode, data, doubtful=True)
+        self._layout.spare.clear()
+
     def _is_news(self, opcode: int, number: int, known: bool, doubtful: bool) -> bool:
         """The first sound definition of a number holds; one from a damaged chunk until there is a sound one."""
         news = not known or ((opcode, number) in self._doubtful and not doubtful)
@@ -178,15 +196,16 @@ class McapFile:
     def _account_for_chunk(self, chunk: Chunk, walk: Walk) -> None:
         """What a chunk is short of that was walked."""
         key, account, seen = (self._name, chunk.start), self._notes.account, walk.seen
-        if walk.unknown:
-            account.add("unknown_channel", {"": walk.unknown}, key, [(chunk.first_ns, chunk.last_ns)])
-        fewer = any(seen[i] < n for i, n in chunk.counts.items())
+        known = {i: n for i, n in chunk.counts.items() if i in self._channels}
+        fewer = not self._sound[walk.number] and seen.total() < sum(chunk.counts.values())
         if walk.end and not chunk.cut and (walk.position < walk.end or fewer):
-            short = self._topics({i: n - seen[i] for i, n in chunk.counts.items()})
+            short = topics_of({i: n - seen[i] for i, n in known.items()}, self._channels)
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
             last_ns = chunk.first_ns if walk.last_ns is None else walk.last_ns
             span = (min(last_ns, chunk.last_ns), chunk.last_ns)
             account.add("damaged_chunk", short if chunk.counts else None, key, [span], detail)
+        elif walk.unknown:
+            account.add("unknown_channel", {"": walk.unknown}, key, [(chunk.first_ns, chunk.last_ns)])
 
     def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
         """Not where its indexes name only channels that are known and not wanted."""
@@ -211,7 +230,7 @@ class McapFile:
         chunk = self._layout.chunks[number]
         detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
         span = (chunk.first_ns, max(chunk.first_ns, chunk.last_ns))
-        counts = self._topics(chunk.counts) if chunk.counts else None
+        counts = topics_of(chunk.counts, self._channels) if chunk.counts else None
         self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), [span], detail)
 
     def _is_kept(self, number: int) -> bool:
@@ -240,6 +259,14 @@ class McapFile:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and position + length <= len(data):
                 self._define(opcode, data[position : position + length], doubtful=True)
             position += length
+
+
+def _total(counts: Iterable[dict[int, int]]) -> dict[int, int]:
+    """The sums of counts, zeros left out."""
+    total: Counter[int] = Counter()
+    for each in counts:
+        total.update(each)
+    return {channel_id: count for channel_id, count in total.items() if count}
 
 
 def _ros_name(name: str) -> str:

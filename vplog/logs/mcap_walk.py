@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
 _IS_MESSAGE, _IS_SCHEMA, _DEFINES = int(Opcode.MESSAGE), int(Opcode.SCHEMA), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
+_OUTSIDE = frozenset({0, *map(int, Opcode)}.difference(_DEFINES, [_IS_MESSAGE]))
+"""Opcodes that no record in a chunk has; those not known yet are stepped over, as the specification asks."""
 _WINDOW = 4096
 """Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
 _BRIEF = 16
@@ -36,16 +38,18 @@ class Walk:
         define: Callable[[int, bytes], None],
         wanted: Collection[Channel] | None,
         brief: Collection[Channel] = (),
+        cut: bool = False,
     ) -> None:
-        """`end` is its length. Messages on `wanted` channels are kept (None: on all); those on `brief` ones need not be
-        whole. `define` takes a schema or channel record and may add to `channels`."""
+        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are kept (None: on
+        all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
+        `channels`."""
         self.position = 0
         self.unknown = 0
         """Messages of channels that nothing defined so far."""
         self.last_ns: int | None = None
         """Log time of the last message, on whatever channel."""
-        self._number, self.end, self._channels, self._define = number, end, channels, define
-        self._wanted, self._brief = wanted, brief
+        self.number, self.end, self._channels, self._define = number, end, channels, define
+        self._wanted, self._brief, self._cut = wanted, brief, cut
         self._used = self._wanted_ids()
         self._ids: list[int] = []
         self._found: list[Channel] = []
@@ -62,6 +66,7 @@ class Walk:
     def whole(self, data: bytes) -> Block:
         """The messages of the chunk, of which `data` are all bytes."""
         self._go(data, 0)
+        self._drop_doubtful()
         return Block(data, self._found, self._log_ns, self._starts, self._stops, self._places)
 
     def in_place(self, read: Callable[[int, int], bytes]) -> Block:
@@ -82,7 +87,16 @@ class Walk:
                     break
             parts.append(data)
             size += len(data)
+        self._drop_doubtful()
         return Block(b"".join(parts), self._found, self._log_ns, self._starts, self._stops, self._places)
+
+    def _drop_doubtful(self) -> None:
+        """Leave out the message before damage: its length may be what is damaged."""
+        if self.position == self.end or self._cut or not self._ids:
+            return
+        if self._ids.pop() in self._used:
+            for column in (self._found, self._log_ns, self._starts, self._stops, self._places):
+                column.pop()
 
     def _go(self, data: bytes, shift: int) -> None:
         """On through `data`, which lie at `position` in the chunk and at `shift` in the block, up to the first record
@@ -92,11 +106,13 @@ class Walk:
         while at + _MESSAGE.size <= size:
             opcode, length, channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, at)
             start, stop = at + _MESSAGE.size, at + RECORD.size + length
+            if stop < start if opcode == _IS_MESSAGE else opcode in _OUTSIDE:
+                break
             if stop > size and (
                 opcode != _IS_MESSAGE or stop > left or self._is_needed(used.get(channel_id), size - start, length)
             ):
                 break
-            if opcode == _IS_MESSAGE and start <= stop:
+            if opcode == _IS_MESSAGE:
                 self._ids.append(channel_id)
                 self.last_ns = log_ns
                 if channel_id in used:
@@ -104,7 +120,7 @@ class Walk:
                     self._log_ns.append(log_ns)
                     self._starts.append(shift + start)
                     self._stops.append(shift + stop)
-                    self._places.append((self._number, base + start, base + stop))
+                    self._places.append((self.number, base + start, base + stop))
                 elif channel_id not in self._channels:
                     self.unknown += 1
             elif opcode in _DEFINES:
@@ -113,7 +129,7 @@ class Walk:
         while at + RECORD.size <= size:  # too short for a message
             opcode, length = RECORD.unpack_from(data, at)
             stop = at + RECORD.size + length
-            if stop > size:
+            if stop > size or opcode == _IS_MESSAGE or opcode in _OUTSIDE:
                 break
             if opcode in _DEFINES:
                 self._learn(opcode, data[at + RECORD.size : stop])

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from vplog.logs.chunks import Chunks, reader_at
 from vplog.logs.compression import BadChunkError, unpack
-from vplog.logs.containers import Block, Channel, Contents, Notes, by_topic, ordered, plural
+from vplog.logs.containers import Block, Channel, Contents, Notes, by_topic, ordered, plural, topics_of
 from vplog.logs.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.remote import RemotePath
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from vplog.logs.containers import Message, Octets, Place
     from vplog.logs.ros1_layout import Chunk
 
+_FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
+"""What the header of each kind of record in the chunks has."""
 __all__ = ["MAGIC", "Ros1Bag"]
 
 
@@ -29,6 +32,8 @@ class Ros1Bag:
         self._file = path.open("rb")
         self._length = path.stat().st_size
         self._channels: dict[int, Channel] = {}
+        self._doubtful: dict[int, Channel] = {}
+        """Connections whose type is damaged, for those that no other record defines."""
         self._layout = read_layout(self._file, self._length, self._connect, self._name)
         local = not isinstance(path, RemotePath)
         self._at = reader_at(self._file, local)
@@ -37,6 +42,10 @@ class Ros1Bag:
 
     def contents(self) -> Contents:
         """Counted by the indexes; a chunk without is unpacked."""
+        if self._doubtful.keys() - self._channels.keys():
+            for count in range(len(self._layout.chunks)):  # which define their connections too
+                self._messages(count, self._data(count))
+            self._channels = self._doubtful | self._channels
         counts: dict[Channel, int] = {}
         start_ns, end_ns = 2**64, 0
         for count, chunk in enumerate(self._layout.chunks):
@@ -86,16 +95,15 @@ class Ros1Bag:
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
         layout, account, name = self._layout, self._notes.account, self._name
         recorded = dict(found)
-        for count, chunk in enumerate(layout.missing):
-            counts = self._topics(chunk.counts)
-            account.add("damaged_bytes", counts or None, (name, count), [(chunk.first_ns, chunk.last_ns)])
+        for chunk in layout.missing:
+            counts = topics_of(chunk.counts, self._channels)
+            before = max((c.last_ns for c in layout.chunks if c.stop <= chunk.record), default=start_ns)
+            behind = min((c.first_ns for c in layout.chunks if c.start > chunk.record and c.first_ns), default=end_ns)
+            first_ns, last_ns = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else (before, behind)
+            detail = f"{name} is damaged near byte {chunk.record}."
+            account.add("damaged_bytes", counts or None, (name, chunk.record), [(first_ns, last_ns)], detail)
             for topic, messages in counts.items():
                 recorded[topic] = recorded.get(topic, 0) + messages
-        for start, stop in layout.gaps if not layout.missing else ():
-            before = max((c.last_ns for c in layout.chunks if c.stop <= start), default=start_ns)
-            behind = min((c.first_ns for c in layout.chunks if c.start >= stop and c.first_ns), default=end_ns)
-            detail = f"{name} is damaged near byte {start}; it is read again from byte {stop} on."
-            account.add("damaged_bytes", None, (name, start), [(min(before, behind), max(before, behind))], detail)
         if layout.cut_at is not None:
             detail = (
                 f"{name} is cut or damaged at byte {layout.cut_at} of {self._length}; "
@@ -106,52 +114,54 @@ class Ros1Bag:
             self._notes.add(
                 f"{name} is cut or damaged at byte {layout.index_cut_at}, behind its messages; none is lost."
             )
-        whole = layout.cut_at is None and (not layout.gaps or bool(layout.missing))
+        whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         account.know(name, recorded if whole else {}, start_ns)
 
-    def _topics(self, counts: dict[int, int]) -> dict[str, int]:
-        """Counts of connections by topic, zero and less left out."""
-        result: dict[str, int] = {}
-        for connection, count in counts.items():
-            if count > 0 and (channel := self._channels.get(connection)) is not None:
-                result[channel.topic] = result.get(channel.topic, 0) + count
-        return result
-
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
-        topic = header.get(b"topic", b"").decode("utf-8", "replace")
-        kind = (fields(data) or {}).get(b"type", b"").decode("utf-8", "replace")
-        self._channels[number(header, b"conn")] = Channel(topic, kind, "ros1")
+        """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
+        connection, about = number(header, b"conn"), fields(data)
+        channel = Channel(
+            header.get(b"topic", b"").decode("utf-8", "replace"),
+            (about or {}).get(b"type", b"").decode("utf-8", "replace"),
+            "ros1",
+        )
+        if about is None or b"type" not in about:
+            self._doubtful.setdefault(connection, channel)
+        else:
+            self._channels.setdefault(connection, channel)
 
-    def _messages(self, count: int, data: bytes) -> Iterator[tuple[int, int, int, int]]:
-        """Connection, log time, start and stop of every message in a chunk; at its end, what it was short of."""
+    def _messages(self, count: int, data: bytes) -> list[tuple[int, int, int, int]]:
+        """Connection, log time, start and stop of every message in a chunk; what it was short of is accounted for."""
         chunk = self._layout.chunks[count]
-        seen: dict[int, int] = {}
-        unknown, position, last_ns = 0, 0, chunk.first_ns
+        found: list[tuple[int, int, int, int]] = []
+        position = 0
         while position < len(data):
             size = int.from_bytes(data[position : position + 4], "little")
             start = position + 8 + size
             header = fields(data[position + 4 : start - 4]) if start <= len(data) else None
             stop = start + int.from_bytes(data[start - 4 : start], "little")
-            if header is None or stop > len(data):
+            if header is None or stop > len(data) or not header.keys() >= _FIELDS.get(number(header, b"op"), {b""}):
                 break
-            op = number(header, b"op")
-            if op == CONNECTION:
+            if number(header, b"op") == CONNECTION:
                 self._connect(header, data[start:stop])
-            elif op == MESSAGE:
-                connection, last_ns = number(header, b"conn"), time_ns(header, b"time")
-                seen[connection] = seen.get(connection, 0) + 1
-                unknown += connection not in self._channels
-                yield connection, last_ns, start, stop
+            else:
+                found.append((number(header, b"conn"), time_ns(header, b"time"), start, stop))
             position = stop
+        damaged = position < len(data) and not chunk.cut
+        if damaged and found:
+            found.pop()  # its length may be what is damaged
         key, account = (self._name, chunk.start), self._notes.account
+        seen = Counter(connection for connection, _, _, _ in found)
+        last_ns = found[-1][1] if found else chunk.first_ns
         span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
+        unknown = sum(messages for connection, messages in seen.items() if connection not in self._channels)
+        if damaged:
+            short = topics_of({i: messages - seen[i] for i, messages in chunk.counts.items()}, self._channels)
+            detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
+            account.add("damaged_chunk", short if chunk.counts else None, key, span, detail)
         if unknown:
             account.add("unknown_channel", {"": unknown}, key, span)
-        fewer = any(seen.get(connection, 0) < messages for connection, messages in chunk.counts.items())
-        if data and not chunk.cut and (position < len(data) or fewer):
-            short = {connection: messages - seen.get(connection, 0) for connection, messages in chunk.counts.items()}
-            detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
-            account.add("damaged_chunk", self._topics(short) if chunk.counts else None, key, span, detail)
+        return found
 
     def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
         """Not where its indexes name only connections that are known and not wanted."""
@@ -167,5 +177,5 @@ class Ros1Bag:
         chunk = self._layout.chunks[count]
         detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
         span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
-        counts = self._topics(chunk.counts) if chunk.counts else None
+        counts = topics_of(chunk.counts, self._channels) if chunk.counts else None
         self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), span, detail)

@@ -1,7 +1,7 @@
 """Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): found by walking it, over damage too.
 
-Where a record cannot be one, the walk goes on at the next chunk: the one that the bag's own index names, or the next
-bytes that can be the head of one.
+A record is believed where another lies behind it. Where none does, the walk goes on at the next bytes that can be the
+head of a chunk, or of a record of an index; what lay between is held against the index at the end.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.compression import KINDS
 from vplog.logs.search import MOST_GAPS, Search
 
 if TYPE_CHECKING:
@@ -26,8 +25,24 @@ _MAX_HEADER = 2**20
 """Bytes of a record header that are believed; real ones are some 100 bytes."""
 _MAX_CONNECTION = 16 * 2**20
 """Bytes of a connection record that are read: its message definition, 100 kB at most in practice."""
-_CHUNK_START = re.compile(rb".\x00\x00\x00[\x05-\x1b]\x00\x00\x00(?=(?:compression=|op=\x05|size=))", re.DOTALL)
-"""Length of a header below 256 bytes, and of its first field, one of the three that a chunk has."""
+_FIELDS = {
+    _BAG: {b"index_pos", b"conn_count", b"chunk_count"},
+    _INDEX: {b"ver", b"conn", b"count"},
+    _CHUNK: {b"compression", b"size"},
+    _CHUNK_INFO: {b"ver", b"chunk_pos", b"start_time", b"end_time", b"count"},
+    CONNECTION: {b"conn", b"topic"},
+}
+"""What the header of each kind of record outside the chunks has."""
+_ENTRY = {_INDEX: 12, _CHUNK_INFO: 8}
+"""Bytes of each of the `count` entries of a record: time and offset of a message; a connection and its count."""
+_FIRST = re.compile(rb"(?:op|compression|size|ver|conn|count|chunk_pos|start_time|end_time)=")
+"""Names in the headers of chunks and of indexes."""
+_RECORD_START = re.compile(rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=%s)" % _FIRST.pattern, re.DOTALL)
+"""Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
+_HEAD = 256
+"""Bytes in which the head of a record ends, but for a connection's of a long topic."""
+_NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn_count|chunk_count|chunk_pos)=")
+"""Names in the header of a chunk, and those that no chunk has."""
 
 
 @dataclass(slots=True)
@@ -38,6 +53,10 @@ class Chunk:
     compression: str
     size: int
     cut: bool
+    record: int = -1
+    """Offset of its record."""
+    doubtful: bool = False
+    """Damage lies between the index records behind it, so that they may not be all."""
     counts: dict[int, int] = field(default_factory=dict)
     """Messages per connection, from the index records behind it; empty where there are none."""
     first_ns: int = 0
@@ -51,7 +70,7 @@ class Layout:
 
     chunks: list[Chunk] = field(default_factory=list)
     missing: list[Chunk] = field(default_factory=list)
-    """Chunks that the bag's index lists and that are not where it says."""
+    """Chunks that lie in damaged bytes, as the bag's index or the index records behind them tell."""
     gaps: list[tuple[int, int]] = field(default_factory=list)
     """Bytes without a record, from and to."""
     cut_at: int | None = None
@@ -74,42 +93,86 @@ class _Walk:
     def __init__(self, file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None]) -> None:
         self._file, self._length, self._connect = file, length, connect
         self.layout = Layout()
-        self._offsets: dict[int, Chunk] = {}
-        """By offset of their record: chunks that were found."""
         self._infos: dict[int, Chunk] = {}
-        """The same, as the bag's index lists them."""
+        """By offset of their record: chunks as the bag's index lists them."""
+        self._indexing: Chunk | None = None
+        """The chunk whose index records come by."""
         self._index_at = 0
-        self._recorded_chunks = 0
         self._search = Search(file, length)
 
     def records(self, position: int) -> None:
-        before = position
         while position < self._length:
             header, start, stop = self._head(position)
-            op = number(header, b"op") if header is not None else -1
-            if header is None or start > self._length or (stop > self._length and op != _CHUNK):
-                resumed = self._resume(before, position) if len(self.layout.gaps) < MOST_GAPS else None
-                if resumed is None:
-                    self.layout.cut_at = min(position, self._length)
-                    return
-                self.layout.gaps.append((position, resumed))
-                before = position = resumed
-                continue
-            self._record(op, header, position, start, stop)
-            before, position = position, stop
+            inside = header is not None and number(header, b"op") == _CHUNK
+            if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
+                found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
+                if header is None or not self._is_sound(header):
+                    if found is None:
+                        if self._indexing is not None:
+                            self._indexing.doubtful = True
+                        self.layout.cut_at = position
+                        return
+                    self._skip(position, found)
+                    position = found
+                    continue
+                stop = self._stop(header, start, stop, found)
+            self._record(number(header, b"op"), header, position, start, stop)
+            position = stop
         if position > self._length:
             self.layout.cut_at = self._length
+
+    def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> int:
+        """Where a record stops that has none behind it: by its header, or else where the next one is found if its
+        length is what is damaged."""
+        length = self._length_by_header(header)
+        if length is not None and self._is_record(start + length):
+            return start + length
+        if found is None or (stop < found and self._is_damaged_head(stop)):
+            return stop
+        self.layout.gaps.append((stop, found))
+        return found
+
+    def _is_damaged_head(self, position: int) -> bool:
+        """Whether two of three signs are there of a header: its length, and length and name of its first field."""
+        data = self.at(position, 8 + 16)
+        header, first = (int.from_bytes(data[at : at + 4], "little") for at in (0, 4))
+        return (header <= _MAX_HEADER) + (first < _HEAD) + bool(_FIRST.match(data, 8)) >= 2
+
+    def _skip(self, position: int, found: int) -> None:
+        """Take note of bytes without a record, and of the chunk that may lie in them."""
+        self.layout.gaps.append((position, found))
+        named = _NAME.search(self.at(position, min(_HEAD, found - position)))
+        if self._indexing is not None and named is not None and named[1] is None:
+            self._indexing.doubtful = True
+        if named is None or named[1] is not None:
+            self._indexing = Chunk(position, found, "", 0, False, record=position)
+            self.layout.missing.append(self._indexing)
 
     def finish(self) -> None:
         """Hold what was found against the bag's index."""
         layout = self.layout
+        found = {chunk.record: chunk for chunk in layout.chunks}
+        skipped = {chunk.record: chunk for chunk in layout.missing}
         for offset, info in sorted(self._infos.items()):
-            if (chunk := self._offsets.get(offset)) is None:
-                layout.missing.append(info)
-            else:
+            if (chunk := found.get(offset)) is not None:
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
+                chunk.doubtful |= bool(chunk.counts) and chunk.counts != info.counts
                 chunk.counts = chunk.counts or info.counts
-        if layout.cut_at is not None and self._index_at and layout.cut_at >= self._index_at and not layout.gaps:
+            elif self._is_chunk(offset):  # it was jumped over
+                header, start, stop = self._head(offset)
+                self._record(_CHUNK, header or {}, offset, start, stop)
+                layout.chunks[-1].counts = info.counts
+            elif any(start <= offset < stop for start, stop in layout.gaps):  # else the index is what is damaged
+                skipped[offset] = info
+        layout.chunks.sort(key=lambda chunk: chunk.start)
+        for chunk in layout.chunks:
+            chunk.counts = {} if chunk.doubtful else chunk.counts
+        layout.missing = [
+            chunk
+            for offset, chunk in sorted(skipped.items())
+            if chunk.counts or offset in self._infos or not self._infos
+        ]
+        if layout.cut_at is not None and self._index_at and layout.cut_at >= self._index_at and not layout.missing:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at
 
     def at(self, position: int, length: int) -> bytes:
@@ -130,18 +193,46 @@ class _Walk:
             return None, 0, 0
         return fields(data[:size]), start, start + int.from_bytes(data[size:], "little")
 
+    def _is_sound(self, header: dict[bytes, bytes]) -> bool:
+        return header.keys() >= _FIELDS.get(number(header, b"op"), {b""})
+
+    def _length_by_header(self, header: dict[bytes, bytes]) -> int | None:
+        """Bytes of a record's data, where its header tells."""
+        op = number(header, b"op")
+        if op == _CHUNK:
+            return number(header, b"size") if header[b"compression"] == b"none" else None
+        return _ENTRY[op] * number(header, b"count") if op in _ENTRY else None
+
+    def _is_record(self, position: int, behind_chunk: bool = True) -> bool:
+        """Whether the head of a record lies here, or the end of the file. Connections lie in chunks too, but behind one
+        only where the index begins."""
+        header, _, _ = self._head(position)
+        if header is None or not self._is_sound(header):
+            return position == self._length
+        return not behind_chunk or number(header, b"op") != CONNECTION or 0 < self._index_at <= position
+
+    def _is_chunk(self, position: int) -> bool:
+        header, _, stop = self._head(position)
+        return (
+            header is not None and number(header, b"op") == _CHUNK and self._is_sound(header) and self._is_record(stop)
+        )
+
+    def _next_record(self, position: int) -> int | None:
+        """The next chunk, or record of an index, behind `position`; connections may as well lie in a chunk."""
+        return self._search.first(_RECORD_START, position + 1, self._is_record)
+
     def _record(self, op: int, header: dict[bytes, bytes], position: int, start: int, stop: int) -> None:
         if op == _CHUNK:
-            kind = header.get(b"compression", b"").decode("ascii", "replace")
-            cut = stop > self._length
-            chunk = Chunk(start, min(stop, self._length), kind, number(header, b"size"), cut)
-            self.layout.chunks.append(chunk)
-            self._offsets[position] = chunk
-        elif op == _INDEX and self.layout.chunks:
-            count = number(header, b"count")
-            if 0 < 12 * count <= stop - start:  # each entry: seconds, nanoseconds, offset, of 4 bytes each
-                chunk = self.layout.chunks[-1]
-                chunk.counts[number(header, b"conn")] = count
+            kind = header[b"compression"].decode("ascii", "replace")
+            cut, stop = stop > self._length, min(stop, self._length)
+            size = stop - start if kind == "none" and not cut else number(header, b"size")
+            self._indexing = Chunk(start, stop, kind, size, cut, record=position)
+            self.layout.chunks.append(self._indexing)
+        elif op == _INDEX and self._indexing is not None:
+            chunk, connection, count = self._indexing, number(header, b"conn"), (stop - start) // 12
+            chunk.doubtful |= connection in chunk.counts or (stop - start) % 12 > 0 or stop > self._length
+            if count and stop <= self._length:
+                chunk.counts[connection] = count
                 for at in (start, start + 12 * (count - 1)):
                     seconds, nanoseconds = struct.unpack("<II", self.at(at, 8))
                     log_ns = seconds * 1_000_000_000 + nanoseconds
@@ -155,39 +246,12 @@ class _Walk:
             self._index_at = max(number(header, b"index_pos"), 0)
 
     def _add_info(self, header: dict[bytes, bytes], data: bytes) -> None:
-        info = Chunk(0, 0, "", 0, False, {}, time_ns(header, b"start_time"), time_ns(header, b"end_time"))
+        position, span = number(header, b"chunk_pos"), (time_ns(header, b"start_time"), time_ns(header, b"end_time"))
+        info = Chunk(position, position, "", 0, False, position, first_ns=span[0], last_ns=span[1])
         for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
             if 0 < count <= self._length:
                 info.counts[connection] = count
-        self._infos[number(header, b"chunk_pos")] = info
-
-    def _resume(self, before: int, position: int) -> int | None:
-        """The next record to go on with, where there is none at `position`; the one before, at `before`, may be the
-        one whose length is damaged."""
-        if not self._infos and len(MAGIC) < self._index_at < self._length:
-            index = self._index_at
-            while index < self._length:
-                header, start, stop = self._head(index)
-                if header is None or stop > self._length or number(header, b"op") not in (CONNECTION, _CHUNK_INFO):
-                    break
-                self._record(number(header, b"op"), header, index, start, stop)
-                index = stop
-        if self._infos:
-            behind = (offset for offset in sorted(self._infos) if offset > before and self._is_chunk(offset))
-            found = next(behind, self._index_at if self._index_at > before else None)
-        else:
-            found = self._search.first(_CHUNK_START, before + 1, self._is_chunk)
-        if found is not None and found < position and self.layout.chunks and self.layout.chunks[-1].stop > found:
-            dropped = self.layout.chunks.pop()
-            self._offsets = {offset: chunk for offset, chunk in self._offsets.items() if chunk is not dropped}
-        return found
-
-    def _is_chunk(self, position: int) -> bool:
-        header, start, stop = self._head(position)
-        if header is None or number(header, b"op") != _CHUNK or start > self._length or stop <= start:
-            return False
-        kind, size = header.get(b"compression", b"").decode("latin-1"), number(header, b"size")
-        return kind in KINDS and (stop - start == size if kind == "none" else size > 0) and stop <= self._length
+        self._infos[position] = info
 
 
 def fields(data: bytes) -> dict[bytes, bytes] | None:

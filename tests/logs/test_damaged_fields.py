@@ -1,0 +1,261 @@
+"""Every length and offset of every format, damaged in turn: what is read and what is said lost are what was written.
+
+Seeded bits anywhere in the files too. Nothing is made up, and nothing is lost without a word.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from typing import TYPE_CHECKING, NamedTuple
+
+import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags import rosbag1, rosbag2
+
+from vplog.errors import LogError
+from vplog.logs.containers import Notes
+from vplog.logs.detect import open_container
+from vplog.logs.ros2_folder import Counted, read_metadata
+
+from .drives import START_NS, store
+from .log_fields import FIELDS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from .log_fields import Field
+
+Messages = Counter[tuple[str, int, bytes]]
+"""Topic, log time and bytes of each message."""
+TOPICS = ("/a", "/bb", "/ccc")
+KIND = "std_msgs/msg/String"
+
+
+def messages() -> list[tuple[str, int, bytes]]:
+    """24 messages of three topics at different rates, in no size twice."""
+    rng = random.Random(1)
+    topics = [TOPICS[(0, 1, 0, 2)[number % 4]] for number in range(24)]
+    return [(topic, START_NS + 10**7 * i, rng.randbytes(20 + 3 * i)) for i, topic in enumerate(topics)]
+
+
+WRITTEN = Counter(messages())
+
+
+def write_mcap(path: Path, beside: bool = False, **options: object) -> Path:
+    """With small chunks; `beside`: with attachments and metadata among them."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=350, **options)  # type: ignore[arg-type]
+        writer.start("ros2", "test")
+        channels = {}
+        for number, (topic, log_ns, data) in enumerate(messages()):
+            if topic not in channels:
+                schema = writer.register_schema(KIND, "ros2msg", b"string data")
+                channels[topic] = writer.register_channel(topic, "cdr", schema, {"qos": "reliable"})
+            writer.add_message(channels[topic], log_ns, data, log_ns)
+            if beside and number % 10 == 5:
+                writer.add_attachment(log_ns, log_ns, f"map{number}", "text/plain", bytes(range(40)))
+                writer.add_metadata(f"notes{number}", {"weather": "rain", "driver": "none"})
+        writer.finish()
+    return path
+
+
+def write_bag(path: Path, compression: str) -> Path:
+    writer = rosbag1.Writer(path)
+    writer.chunk_threshold = 350
+    if compression:
+        writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    with writer:
+        connections = {topic: writer.add_connection(topic, KIND, typestore=store(1)) for topic in TOPICS}
+        for topic, log_ns, data in messages():
+            writer.write(connections[topic], log_ns, data)
+    return path
+
+
+def write_db3(path: Path) -> Path:
+    folder = path.with_suffix("")
+    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3) as writer:
+        connections = {topic: writer.add_connection(topic, KIND, typestore=store(2)) for topic in TOPICS}
+        for topic, log_ns, data in messages():
+            writer.write(connections[topic], log_ns, data)
+    return folder / path.name
+
+
+def unindexed(path: Path) -> Path:
+    """A bag as a recorder that crashed leaves it: without the index at its end."""
+    data = path.read_bytes()
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    end = int.from_bytes(data[at : at + 8], "little")
+    path.write_bytes(data[:at] + bytes(8) + data[at + 8 : end])
+    return path
+
+
+def cut_off(path: Path) -> Path:
+    """An MCAP file as a recorder that crashed leaves it: up to the end of the last message index."""
+    data = path.read_bytes()
+    path.write_bytes(data[: data.rindex(b"\x0f\x04\0\0\0\0\0\0\0")])
+    return path
+
+
+class Format(NamedTuple):
+    write: Callable[[Path], Path]
+    counted: bool = True
+    """Something in the file besides the messages themselves tells how many there are."""
+    checked: bool = True
+    """Checksums cover the messages, and their channels are defined at more than one place."""
+    cut: bool = False
+    """The end is missing, so that some of unknown number may be."""
+    rows: bool = False
+    """Rows of SQLite. They are looked up by halves, so that a damaged one may hide sound ones when they are counted;
+    and without its first page, the list of tables, nothing is read."""
+    folder: bool = False
+    """With metadata.yaml beside it."""
+
+
+BARE = {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False}
+FORMATS = {
+    **{
+        f"mcap-{kind.name.lower()}": Format(lambda p, kind=kind: write_mcap(p / "log.mcap", compression=kind))
+        for kind in CompressionType
+    },
+    "mcap-beside": Format(lambda p: write_mcap(p / "log.mcap", beside=True)),
+    "mcap-no-crc": Format(
+        lambda p: write_mcap(p / "log.mcap", enable_crcs=False, compression=CompressionType.NONE), checked=False
+    ),
+    "mcap-no-summary": Format(
+        lambda p: write_mcap(p / "log.mcap", use_summary_offsets=False, index_types=IndexType.MESSAGE, **BARE),
+        checked=False,
+    ),
+    "mcap-no-index": Format(
+        lambda p: write_mcap(p / "log.mcap", use_summary_offsets=False, index_types=IndexType.NONE, **BARE),
+        False,
+        False,
+    ),
+    "mcap-cut-off": Format(
+        lambda p: cut_off(write_mcap(p / "log.mcap", compression=CompressionType.LZ4)), checked=False, cut=True
+    ),
+    "mcap-unchunked": Format(lambda p: write_mcap(p / "log.mcap", use_chunking=False), checked=False),
+    "mcap-unchunked-no-summary": Format(
+        lambda p: write_mcap(p / "log.mcap", use_chunking=False, use_summary_offsets=False, **BARE), False, False
+    ),
+    **{
+        f"bag-{kind.lower() or 'none'}": Format(
+            lambda p, kind=kind: write_bag(p / "log.bag", kind), checked=kind == "BZ2"
+        )
+        for kind in ("", "BZ2", "LZ4")
+    },
+    "bag-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "LZ4")), checked=False, cut=True),
+    "bag-none-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "")), checked=False, cut=True),
+    "db3": Format(lambda p: write_db3(p / "log.db3"), counted=False, checked=False, rows=True),
+    "db3-folder": Format(lambda p: write_db3(p / "log.db3"), checked=False, rows=True, folder=True),
+}
+
+
+def values(field: Field, data: bytes, rng: random.Random) -> list[int]:
+    """Wrong values: off by one, twice, of the limits of signed and unsigned numbers, and by chance."""
+    true = field.read(data)
+    limits = (2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
+    wrong = [0, true - 1, true + 1, 2 * true, *(limit for limit in limits if limit < 1 << 8 * field.width)]
+    wrong += [rng.randrange(1 << 8 * field.width), rng.randrange(max(2 * true, 2)), rng.randrange(len(data))]
+    return list(dict.fromkeys(value % (1 << 8 * field.width) for value in wrong if value != true))
+
+
+def by_topic(found: Messages) -> Counter[str]:
+    result: Counter[str] = Counter()
+    for (topic, _, _), count in found.items():
+        result[topic] += count
+    return result
+
+
+def problem(path: Path, written: Messages, form: Format, content: bool = True) -> str:
+    """What is wrong with the account of what is read and lost; empty where nothing is. `content`: whether the bytes of
+    messages must be those that were written."""
+    notes = Notes()
+    try:
+        container, _ = open_container(path, notes)
+        if form.folder:
+            container = Counted(container, read_metadata(path.parent), [path.name], notes)
+        contents = container.contents()
+        read = Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in container.messages(contents.counts))
+    except LogError as error:
+        # The first bytes tell what a log is.
+        known = "which no log does" in str(error) or (form.rows and "ROS 2 bag" in str(error))
+        return "" if known and "\n" not in str(error) else f"refused: {error}"
+    found: Counter[str] = Counter()
+    for channel, count in contents.counts.items():
+        found[channel.topic] += count
+    made_up = read - written if content else Counter()
+    if not content:  # nor need their topics be
+        read, written, found = untold(read), untold(written), Counter({"": found.total()})
+    return compared(by_topic(read), made_up, by_topic(written), found, notes, form)
+
+
+def untold(found: Messages) -> Messages:
+    """As many messages of no topic."""
+    return Counter({("", 0, b""): found.total()})
+
+
+def compared(
+    read: Counter[str], made_up: Messages, written: Counter[str], found: Counter[str], notes: Notes, form: Format
+) -> str:
+    if made_up:
+        return f"made up: {[(topic, len(data)) for topic, _, data in made_up]}"
+    missed = written - read
+    losses = [loss for loss in notes.account.losses if not form.cut or loss.reason != "cut" or loss.messages]
+    said: Counter[str] = Counter()
+    for loss in losses:
+        said[loss.topic] += loss.messages or 0
+    said = +said
+    unknown = [loss.reason for loss in losses if loss.messages is None]
+    state = f"missed {dict(missed)}, said {dict(said)} {unknown}, contents {dict(found)}: {notes.lines}"
+    if not missed and (said or unknown):
+        return f"invented loss: {state}"
+    if missed and not (said or unknown):
+        return f"silent loss: {state}"
+    if unknown and form.counted:
+        return f"unknown number: {state}"
+    more = said.total() > missed.total() and not form.rows
+    if more or (not unknown and said.total() < missed.total()):
+        return f"wrong number: {state}"
+    if (
+        set(said) - {""}
+        and set(written) != {""}
+        and not form.rows
+        and any(said[topic] > missed[topic] for topic in said if topic)
+    ):
+        return f"wrong topic: {state}"
+    if not form.rows and (not read <= found or not found <= written):
+        return f"wrong contents: read {dict(read)} {state}"
+    return ""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_damaged_field_is_accounted_for(name: str, tmp_path: Path) -> None:
+    form = FORMATS[name]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    assert problem(path, WRITTEN, form) == ""
+    rng, problems = random.Random(7), []
+    for field in FIELDS[path.suffix](whole):
+        for value in rng.sample(found := values(field, whole, rng), min(4, len(found))):
+            path.write_bytes(field.set(whole, value))
+            if wrong := problem(path, WRITTEN, form):
+                problems.append(f"{field.name} at {field.offset}: {field.read(whole)} -> {value}: {wrong}")
+    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_damaged_bit_is_accounted_for(name: str, tmp_path: Path) -> None:
+    form = FORMATS[name]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    rng, problems = random.Random(9), []
+    for _ in range(100):
+        bit = rng.randrange(8 * len(whole))
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(data)
+        if found := problem(path, WRITTEN, form, form.checked):
+            problems.append(f"bit {bit % 8} of byte {bit // 8}: {found}")
+    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
