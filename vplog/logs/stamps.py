@@ -10,7 +10,7 @@ import numpy as np
 
 from vplog.errors import LogError
 from vplog.logs.clocks import LEAST_JUMP_NS, Clock, on_one_clock
-from vplog.logs.containers import plural
+from vplog.logs.containers import Notes, plural
 from vplog.logs.losses import runs_of
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from vplog.data import Ints
     from vplog.logs.clocks import Repaired
-    from vplog.logs.containers import Notes
 
 NONE: Ints = np.zeros(0, np.int64)
 _LAST_NS = 2**63 - 1
@@ -30,6 +29,8 @@ _LATE_NS = 2 * 10**9
 _GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
+_FASTEST_HZ = 1e6
+"""Hz; stamps that are less than a microsecond apart are counters, not times."""
 _NAMED = 4
 """Jumps of a clock that are named."""
 
@@ -65,6 +66,11 @@ class Stamps:
             return None
         kept = found.stamp_ns[found.kept]
         return Clock(found.skew_ns, int(kept.min()), int(kept.max()))
+
+    def rate_hz(self) -> float | None:
+        """Messages a second between the first and the last; None where there is no such time."""
+        ordered_ns, _ = self.order("", Notes())
+        return rate_hz(ordered_ns)
 
     def clocks(self) -> dict[int, int]:
         """Messages by the skew of the clock that they came on; several where it was set."""
@@ -113,6 +119,13 @@ class Stamps:
     def _by_log_times(self, topic: str, notes: Notes, log_ns: Ints, why: str) -> tuple[Ints, Ints]:
         notes.add(f"{topic} {why}; its log times are used instead.")
         return _in_order(topic, notes, log_ns, np.arange(len(log_ns)), log_ns)
+
+
+def rate_hz(stamp_ns: Ints) -> float | None:
+    """Messages a second of (T,) increasing stamps; None where they span no time, or none that a sensor would."""
+    span_ns = int(stamp_ns[-1]) - int(stamp_ns[0]) if len(stamp_ns) else 0
+    rate = (len(stamp_ns) - 1) * 1e9 / span_ns if span_ns else None
+    return round(rate, 3) if rate is not None and rate < _FASTEST_HZ else None
 
 
 def share_clock(topics: Iterable[Stamps]) -> None:
