@@ -22,7 +22,9 @@ _TURN_RAD_S = 12.0
 _LEAST_TURN_RAD = 0.1
 """rad; a smaller turn in one step is noise of short periods."""
 _TIMES = 10.0
-"""A jump departs so many times further from the speed beside it than nine tenths of the drive's own steps do."""
+"""A jump departs so many times further from the motion beside it than nine tenths of the drive's own steps do."""
+_PERIODS = 3.0
+"""A jump is also longer than the way of so many periods: stamps that jitter crowd that much motion into one step."""
 _BESIDE = 3
 """Steps on either side whose median speed a step is held against: one or two of them may be jumps themselves."""
 _LEAST = 4 * _BESIDE
@@ -38,11 +40,16 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
     seconds = np.diff(stamp_ns) / 1e9
     step = geometry.between(poses[:-1], poses[1:])
     speed = step[:, :3, 3] / seconds[:, None]
-    departure = np.linalg.norm(speed - _beside(speed), axis=1)
+    departure_m = np.linalg.norm(speed - _beside(speed), axis=1) * seconds
+    least_s = np.maximum(seconds, np.median(seconds))
     window_s = np.convolve(seconds, np.ones(2 * _BESIDE + 1), "same")
-    turn = geometry.angle(step)
-    far = (departure > _ACCELERATION_M_S2 * window_s / 2) & (departure > _TIMES * _usual(departure))
-    turned = (turn > np.maximum(_TURN_RAD_S * seconds, _LEAST_TURN_RAD)) & (turn > _TIMES * _usual(turn))
+    usual_m_s, turn = _usual(np.linalg.norm(speed, axis=1)), geometry.angle(step)
+    limits_m = (
+        _ACCELERATION_M_S2 * least_s * window_s / 2, _TIMES * _usual(departure_m), _PERIODS * usual_m_s * least_s
+    )  # fmt: skip
+    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _usual(turn), _LEAST_TURN_RAD)
+    far = np.all([departure_m > limit for limit in limits_m], axis=0)
+    turned = np.all([turn > limit for limit in limits_rad], axis=0)
     return np.flatnonzero(far | turned)
 
 

@@ -63,7 +63,8 @@ def weigh(source: Channel, frames: list[str], odometry: Odometry, camera_ns: Int
         camera_hz = (len(camera_ns) - 1) * 1e9 / int(camera_ns[-1] - camera_ns[0])
     evidence = _named(topic, kind, frames)
     if coverage < COVERED:
-        evidence[f"covers {coverage:.0%} of the camera's time"] = max(coverage * coverage / 2, _FAINT)
+        whose = "camera's" if len(camera_ns) else "sources'"
+        evidence[f"covers {coverage:.0%} of the {whose} time"] = max(coverage * coverage / 2, _FAINT)
     if rate_hz is not None and (share := rate_hz / min(camera_hz, _LEAST_HZ)) < COVERED:
         what = f"{rate_hz:.2g} poses a second that differ" if moved else "its pose never changes"
         evidence[what] = max(math.sqrt(share), _FAINT)  # the root: a robot that mostly stands has odometry too
@@ -118,13 +119,13 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
     if not fit:
         return asked or next(iter(chosen.sources), None)
     best, source = fit[0]
-    _note_doubts(best, asked is not None, notes)
+    _note_doubts(best, asked is not None, chosen.image is not None, notes)
     return source
 
 
-def _note_doubts(source: OdometrySource, asked: bool, notes: Notes) -> None:
+def _note_doubts(source: OdometrySource, asked: bool, pictured: bool, notes: Notes) -> None:
     """Say what is lost with a source that is taken all the same."""
-    if source.coverage < COVERED:
+    if source.coverage < COVERED and pictured:
         better = "" if asked else " No other source is better; --odometry-file takes one from a file."
         notes.add(
             f"{source.topic} covers {source.coverage:.0%} of the camera's time; the frames outside have no odometry "
