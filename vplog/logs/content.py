@@ -84,6 +84,7 @@ def read_content(container: Container, chosen: Selection, notes: Notes, early: E
         early.offer(block)
         read.take_block(block)
     read.finish_poses()
+    read.find_steps_back(notes)
     sources = weigh_sources(read, chosen)
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}

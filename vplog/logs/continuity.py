@@ -50,7 +50,7 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
     limits_rad = (_TURN_RAD_S * least_s, _TIMES * _usual(turn), _LEAST_TURN_RAD)
     far = np.all([departure_m > limit for limit in limits_m], axis=0)
     turned = np.all([turn > limit for limit in limits_rad], axis=0)
-    return np.flatnonzero(far | turned)
+    return np.flatnonzero(np.logical_or(far, turned))
 
 
 def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:

@@ -22,7 +22,7 @@ from vplog.logs.messages import (
 )
 from vplog.logs.moving import MovingFrames
 from vplog.logs.odometry_message import read_poses
-from vplog.logs.stamps import NONE, Stamps
+from vplog.logs.stamps import NONE, Stamps, find_steps_back
 
 if TYPE_CHECKING:
     from vplog.data import Ints
@@ -185,6 +185,12 @@ class Gathered:
         """Of every topic that is followed over time."""
         images = [one.stamps for one in (self.images, self.depths, self.rights) if one.channel]
         return images + [one.stamps for one in (*self.poses.values(), self.fixes) if one]
+
+    def find_steps_back(self, notes: Notes) -> None:
+        """Undo steps back of the recorder's clock, which all topics share, and find those of the headers'."""
+        for track in self.poses.values():
+            track.tell_apart()
+        find_steps_back([*self.stamps(), *self.others.values(), *self.moving.stamps()], notes)
 
     def skew_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""

@@ -81,6 +81,10 @@ class MovingFrames:
         """Transforms that were the same whenever they were sent."""
         return [link.first for _, link in sorted(self._links.items()) if not link.moves]
 
+    def stamps(self) -> list[Stamps]:
+        """Of every link that is followed over time."""
+        return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
+
     def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:
         """The poses of the body in the frame that stands still, and the frames from there down to the body.
 

@@ -11,13 +11,12 @@ import numpy as np
 
 from vplog import geometry
 from vplog.data import Gps, Odometry
-from vplog.logs.containers import plural
+from vplog.logs.containers import Notes, plural
 from vplog.logs.stamps import Stamps
 from vplog.logs.transforms import are_usable, clean, is_usable
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.logs.containers import Notes
+    from vplog.data import Floats, Ints
     from vplog.logs.messages import FixMessage, PoseMessage
     from vplog.logs.odometry_message import Poses
 
@@ -27,6 +26,9 @@ _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UNKNOWN = [float("nan")] * 36
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
+_BACK_AND_FORTH = 1.5
+"""A path by header stamps that is so many times that by log times is out of order; one that is sorted rightly is
+shorter."""
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -80,7 +82,7 @@ class PoseTrack:
         """The odometry, or None where no pose is usable."""
         if self._dropped:
             notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
-        stamp_ns, rows = self.stamps.order(self.topic, notes)
+        stamp_ns, rows = self._order(notes)
         if not len(rows):
             return None
         poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
@@ -100,6 +102,24 @@ class PoseTrack:
         why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
         notes.add(f"{self.topic} {why}; the noise of its motion is a guess.")
         return Odometry(stamp_ns, poses, None)
+
+    def tell_apart(self) -> None:
+        """Give the stamps a number of each pose, by which a pose that was written twice shows."""
+        self.stamps.content = array("d", np.frombuffer(self._poses).reshape(-1, 7)[:, :3].sum(1).tolist())
+
+    def _order(self, notes: Notes) -> tuple[Ints, Ints]:
+        """Stamps and rows; by the log times where the motion is continuous by them and not by the header stamps."""
+        position = np.frombuffer(self._poses).reshape(-1, 7)[:, :3]
+        _, by_header = self.stamps.order(self.topic, Notes())
+        if (np.diff(by_header) < 0).any():
+            _, by_log = self.stamps.by_log_times(self.topic, Notes(), "")
+            ways = [
+                float(np.linalg.norm(np.diff(position[rows], axis=0), axis=1).sum()) for rows in (by_header, by_log)
+            ]
+            if ways[0] > _BACK_AND_FORTH * ways[1]:
+                why = "has header stamps by which it moves back and forth"
+                return self.stamps.by_log_times(self.topic, notes, why)
+        return self.stamps.order(self.topic, notes)
 
 
 def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
