@@ -25,6 +25,8 @@ _LEAST_RUN = 5
 """Messages of one clock in a row; fewer are damaged stamps, not a clock that was set."""
 _STEP_PERIODS = 3
 """A step back is at least so many periods of the topic: less is within what messages come out of order by."""
+_LEVEL = 30
+"""Messages before and behind a step by which the skew is known: a burst is over by then."""
 _TWICE = 1.5
 """Messages of a time that was passed twice, against those of one that was passed once: between 1 and 2."""
 _MOST_CLOCKS = 20
@@ -79,6 +81,18 @@ def steps_back(times_ns: Ints, *others: np.ndarray) -> tuple[Ints, Ints]:
     stays = advance < _LEAST_RUN * period - size / 2  # a message that is late alone leaves the median
     told = stays & (found > _TWICE * size / period)
     return rows[told], size[told]
+
+
+def header_steps_back(header_ns: Ints, log_ns: Ints) -> Ints:
+    """By how many ns the clock of header stamps (M,) was set back each time: the skew to the log times stays higher by
+    as much, and by more than it varies, which a network that delivers in bursts does not bring about."""
+    skew, found = log_ns - header_ns, []
+    for row, size in zip(*(part.tolist() for part in steps_back(header_ns, log_ns)), strict=True):
+        windows = skew[max(row - _LEVEL, 0) : row], skew[row : row + _LEVEL]
+        low, level, high = np.transpose([np.quantile(window, (0.1, 0.5, 0.9)) for window in windows])
+        if abs(level[1] - level[0] - size) < size / 2 and (high - low).max() < size / 2:
+            found.append(size)
+    return np.array(found, np.int64)
 
 
 def on_one_clock(

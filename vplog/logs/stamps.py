@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import LEAST_JUMP_NS, Clock, on_one_clock, steps_back
+from vplog.logs.clocks import LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
 from vplog.logs.containers import Notes, plural
 from vplog.logs.losses import runs_of
 
@@ -85,7 +85,7 @@ class Stamps:
         """Sizes in ns of the steps back of the header's clock."""
         header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
         set_ = header_ns != 0
-        return steps_back(header_ns[set_], log_ns[set_])[1]
+        return header_steps_back(header_ns[set_], log_ns[set_])
 
     def shift(self, last_ns: int, period_ns: int, size_ns: int) -> None:
         """Shift the log times from where the recorder's clock was set back, behind `last_ns`, on by `size_ns`."""
