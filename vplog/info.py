@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, Topic
+    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
     from vplog.logs import TopicChoice
     from vplog.stages import Log
 
@@ -172,14 +172,13 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
         if topics.calibration_file is not None:
             return f"{topics.calibration_file} is used instead"
         return "its matrix is not set" if topic.calibrated is False else "of another camera"
-    source = next((source for source in found.odometry_sources if source.topic == topic.name), None)
-    if taken_from := next((other for other in found.topics if other.part == "odometry"), None):
-        best = next((one for one in found.odometry_sources if one.topic == taken_from.name), None)
-        if source is not None and best is not None and not topics.odometry:
-            return (
-                f"{best.topic} is taken ({evidence_in_words(best)}); this has {evidence_in_words(source)}; "
-                f"--odometry-topic {topic.name} takes it"
-            )
+    best, others = _odometry_sources(found)
+    source = next((other for other in others if other.topic == topic.name), None)
+    if best is not None and source is not None:
+        return (
+            f"{best.topic} is taken, score {best.score:.2g}; this has {evidence_in_words(source)}; "
+            f"--odometry-topic {topic.name} takes it"
+        )
     if topic.role in ("tf", "tf_static"):
         return "nothing moves or stands by it that another topic does not tell"
     if topic.role == "depth" and any(other.part == "right" for other in found.topics):
@@ -227,11 +226,18 @@ def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoi
     }
 
 
+def _odometry_sources(found: LogInfo) -> tuple[OdometrySource | None, list[OdometrySource]]:
+    """The source in use, None of a file, and the others."""
+    used = next((topic.name for topic in found.topics if topic.part == "odometry"), None)
+    best = next((source for source in found.odometry_sources if source.topic == used), None)
+    return best, [source for source in found.odometry_sources if source is not best]
+
+
 def _choice(found: LogInfo, topics: TopicChoice) -> str:
     """Why this source is the odometry, and what comes next; empty of a file."""
-    if topics.odometry_file is not None or not found.odometry_sources:
+    best, others = _odometry_sources(found)
+    if best is None:
         return ""
-    best, *others = found.odometry_sources
     why = "as asked for" if topics.odometry else "the only source" if not others else "the best source"
     text = f"{best.topic} is {why}: {evidence_in_words(best)}"
     return text + (f"; next is {others[0].topic}: {evidence_in_words(others[0])}" if others else "")

@@ -126,6 +126,25 @@ def test_what_covers_the_drive_wins_over_what_covers_a_part(share: float, tmp_pa
     assert "covers" not in " ".join(log.warnings)
 
 
+def test_four_poses_alone_are_not_taken_silently(tmp_path: Path) -> None:
+    log = logs.open(drive(tmp_path, poses("/amcl_pose", AMCL, OTHER[::33], STAMPS[::33])))
+    assert source(log) == "/amcl_pose"
+    assert "/amcl_pose has 0.3 poses a second that differ" in " ".join(log.warnings)
+
+
+def test_a_topic_of_several_bodies_is_followed_for_one(tmp_path: Path) -> None:
+    kind = "geometry_msgs/msg/TransformStamped"
+    robot, other = poses("/vision", kind, WALK), poses("/vision", kind, OTHER)
+    for message in other:
+        message.message.child_frame_id = "ball"
+        message.stamp_ns += 1
+    log = logs.open(drive(tmp_path, robot, other))
+    odometry = log.odometry()
+    assert odometry is not None
+    np.testing.assert_allclose(odometry.odom_from_body, WALK, atol=1e-9)
+    assert "100 poses of other frames than base_link" in " ".join(log.warnings)
+
+
 def test_frames_tell_between_equal_types(tmp_path: Path) -> None:
     def frames(parent: str, child: str) -> Any:
         found = poses(f"/{parent}_{child}", ODOMETRY, WALK)
@@ -187,7 +206,7 @@ def test_info_says_why_and_what_comes_next(tmp_path: Path) -> None:
         f"score {other['score']:.2g}, a PoseStamped"
     )
     why = {topic["name"]: topic["why"] for topic in record["topics"]}
-    assert why["/pose"].startswith("/tf is taken (score") and why["/pose"].endswith("--odometry-topic /pose takes it")
+    assert why["/pose"].startswith("/tf is taken, score") and why["/pose"].endswith("--odometry-topic /pose takes it")
 
 
 def test_what_was_lost_of_a_source_that_is_not_taken_is_no_loss(tmp_path: Path) -> None:

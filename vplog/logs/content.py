@@ -86,6 +86,7 @@ def read_content(container: Container, chosen: Selection, notes: Notes, early: E
     read.finish_poses()
     read.find_steps_back(notes)
     sources = weigh_sources(read, chosen)
+    rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
@@ -116,5 +117,5 @@ def read_content(container: Container, chosen: Selection, notes: Notes, early: E
         gps = replace(gps, antenna_m=placed[:3, 3])
     return Content(
         stamp_ns, places, read.images.stream, rows, paired[0], paired[1], read.calibration, read.right_calibration,
-        odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], read.rates_hz(),
+        odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,
     )  # fmt: skip

@@ -45,6 +45,7 @@ COVERED = 0.9
 """Share of the camera's time that odometry covers in a usual log: recorders start and stop within seconds."""
 _LEAST_HZ = 5.0
 """Poses a second, or one per image, beyond which more of them add nothing: 2 m apart at 10 m/s."""
+_SPARSE = "poses a second that differ"
 _FAINT = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
 
@@ -66,7 +67,7 @@ def weigh(source: Channel, frames: list[str], odometry: Odometry, camera_ns: Int
         whose = "camera's" if len(camera_ns) else "sources'"
         evidence[f"covers {coverage:.0%} of the {whose} time"] = max(coverage * coverage / 2, _FAINT)
     if rate_hz is not None and (share := rate_hz / min(camera_hz, _LEAST_HZ)) < COVERED:
-        what = f"{rate_hz:.2g} poses a second that differ" if moved else "its pose never changes"
+        what = f"{rate_hz:.2g} {_SPARSE}" if moved else "its pose never changes"
         evidence[what] = max(math.sqrt(share), _FAINT)  # the root: a robot that mostly stands has odometry too
     if rate_hz is None:
         evidence["a single pose"] = _FAINT
@@ -130,6 +131,11 @@ def _note_doubts(source: OdometrySource, asked: bool, pictured: bool, notes: Not
         notes.add(
             f"{source.topic} covers {source.coverage:.0%} of the camera's time; the frames outside have no odometry "
             f"and are left out.{better}"
+        )
+    if pictured and any(_SPARSE in what for what in source.evidence) and (source.rate_hz or 1.0) < 1.0:
+        notes.add(
+            f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is a guess, "
+            "by a straight line."
         )
     if any(map(_TRUTH.search, (source.topic, *source.frames))):
         notes.add(

@@ -59,7 +59,8 @@ class PoseTrack:
         """36 numbers of every pose, NaN where it has none."""
         self._bare = True
         """No pose has a covariance."""
-        self._dropped = 0
+        self._dropped = self._others = 0
+        """Poses that are unusable, and those of other bodies than the first."""
         self.child = ""
         """The frame that moves, as the first message names it."""
         self.parent = ""
@@ -68,7 +69,10 @@ class PoseTrack:
     def add(self, message: PoseMessage, log_ns: int) -> None:
         self.child = self.child or clean(message.child)
         self.parent = self.parent or clean(message.frame)
-        stamp_ns, _, _, position, quaternion, covariance = message
+        stamp_ns, _, child, position, quaternion, covariance = message
+        if clean(child) != self.child:
+            self._others += 1
+            return
         if not is_usable(*position, *quaternion):
             self._dropped += 1
             return
@@ -82,6 +86,9 @@ class PoseTrack:
         """The same of several messages that name the same frames."""
         self.child = self.child or clean(poses.child)
         self.parent = self.parent or clean(poses.frame)
+        if clean(poses.child) != self.child:
+            self._others += len(log_ns)
+            return
         usable = are_usable(poses.poses)
         self._dropped += int((~usable).sum())
         self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable.tolist())))
@@ -96,6 +103,8 @@ class PoseTrack:
         """The odometry, or None where no pose is usable."""
         if self._dropped:
             notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
+        if self._others:
+            notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {self.child} left out.")
         stamp_ns, rows = self._order(notes)
         if not len(rows):
             return None
