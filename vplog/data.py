@@ -302,6 +302,30 @@ class Topic:
     """Of images and calibrations: the frame_id."""
     calibrated: bool | None = None
     """Of calibrations: whether the matrix is set."""
+    rate_hz: float | None = None
+    """Messages a second of the time between its first and last; None where it was not read, or they span no time."""
+
+
+@dataclass(frozen=True)
+class OdometrySource:
+    """One source of odometry in a log, and the evidence by which one of several is chosen."""
+
+    topic: str
+    type: str
+    frames: list[str]
+    """From the one that stands still to the body; empty names where it names none."""
+    count: int
+    rate_hz: float | None
+    """Poses a second that differ from the one before; None of a single pose."""
+    coverage: float
+    """Share of the camera's images with odometry at their stamp; without images, of the time of all sources."""
+    path_m: float
+    jumps: int
+    """Steps that no motion of this drive explains."""
+    evidence: dict[str, float]
+    """What speaks against it, in words, and the factor that each leaves of a score of 1."""
+    score: float
+    """Product of the factors."""
 
 
 @dataclass(frozen=True)
@@ -320,3 +344,5 @@ class LogInfo:
     """Names of the frames from the one that stands still to the body; empty where the odometry names none."""
     skew_ms: dict[str, float] = field(default_factory=dict)
     """By topic in use: log time less header stamp, the median."""
+    odometry_sources: list[OdometrySource] = field(default_factory=list)
+    """Those that could be the odometry, the best first."""

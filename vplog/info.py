@@ -12,12 +12,14 @@ import numpy as np
 from vplog import logs
 from vplog.errors import LogError
 from vplog.keyframes import KeyframeSettings, select_keyframes
+from vplog.logs.odometry_sources import in_words as evidence_in_words
+from vplog.logs.stamps import rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, Topic
+    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
     from vplog.logs import TopicChoice
     from vplog.stages import Log
 
@@ -72,7 +74,6 @@ def preflight(path: Path, topics: TopicChoice | None = None) -> Preflight:
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     for topic, told in zip(found.topics, named["topics"], strict=True):
-        told["rate_hz"] = _rate(topic.count, found)
         told["why"] = _why(topic, found, topics)
     record = {
         **named,
@@ -171,6 +172,13 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
         if topics.calibration_file is not None:
             return f"{topics.calibration_file} is used instead"
         return "its matrix is not set" if topic.calibrated is False else "of another camera"
+    best, others = _odometry_sources(found)
+    source = next((other for other in others if other.topic == topic.name), None)
+    if best is not None and source is not None:
+        return (
+            f"{best.topic} is taken, score {best.score:.2g}; this has {evidence_in_words(source)}; "
+            f"--odometry-topic {topic.name} takes it"
+        )
     if topic.role in ("tf", "tf_static"):
         return "nothing moves or stands by it that another topic does not tell"
     if topic.role == "depth" and any(other.part == "right" for other in found.topics):
@@ -179,18 +187,11 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
     return f"{taken} is taken; {option} takes this" if taken else f"left out; {option} takes it"
 
 
-def _rate(count: int, found: LogInfo) -> float | None:
-    seconds = (found.end_ns - found.start_ns) / 1e9
-    return round(count / seconds, 3) if count > 1 and seconds > 0 else None
-
-
 def _timing(stamp_ns: Ints) -> dict[str, Any]:
-    """First and last stamp, and the rate by the median of the periods."""
+    """First and last stamp, and the rate between them."""
     if not len(stamp_ns):
         return {"start_ns": None, "end_ns": None, "rate_hz": None}
-    period_ns = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-    rate = round(1e9 / period_ns, 3) if period_ns else None
-    return {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1]), "rate_hz": rate}
+    return {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1]), "rate_hz": rate_hz(stamp_ns)}
 
 
 def _about_camera(camera: Camera) -> dict[str, Any]:
@@ -220,8 +221,26 @@ def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoi
         "count": len(odometry.stamp_ns),
         **_timing(odometry.stamp_ns),
         "path_m": round(float(steps.sum()), 3),
+        "choice": _choice(found, topics),
         "covariance": "logged" if known else "unknown",
     }
+
+
+def _odometry_sources(found: LogInfo) -> tuple[OdometrySource | None, list[OdometrySource]]:
+    """The source in use, None of a file, and the others."""
+    used = next((topic.name for topic in found.topics if topic.part == "odometry"), None)
+    best = next((source for source in found.odometry_sources if source.topic == used), None)
+    return best, [source for source in found.odometry_sources if source is not best]
+
+
+def _choice(found: LogInfo, topics: TopicChoice) -> str:
+    """Why this source is the odometry, and what comes next; empty of a file."""
+    best, others = _odometry_sources(found)
+    if best is None:
+        return ""
+    why = "as asked for" if topics.odometry else "the only source" if not others else "the best source"
+    text = f"{best.topic} is {why}: {evidence_in_words(best)}"
+    return text + (f"; next is {others[0].topic}: {evidence_in_words(others[0])}" if others else "")
 
 
 def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
@@ -286,6 +305,8 @@ def in_words(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         rate = "" if odometry["rate_hz"] is None else f" at {odometry['rate_hz']:.1f} Hz"
         text = f"{odometry['source']}: {chain}, {odometry['count']} poses{rate} over {odometry['path_m']:.1f} m"
         yield "odometry", f"{text}, covariance {odometry['covariance']}"
+        if odometry["choice"]:
+            yield "chosen", odometry["choice"]
     if gps is not None:
         known = f"{gps['with_covariance']} with a covariance"
         yield "gps", f"{gps['source']}: {gps['count']} fixes, {known}; --gps uses them"

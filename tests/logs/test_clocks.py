@@ -168,3 +168,23 @@ def test_a_clock_that_is_set_in_a_whole_log(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.diff(log.stamps()), PERIOD_NS)
     np.testing.assert_array_equal(odometry.stamp_ns, log.stamps())
     assert "the clock of the header stamps was set by +3600.000 s" in " ".join(log.warnings)
+
+
+@pytest.mark.parametrize(
+    ("header_ns", "log_ns", "hz"),
+    [
+        # 4 periods in 7.6 s, however short most of them are
+        (
+            START_NS + np.array([0, 80, 160, 240, 7600]) * 10**6,
+            START_NS + np.array([1, 81, 161, 241, 7601]) * 10**6,
+            0.526,
+        ),
+        (START_NS + np.arange(10), START_NS + np.arange(10), None),  # counters, no times
+        (np.full(20, START_NS), START_NS + SECOND // 4 * np.arange(20), 4.0),  # stamps that stand
+        (np.array([START_NS]), np.array([START_NS]), None),
+    ],
+)
+def test_the_rate_is_that_of_the_time_between_first_and_last(
+    header_ns: np.ndarray, log_ns: np.ndarray, hz: float | None
+) -> None:
+    assert stamps(header_ns, log_ns).rate_hz() == hz

@@ -176,11 +176,11 @@ def test_foxglove_transforms(several: bool, tmp_path: Path) -> None:
     np.testing.assert_allclose(odometry.odom_from_body, POSES, atol=1e-9)
 
 
-def test_other_odometry_comes_before_tf_unless_tf_is_asked_for(tmp_path: Path) -> None:
+def test_odometry_comes_before_tf_unless_tf_is_asked_for(tmp_path: Path) -> None:
     found = []
     for stamp, pose in zip(STAMPS.tolist(), POSES, strict=True):
         found.append(tf(2, "/tf", stamp, ("odom", "base_link", pose)))
-        kind = "geometry_msgs/msg/PoseStamped"
+        kind = "nav_msgs/msg/Odometry"
         found.append(Written("/pose", kind, stamp, pose_message(kind, stamp, 2 * np.eye(4) + pose)))
     path = write_ros2(tmp_path / "drive", found)
     other = logs.open(path).odometry()

@@ -88,30 +88,33 @@ def test_pair_or_depth_but_not_both() -> None:
         pick(*found, right="/c")
 
 
-def test_tf_is_odometry_where_nothing_else_is() -> None:
-    moving = topic("/tf", "tf", 50, "tf2_msgs/msg/TFMessage")
+def test_the_sources_of_odometry_are_all_poses_and_the_transforms() -> None:
+    """Which of them it is shows when they are read (test_odometry_choice.py)."""
+    moving = [topic(name, "tf", count, "tf2_msgs/msg/TFMessage") for name, count in (("/tf", 50), ("/arm/tf", 9))]
     static = topic("/tf_static", "tf_static", 1, "tf2_msgs/msg/TFMessage")
-    pose = topic("/pose", "odometry", 5, "geometry_msgs/msg/PoseStamped")
-    assert pick(moving, static)["odometry"] == "/tf"
-    assert pick(moving, static, pose)["odometry"] == "/pose"
-    assert pick(moving, static, pose, odometry="/tf")["odometry"] == "/tf"
-    assert pick(moving, static, odometry="")["odometry"] is None
-    topics = TopicChoice()
-    assert select([moving, static, pose], topics, "a").tf == ()
-    assert select([moving, pose], topics, "a").tf == (moving.channel,)  # the only place where static ones can be
+    poses = topic("/b", "odometry", 9), topic("/a", "odometry", 99), topic("/empty", "odometry", 0)
 
+    def sources(*found: Candidate, **choice: str) -> list[str]:
+        chosen = select(list(found), TopicChoice.model_validate(choice), "run.mcap")
+        assert chosen == select(list(reversed(found)), TopicChoice.model_validate(choice), "run.mcap")
+        return [source.topic for source in chosen.sources]
 
-def test_odometry_by_type_then_count_then_name() -> None:
-    pose = topic("/a", "odometry", 99, "geometry_msgs/msg/PoseStamped")
-    with_covariance = topic("/b", "odometry", 9, "geometry_msgs/msg/PoseWithCovarianceStamped")
-    odometry = [topic(name, "odometry", 5, "nav_msgs/msg/Odometry") for name in ("/z", "/y")]
-    assert pick(pose, with_covariance, *odometry)["odometry"] == "/y"
-    assert pick(pose, with_covariance)["odometry"] == "/b"
+    assert sources(*moving, static, *poses) == ["/a", "/b", "/tf"]
+    assert sources(*moving, static, *poses, odometry="/tf") == ["/tf"]
+    assert sources(*moving, static, *poses, odometry="") == []
+    topics = TopicChoice(odometry="/a")
+    assert select([*moving, static, *poses], topics, "a").tf == ()
+    assert [c.topic for c in select([*moving, *poses], topics, "a").tf] == [
+        "/tf",
+        "/arm/tf",
+    ]  # static ones may be there
+    chosen = select([*moving, static, *poses], TopicChoice(), "a")
+    assert chosen.with_odometry(chosen.sources[0]).tf == ()
+    assert len(chosen.with_odometry(moving[0].channel).tf) == 2
 
 
 def test_choice_overrides_and_empty_means_none() -> None:
     found = (topic("/a", "odometry", 5), topic("/b", "odometry", 9), topic("/c"), topic("/d", "depth"))
-    assert pick(*found)["odometry"] == "/b"
     assert pick(*found, odometry="/a")["odometry"] == "/a"
     assert pick(*found, odometry="", depth="")["odometry"] is None
     assert pick(*found, image="/d")["image"] == "/d"  # 16 bits of grey look like depth; who asks gets it

@@ -8,6 +8,7 @@ from vplog import geometry
 from vplog.data import Odometry
 from vplog.errors import LogError
 from vplog.logs.calibration_file import camera_for, read_calibrations
+from vplog.logs.continuity import without_jumps
 from vplog.tum import read_tum
 
 if TYPE_CHECKING:
@@ -25,7 +26,8 @@ class Beside:
         self.odometry: Odometry | None = None
         """None without a file."""
         if choice.odometry_file is not None:
-            self.odometry = Odometry(*read_tum(choice.odometry_file, LogError, "--odometry-file"), None)
+            logged = Odometry(*read_tum(choice.odometry_file, LogError, "--odometry-file"), None)
+            self.odometry = without_jumps(logged, choice.odometry_file.name, notes)
             notes.add(f"{choice.odometry_file.name} carries no covariance; the noise of its motion is a guess.")
         self._path = choice.calibration_file
         self._cameras = [] if self._path is None else read_calibrations(self._path)

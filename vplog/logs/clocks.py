@@ -2,7 +2,8 @@
 
 A header stamp says when something was measured, and aligns topics; but clocks are set while a drive runs, simulations
 start again at zero, and single stamps are damaged. The log time is late by the transport but steady, so it is the
-check: between two messages of a topic both should advance alike.
+check: between two messages of a topic both should advance alike. A clock that is set back shows by itself: it passes
+the same time twice, so that messages lie twice as close there, which those that only come out of order do not.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ _PERIODS = 10
 """A jump is also longer than so many periods of the topic: slow topics may be late by one."""
 _LEAST_RUN = 5
 """Messages of one clock in a row; fewer are damaged stamps, not a clock that was set."""
+_STEP_PERIODS = 3
+"""A step back is at least so many periods of the topic: less is within what messages come out of order by."""
+_LEVEL = 30
+"""Messages before and behind a step by which the skew is known: a burst is over by then."""
+_TWICE = 1.5
+"""Messages of a time that was passed twice, against those of one that was passed once: between 1 and 2."""
 _MOST_CLOCKS = 20
 """A clock is set a few times in a drive; what jumps to more values than these is none."""
 
@@ -54,26 +61,65 @@ class Repaired:
     """Messages by the skew of the clock that they came on."""
 
 
-def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
+def steps_back(times_ns: Ints, *others: np.ndarray) -> tuple[Ints, Ints]:
+    """Rows of times (M,) in the order of receipt before which their clock was set back, and by how many ns.
+
+    `others` (M,) tell messages apart: what comes again with the same time and the same others was written twice.
+    """
+    step = np.diff(times_ns)
+    period = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+    rows = np.flatnonzero(-step >= (_STEP_PERIODS - 1) * period) + 1 if period else np.zeros(0, np.int64)
+    rows = rows[(rows >= _LEAST_RUN) & (rows <= len(times_ns) - _LEAST_RUN)]
+    if not len(rows):
+        return rows, rows
+    each = np.unique(np.stack([times_ns, *(other.view(np.int64) for other in others)]), axis=1)[0]
+    size = times_ns[rows - 1] - times_ns[rows] + int(period)
+    found = np.searchsorted(each, times_ns[rows - 1], "right") - np.searchsorted(each, times_ns[rows], "left")
+    around = rows[:, None] + np.arange(-_LEAST_RUN, _LEAST_RUN)
+    before, behind = np.split(times_ns[around], 2, axis=1)
+    advance = np.median(behind, axis=1) - np.median(before, axis=1)
+    stays = advance < _LEAST_RUN * period - size / 2  # a message that is late alone leaves the median
+    told = stays & (found > _TWICE * size / period)
+    return rows[told], size[told]
+
+
+def header_steps_back(header_ns: Ints, log_ns: Ints) -> Ints:
+    """By how many ns the clock of header stamps (M,) was set back each time: the skew to the log times stays higher by
+    as much, and by more than it varies, which a network that delivers in bursts does not bring about."""
+    skew, found = log_ns - header_ns, []
+    for row, size in zip(*(part.tolist() for part in steps_back(header_ns, log_ns)), strict=True):
+        windows = skew[max(row - _LEVEL, 0) : row], skew[row : row + _LEVEL]
+        low, level, high = np.transpose([np.quantile(window, (0.1, 0.5, 0.9)) for window in windows])
+        if abs(level[1] - level[0] - size) < size / 2 and (high - low).max() < size / 2:
+            found.append(size)
+    return np.array(found, np.int64)
+
+
+def on_one_clock(
+    header_ns: Ints, log_ns: Ints, reference_ns: int | None = None, step_ns: int | None = None
+) -> Repaired | None:
     """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1.
 
     Where there are several clocks, `reference_ns` is the skew of the one to end on, that of most messages of all
-    topics; None takes that of most of these.
+    topics; None takes that of most of these. `step_ns` is the least step back that some clock of the log was set by.
     """
     step, log_step = np.diff(header_ns), np.diff(log_ns)
     period = float(np.median(np.minimum(np.abs(step), np.abs(log_step)))) if len(step) else 0.0
-    limit = max(LEAST_JUMP_NS, _PERIODS * period)
+    limit = max(LEAST_JUMP_NS, _PERIODS * period) if step_ns is None else step_ns / 2
     apart = np.abs(step - log_step) > limit
     steady, log_steady = np.abs(step) <= limit, np.abs(log_step) <= limit
     bounds = [0, *(np.flatnonzero(apart & log_steady & ~steady) + 1).tolist(), len(header_ns)]
     least = min(_LEAST_RUN, max(b - a for a, b in pairwise(bounds)))
-    runs = [slice(a, b) for a, b in pairwise(bounds) if b - a >= least]
+    runs = [slice(a, b) for a, b in pairwise(bounds)]
     skews = [int(np.median(log_ns[run] - header_ns[run])) for run in runs]
     counts: dict[int, int] = {}
-    clocks = []
-    for run, skew in zip(runs, skews, strict=True):  # a stray stamp parts one clock's run in two
+    clocks: list[int] = []
+    long = [
+        (run.stop - run.start, skew) for run, skew in zip(runs, skews, strict=True) if run.stop - run.start >= least
+    ]
+    for count, skew in long:  # a stray stamp parts one clock's run in two
         clocks.append(next((known for known in counts if abs(known - skew) <= limit), skew))
-        counts[clocks[-1]] = counts.get(clocks[-1], 0) + run.stop - run.start
+        counts[clocks[-1]] = counts.get(clocks[-1], 0) + count
         if len(counts) > _MOST_CLOCKS:
             return None
     chosen = max(counts, key=lambda skew: (counts[skew], -skew))
@@ -81,8 +127,11 @@ def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None)
         near = min(counts, key=lambda skew: (abs(skew - reference_ns), skew))
         chosen = near if abs(near - reference_ns) <= limit else reference_ns
     stamp_ns, kept = header_ns.copy(), np.zeros(len(header_ns), bool)
-    for run, skew, clock in zip(runs, skews, clocks, strict=True):
-        shift = 0 if clock == chosen else skew - chosen
+    for run, skew in zip(runs, skews, strict=True):
+        clock = min(counts, key=lambda known: (abs(known - skew), known))
+        if abs(clock - skew) > limit:  # too short to be a clock, and on none
+            continue
+        shift = 0 if clock == chosen else (skew if run.stop - run.start >= least else clock) - chosen
         shifted = [int(header_ns[run].min()) + shift, int(header_ns[run].max()) + shift]
         kept[run] = min(shifted) >= 0 and max(shifted) < 2**63
         if shift and kept[run.start]:

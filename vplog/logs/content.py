@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.logs.containers import plural
+from vplog.logs.continuity import without_jumps
 from vplog.logs.gather import Calibrations, Gathered, Images
 from vplog.logs.moving import MovingFrames
+from vplog.logs.odometry_sources import choose_odometry, read_odometry, weigh_sources
 from vplog.logs.stamps import nearest, share_clock
 from vplog.logs.tracks import FixTrack, PoseTrack
 from vplog.logs.transforms import FrameTree
 
 if TYPE_CHECKING:
-    from vplog.data import Gps, Ints, Odometry
-    from vplog.logs.containers import Container, Notes, Place
+    from vplog.data import Gps, Ints, Odometry, OdometrySource
+    from vplog.logs.containers import Channel, Container, Notes, Place
     from vplog.logs.messages import CalibrationMessage
     from vplog.logs.select import Selection
 
@@ -48,6 +50,12 @@ class Content:
     tree: FrameTree
     skew_ms: dict[str, float]
     """By topic: log time less header stamp, the median."""
+    chosen: Selection
+    """With the source that the odometry was taken from."""
+    sources: list[OdometrySource]
+    """Those that could be the odometry, the best first."""
+    rates_hz: dict[Channel, float | None]
+    """By topic that was read: messages a second."""
 
     @property
     def body(self) -> str:
@@ -67,20 +75,25 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         Images(chosen.right),
         Calibrations(chosen.camera_info),
         Calibrations(chosen.right_info),
-        PoseTrack(chosen.odometry.topic) if chosen.odometry and chosen.odometry not in chosen.tf else None,
+        {source: PoseTrack(source.topic) for source in chosen.sources if source not in chosen.tf},
         FixTrack(chosen.gps.topic) if chosen.gps else None,
-        odometry=chosen.odometry,
         tf=chosen.tf,
-        moving=MovingFrames(keep=chosen.odometry in chosen.tf),
+        moving=MovingFrames(keep=any(source in chosen.tf for source in chosen.sources)),
     )
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
     for block in container.blocks(chosen.channels, stamped):
         read.take_block(block)
     read.finish_poses()
+    read.find_steps_back(notes)
+    sources = weigh_sources(read, chosen)
+    rates_hz = read.rates_hz()
+    chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
+    read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
-        notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
+        if topic in {channel.topic for channel in chosen.channels}:
+            notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
     share_clock(read.stamps())
-    tree = FrameTree([*read.moving.still(), *read.transforms])
+    tree = FrameTree([*(read.moving.still() if chosen.tf else ()), *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images.finish(notes)
@@ -95,10 +108,9 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         late_ns = np.abs(other_ns[np.array(pairs, np.int64)[found]] - stamp_ns[found])
         if name == "right" and len(found) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
             notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; motion spoils depth.")
-    odometry = read.poses.finish(notes) if read.poses else None
-    frames = [read.poses.parent, read.poses.child] if read.poses else []
-    if chosen.odometry in chosen.tf and chosen.odometry is not None:
-        odometry, frames = read.moving.odometry(tree, chosen.odometry.topic, notes)
+    odometry, frames = read_odometry(read, chosen.odometry, tree, notes)
+    if odometry is not None and chosen.odometry is not None:
+        odometry = without_jumps(odometry, chosen.odometry.topic, notes)
     body = frames[-1] if frames else ""
     gps = read.fixes.finish(notes) if read.fixes else None
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
@@ -107,5 +119,5 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
     right_calibration = next(iter(read.right_calibrations.finish(notes)), None)
     return Content(
         stamp_ns, places, read.images.stream, rows, paired[0], paired[1], calibrations, right_calibration,
-        odometry, frames, gps, tree, read.skew_ms(),
+        odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,
     )  # fmt: skip

@@ -22,7 +22,7 @@ from vplog.logs.messages import (
 )
 from vplog.logs.moving import MovingFrames
 from vplog.logs.odometry_message import read_poses
-from vplog.logs.stamps import NONE, Stamps
+from vplog.logs.stamps import NONE, Stamps, find_steps_back
 
 if TYPE_CHECKING:
     from vplog.data import Ints
@@ -137,15 +137,16 @@ class Gathered:
     rights: Images
     calibrations: Calibrations
     right_calibrations: Calibrations
-    poses: PoseTrack | None
+    poses: dict[Channel, PoseTrack]
+    """Of every topic that may be the odometry."""
     fixes: FixTrack | None
     transforms: list[TransformMessage] = field(default_factory=list)
     lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
     """By reason and topic."""
-    odometry: Channel | None = None
-    waiting: list[bytes] = field(default_factory=list)
+    waiting: dict[Channel, tuple[list[bytes], list[int]]] = field(default_factory=dict)
     """Messages of odometry that are still to be added, and their log times."""
-    waiting_ns: list[int] = field(default_factory=list)
+    others: dict[Channel, Stamps] = field(default_factory=dict)
+    """Log times of the topics that are not followed over time."""
     tf: tuple[Channel, ...] = ()
     moving: MovingFrames = field(default_factory=lambda: MovingFrames(keep=False))
 
@@ -164,27 +165,32 @@ class Gathered:
         for channel, mine in rows.items():
             if (images := self.by_channel.get(channel)) and images.add_block(block, mine):
                 self._sound(channel.topic)
-            elif channel == self.odometry and self.poses:
-                self.waiting += [bytes(block.data[block.starts[row] : block.stops[row]]) for row in mine]
-                self.waiting_ns += [block.log_ns[row] for row in mine]
-            elif known := self.calibrations_of(channel):
-                others += [row for row in mine if not known.repeats(view[block.starts[row] : block.stops[row]])]
+            elif channel in self.poses:
+                data, log_ns = self.waiting.setdefault(channel, ([], []))
+                data += [bytes(block.data[block.starts[row] : block.stops[row]]) for row in mine]
+                log_ns += [block.log_ns[row] for row in mine]
+                if len(data) >= _TOGETHER:
+                    self._add_poses(channel)
             else:
-                others += mine
+                self.others.setdefault(channel, Stamps()).extend([0] * len(mine), [block.log_ns[row] for row in mine])
+                known = self.calibrations_of(channel)
+                others += [
+                    row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
+                ]
         for row in sorted(others):
             self.take(block.message(row))
-        if len(self.waiting) >= _TOGETHER:
-            self.finish_poses()
 
     def finish_poses(self) -> None:
-        """Add the messages of odometry that wait: at once where each is a pose, else one by one."""
-        channel, data, log_ns = self.odometry, self.waiting, self.waiting_ns
-        self.waiting, self.waiting_ns = [], []
-        if channel is None or self.poses is None or not data:
-            return
+        """Add the messages of odometry that wait."""
+        for channel in list(self.waiting):
+            self._add_poses(channel)
+
+    def _add_poses(self, channel: Channel) -> None:
+        """Add those of one topic: at once where each is a pose, else one by one."""
+        data, log_ns = self.waiting.pop(channel)
         found = read_poses(channel, data)
         if found is not None:
-            self.poses.add_all(found, log_ns)
+            self.poses[channel].add_all(found, log_ns)
             self._sound(channel.topic)
         else:
             for one, time_ns in zip(data, log_ns, strict=True):
@@ -213,13 +219,24 @@ class Gathered:
     def stamps(self) -> list[Stamps]:
         """Of every topic that is followed over time."""
         images = [one.stamps for one in (self.images, self.depths, self.rights) if one.channel]
-        return images + [one.stamps for one in (self.poses, self.fixes) if one]
+        return images + [one.stamps for one in (*self.poses.values(), self.fixes) if one]
+
+    def find_steps_back(self, notes: Notes) -> None:
+        """Undo steps back of the recorder's clock, which all topics share, and find those of the headers'."""
+        for track in self.poses.values():
+            track.tell_apart()
+        find_steps_back([*self.stamps(), *self.others.values(), *self.moving.stamps()], notes)
 
     def skew_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
         timed = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
-        timed += [(one.topic, one.stamps) for one in (self.poses, self.fixes) if one]
+        timed += [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one]
         return {topic: clock.skew_ns / 1e6 for topic, stamps in timed if (clock := stamps.clock())}
+
+    def rates_hz(self) -> dict[Channel, float | None]:
+        """Messages a second of each topic that was read, by its own times."""
+        found = {channel: one.stamps for channel, one in (*self.by_channel.items(), *self.poses.items())}
+        return {channel: stamps.rate_hz() for channel, stamps in (*found.items(), *self.others.items())}
 
     def add(self, message: Message) -> None:
         """Raises BadMessageError."""
@@ -230,8 +247,8 @@ class Gathered:
         match decode(channel, message.data):
             case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
                 known.add(calibration, message.data)
-            case PoseMessage() as pose if self.poses:
-                self.poses.add(pose, message.log_ns)
+            case PoseMessage() as pose if channel in self.poses:
+                self.poses[channel].add(pose, message.log_ns)
             case FixMessage() as fix if self.fixes:
                 self.fixes.add(fix, message.log_ns)
             case list() as transforms if channel in self.tf:

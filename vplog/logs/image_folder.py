@@ -17,7 +17,7 @@ from vplog.logs.frames import affine_to_camera, warped
 from vplog.logs.image_groups import of_one_camera
 from vplog.logs.images import drive_levels, grey, spread
 from vplog.logs.messages import BadMessageError, ImageMessage
-from vplog.logs.stamps import increasing, rows_of
+from vplog.logs.stamps import increasing, rate_hz, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -135,7 +135,7 @@ class ImageFolder:
     def info(self) -> LogInfo:
         count = len(self._files)
         kind = self._files[0].suffix.lstrip(".").lower()
-        topic = Topic(self.name, "image", kind, count, "image", True, "image", kind)
+        topic = Topic(self.name, "image", kind, count, "image", True, "image", kind, rate_hz=rate_hz(self._stamp_ns))
         start_ns, end_ns = int(self._stamp_ns[0]), int(self._stamp_ns[-1])
         return LogInfo(str(self._path), "images", start_ns, end_ns, count, [topic], self.warnings)
 

@@ -26,9 +26,6 @@ _BODIES = ("base_link", "base_footprint")
 """Names of the body, ROS REP 105 and 120, in order of preference."""
 _ROOTS = ("odom", "map", "world")
 """Names of frames that stand still (ROS REP 105): odom first, whose poses do not jump."""
-_DEEPEST = 100
-"""Links of the longest chain that is followed: real trees have ten, and damage may close a circle."""
-
 Edge = tuple[str, str]
 """Parent and child."""
 
@@ -41,6 +38,8 @@ class _Link:
     times_ns: list[tuple[int, int]] = field(default_factory=list)
     """Stamp and log time of the first and the last sample before it moved."""
     moves: bool = False
+    travels: bool = False
+    """Its position changes, not its rotation alone."""
     stamps: Stamps = field(default_factory=Stamps)
     values: array[float] = field(default_factory=lambda: array("d"))
     """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
@@ -73,7 +72,8 @@ class MovingFrames:
             link = self._links.get(edge)
             if link is None:
                 link = self._links[edge] = _Link(transform)
-            link.moves = link.moves or _differ(link.first, transform)
+            link.travels = link.travels or not np.array_equal(link.first.position, transform.position)
+            link.moves = link.travels or link.moves or not np.array_equal(link.first.quaternion, transform.quaternion)
             if self._keep:
                 link.keep(transform, (transform.stamp_ns, log_ns))
 
@@ -81,12 +81,16 @@ class MovingFrames:
         """Transforms that were the same whenever they were sent."""
         return [link.first for _, link in sorted(self._links.items()) if not link.moves]
 
+    def stamps(self) -> list[Stamps]:
+        """Of every link that is followed over time."""
+        return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
+
     def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:
         """The poses of the body in the frame that stands still, and the frames from there down to the body.
 
         None and no frames where no chain moves.
         """
-        chain = self._chain(tree)
+        chain = self._chain(tree, topic, notes)
         moving = [edge for edge in chain if edge in self._links and self._links[edge].moves]
         if not moving:
             return None, []
@@ -112,25 +116,33 @@ class MovingFrames:
         notes.add(f"Odometry is {names} of {topic}, which carries no covariance; the noise of its motion is a guess.")
         return Odometry(at_ns, poses, None), frames
 
-    def _chain(self, tree: FrameTree) -> list[Edge]:
-        """Edges from the frame that stands still down to the body; empty where nothing moves."""
+    def _chain(self, tree: FrameTree, topic: str, notes: Notes) -> list[Edge]:
+        """Edges from the frame that stands still down to the body; empty where nothing moves but joints."""
+        edges = [*tree.edges, *sorted(self._links)]
         moving = {edge for edge, link in self._links.items() if link.moves}
-        parents = {child: parent for parent, child in (*tree.edges, *sorted(self._links))}
-        up = {body: _upwards(body, parents) for body in (*_BODIES, *sorted(child for _, child in moving))}
-        named = [body for body in _BODIES if moving.intersection(up[body])]
-        body = named[0] if named else self._unnamed(moving, up)
+        by_root = sorted(edges, key=lambda edge: -_ROOTS.index(_name(edge[0])) if _name(edge[0]) in _ROOTS else -9)
+        parents = {child: parent for parent, child in by_root}  # of several parents the root that does not jump
+        up = {frame: _upwards(frame, parents) for edge in edges for frame in edge}
+        bodies = [body for name in _BODIES for body in sorted(up) if _name(body) == name]
+        body = next((body for body in bodies if moving.intersection(up[body])), None)
+        if body is None:
+            body = "" if bodies else self._unnamed(moving, up)  # on a body that stands, only its parts move
         chain = up.get(body, [])[::-1]
         for root in _ROOTS:
-            below = [i for i, (parent, _) in enumerate(chain) if parent == root]
+            below = [i for i, (parent, _) in enumerate(chain) if _name(parent) == root]
             if below and moving.intersection(chain[below[0] :]):
                 return chain[below[0] :]
+        if chain and chain[0][0] in parents:
+            notes.add(f"{topic}: the transforms above {body} run in a circle without odom, map or world; not odometry.")
+            return []
         return chain
 
     def _unnamed(self, moving: set[Edge], up: dict[str, list[Edge]]) -> str:
-        """The body of a log that names none: what moves in a frame that stands still, with the fewest links between
-        (an arm moves on the body), then the most samples, then the name."""
-        children = [child for _, child in sorted(moving) if child not in _ROOTS]
-        rooted = [child for child in children if any(parent in _ROOTS for parent, _ in up[child])] or children
+        """The body of a log that names none: what travels in a frame that stands still, with the fewest links between
+        (an arm moves on the body), then the most samples, then the name. Joints turn about one point."""
+        travels = [edge for edge in sorted(moving) if self._links[edge].travels]
+        children = [child for _, child in travels if _name(child) not in _ROOTS]
+        rooted = [child for child in children if any(_name(parent) in _ROOTS for parent, _ in up[child])] or children
         samples = {child: len(self._links[parent, child].values) for parent, child in moving}
         return min(rooted, key=lambda c: (len(moving.intersection(up[c])), -samples[c], c), default="")
 
@@ -146,13 +158,16 @@ class MovingFrames:
 
 
 def _upwards(frame: str, parents: dict[str, str]) -> list[Edge]:
-    """Edges from a frame to the top of its tree."""
+    """Edges from a frame to the top of its tree; in a circle, up to the frame that comes twice."""
     result: list[Edge] = []
-    while frame in parents and len(result) < _DEEPEST:
+    passed = {frame}
+    while frame in parents and parents[frame] not in passed:
         result.append((parents[frame], frame))
         frame = parents[frame]
+        passed.add(frame)
     return result
 
 
-def _differ(a: TransformMessage, b: TransformMessage) -> bool:
-    return not (np.array_equal(a.position, b.position) and np.array_equal(a.quaternion, b.quaternion))
+def _name(frame: str) -> str:
+    """A frame's name without its namespace: `robot1/odom` is an odom."""
+    return frame.rsplit("/", 1)[-1]

@@ -68,8 +68,8 @@ class RecordedLog:
 
     def info(self) -> LogInfo:
         """Reads the chosen topics once, so that the warnings are complete."""
-        topics = [self._topic(channel, count) for channel, count in self._contents.counts.items()]
         content = self._content
+        topics = [self._topic(channel, count) for channel, count in self._contents.counts.items()]
         if self._selection.image is not None:
             self._check_images()
         stamps = [content.stamp_ns] + [track.stamp_ns for track in (content.odometry, content.gps) if track is not None]
@@ -79,18 +79,19 @@ class RecordedLog:
         messages = self._contents.messages
         frames = [frame for frame in content.frames if frame]
         return LogInfo(
-            str(self._path), self._kind, start_ns, end_ns, messages, topics, self.warnings, frames, content.skew_ms
-        )
+            str(self._path), self._kind, start_ns, end_ns, messages, topics, self.warnings, frames, content.skew_ms,
+            content.sources,
+        )  # fmt: skip
 
     def _topic(self, channel: Channel, count: int) -> Topic:
-        part = self._selection.parts.get(channel, "")
+        part, rate_hz = self._content.chosen.parts.get(channel, ""), self._content.rates_hz.get(channel)
         known = next((c for c in self._candidates if c.channel == channel), None)
         if known is None:
-            return Topic(channel.topic, channel.type, channel.encoding, count, "", bool(part), part)
+            return Topic(channel.topic, channel.type, channel.encoding, count, "", bool(part), part, rate_hz=rate_hz)
         calibrated = known.calibrated if known.role == "camera_info" else None
         return Topic(
             channel.topic, channel.type, channel.encoding, count, known.role, bool(part), part, known.encoding,
-            *known.size, known.frame, calibrated,
+            *known.size, known.frame, calibrated, rate_hz,
         )  # fmt: skip
 
     def camera(self) -> Camera:

@@ -11,14 +11,14 @@ other parts the first by these rules does, unless TopicChoice names another:
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
-- odometry: nav_msgs/Odometry first, then foxglove.Odometry, then types with a covariance, then other poses, then tf,
-  whose chain from its root to the body is taken; then most messages, then name;
+- odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
+  chain from its root to the body is taken;
 - gps: most messages, then name.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -82,10 +82,13 @@ class Selection:
     depth: Channel | None = None
     camera_info: Channel | None = None
     odometry: Channel | None = None
+    """As asked for, or as chosen among `sources` once these are read."""
+    sources: tuple[Channel, ...] = ()
+    """Topics that may be the odometry; the transforms over time are one source, named by the largest topic."""
     gps: Channel | None = None
     tf_static: tuple[Channel, ...] = ()
     tf: tuple[Channel, ...] = ()
-    """Transforms over time: read where odometry comes from them, or where no topic is of static ones alone."""
+    """Transforms over time: read where odometry may come from them, or where no topic is of static ones alone."""
     right: Channel | None = None
     right_info: Channel | None = None
 
@@ -99,7 +102,12 @@ class Selection:
 
     @property
     def channels(self) -> list[Channel]:
-        return list(self.parts)
+        return list(dict.fromkeys((*self.parts, *self.sources)))
+
+    def with_odometry(self, odometry: Channel | None) -> Selection:
+        """The selection once the source of odometry is known."""
+        tf = self.tf if odometry in self.tf or not self.tf_static else ()
+        return replace(self, odometry=odometry, sources=(), tf=tf)
 
 
 _NAMES = {
@@ -112,8 +120,6 @@ _NAMES = {
 }
 _ROLES = {"right": "image"}
 """What a topic of a part is taken for before parts are given out, where it is called otherwise."""
-_POSE_TYPES = ("nav_msgs/Odometry", "foxglove.Odometry", "geometry_msgs/PoseWithCovarianceStamped")
-"""Odometry types in order of preference; every other comes after."""
 _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"))
 """Words that tell the topics of a stereo pair apart: most drivers', RealSense's, and EuRoC's."""
 
@@ -173,19 +179,20 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         if choice.odometry:
             raise LogError(_two("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
         choice = choice.model_copy(update={"odometry": ""})
-    odometry = pick("odometry", lambda c: (_pose_rank(c), *by_size(c)), "tf")
+    asked = pick("odometry", by_size, "tf") if choice.odometry is not None else None
     moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=by_size)
-    if odometry is None and choice.odometry is None and moving:
-        odometry = moving[0]
+    sources = [asked] if asked else []
+    if choice.odometry is None:
+        sources = [*sorted((c for c in candidates if c.role == "odometry" and c.count), key=by_size), *moving[:1]]
     gps = pick("gps", by_size)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     parts = {
-        "image": image, "depth": depth, "camera_info": calibration, "odometry": odometry, "gps": gps,
+        "image": image, "depth": depth, "camera_info": calibration, "odometry": asked, "gps": gps,
         "right": right, "right_info": right_info,
     }  # fmt: skip
     found = {name: part.channel for name, part in parts.items() if part is not None}
-    tf = tuple(c.channel for c in moving) if not static or (odometry is not None and odometry.role == "tf") else ()
-    return Selection(**found, tf_static=static, tf=tf)
+    tf = tuple(c.channel for c in moving) if not static or any(c.role == "tf" for c in sources) else ()
+    return Selection(**found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf)
 
 
 def _partner(image: Candidate, candidates: list[Candidate], back: bool = False) -> Candidate | None:
@@ -222,11 +229,6 @@ def _shared(a: Candidate, b: Candidate) -> int:
     """Levels of the namespace that two topics have in common, their own names left out."""
     x, y = (c.channel.topic.strip("/").split("/")[:-1] for c in (a, b))
     return next((i for i, (p, q) in enumerate(zip(x, y, strict=False)) if p != q), min(len(x), len(y)))
-
-
-def _pose_rank(candidate: Candidate) -> int:
-    kind = candidate.channel.type.replace("/msg/", "/")
-    return _POSE_TYPES.index(kind) if kind in _POSE_TYPES else len(_POSE_TYPES)
 
 
 def _two(what: str, topic: str, file: Path, option: str) -> str:

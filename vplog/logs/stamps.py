@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import LEAST_JUMP_NS, Clock, on_one_clock
-from vplog.logs.containers import plural
+from vplog.logs.clocks import LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
+from vplog.logs.containers import Notes, plural
 from vplog.logs.losses import runs_of
 
 if TYPE_CHECKING:
@@ -18,11 +18,15 @@ if TYPE_CHECKING:
 
     from vplog.data import Ints
     from vplog.logs.clocks import Repaired
-    from vplog.logs.containers import Notes
 
 NONE: Ints = np.zeros(0, np.int64)
 _LAST_NS = 2**63 - 1
 """Log times are unsigned; what is beyond this, year 2262, is damage."""
+_SECOND_NS = 10**9
+_COARSE_NS = 3 * 10**8
+"""ns by which the delay of stamps in whole seconds varies at least where they are not taken on the second."""
+_MOST_STEPS = 20
+"""Steps back of the recorder's clock that are undone; it is set a few times in a drive."""
 _STANDING = 10
 """A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
 _LATE_NS = 2 * 10**9
@@ -30,6 +34,8 @@ _LATE_NS = 2 * 10**9
 _GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
+_FASTEST_HZ = 1e6
+"""Hz; stamps that are less than a microsecond apart are counters, not times."""
 _NAMED = 4
 """Jumps of a clock that are named."""
 
@@ -45,8 +51,12 @@ class Stamps:
     header_ns: array[int] = field(default_factory=_numbers)
     log_ns: array[int] = field(default_factory=_numbers)
 
+    content: array[float] = field(default_factory=lambda: array("d"))
+    """A number of each message's content, where that is known: it tells a message from one that was written twice."""
     common: Clock | None = None
     """The clock that all topics of the log are to be on, where that is known."""
+    step_ns: int | None = None
+    """The least step that a clock of the log was set back by; None where none was."""
     _found: tuple[int, Repaired | None] | None = None
     """The one clock of so many messages."""
 
@@ -66,6 +76,28 @@ class Stamps:
         kept = found.stamp_ns[found.kept]
         return Clock(found.skew_ns, int(kept.min()), int(kept.max()))
 
+    def rate_hz(self) -> float | None:
+        """Messages a second between the first and the last; None where there is no such time."""
+        ordered_ns, _ = self.order("", Notes())
+        return rate_hz(ordered_ns)
+
+    def header_steps(self) -> Ints:
+        """Sizes in ns of the steps back of the header's clock."""
+        header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
+        set_ = header_ns != 0
+        return header_steps_back(header_ns[set_], log_ns[set_])
+
+    def shift(self, last_ns: int, period_ns: int, size_ns: int) -> None:
+        """Shift the log times from where the recorder's clock was set back, behind `last_ns`, on by `size_ns`."""
+        log_ns = np.array(self.log_ns, np.int64)
+        step = np.diff(log_ns)
+        near = 3 * max(period_ns, int(np.median(np.abs(step))) if len(step) else 0)
+        back = np.flatnonzero((step < 0) & (np.abs(log_ns[:-1] - last_ns) <= near))
+        row = int(back[np.argmin(step[back])]) + 1 if len(back) else int(np.argmax(log_ns > last_ns))
+        if len(back) or log_ns[row] > last_ns:
+            log_ns[row:] = np.minimum(log_ns[row:], _LAST_NS - size_ns) + size_ns
+            self.log_ns, self._found = array("q", log_ns.tolist()), None
+
     def clocks(self) -> dict[int, int]:
         """Messages by the skew of the clock that they came on; several where it was set."""
         found = self._on_one_clock()
@@ -76,7 +108,8 @@ class Stamps:
         if self._found is None or self._found[0] != len(self.log_ns):
             header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
             log_ns, header_ns = log_ns[header_ns != 0], header_ns[header_ns != 0]
-            self._found = len(self.log_ns), on_one_clock(header_ns, log_ns) if len(header_ns) else None
+            found = on_one_clock(header_ns, log_ns, None, self.step_ns) if len(header_ns) else None
+            self._found = len(self.log_ns), found
         return self._found[1]
 
     def order(self, topic: str, notes: Notes) -> tuple[Ints, Ints]:
@@ -91,13 +124,14 @@ class Stamps:
         if not len(header_ns):
             return NONE, NONE
         if 2 * len(rows) < len(header_ns):
-            return self._by_log_times(topic, notes, log_ns, "has no header stamps")
+            return self.by_log_times(topic, notes, "has no header stamps")
         _lose("no_stamp", topic, header_ns == 0, log_ns, notes)
-        if len(np.unique(header_ns[rows])) * _STANDING < len(rows):
-            return self._by_log_times(topic, notes, log_ns, "has header stamps that do not advance")
-        found = on_one_clock(header_ns[rows], log_ns[rows], self.common.skew_ns if self.common else None)
+        if why := _no_clock(header_ns[rows], log_ns[rows]):
+            return self.by_log_times(topic, notes, why)
+        common_ns = self.common.skew_ns if self.common else None
+        found = on_one_clock(header_ns[rows], log_ns[rows], common_ns, self.step_ns)
         if found is None:
-            return self._by_log_times(topic, notes, log_ns, "has header stamps that follow no clock")
+            return self.by_log_times(topic, notes, "has header stamps that follow no clock")
         if found.jumps_ns:
             steps = ", ".join(f"{jump / 1e9:+.3f} s" for jump in found.jumps_ns[:_NAMED])
             steps += f" and {len(found.jumps_ns) - _NAMED} times more" if len(found.jumps_ns) > _NAMED else ""
@@ -110,9 +144,70 @@ class Stamps:
         stamp_ns = _on_common(stamp_ns, found.skew_ns, self.common, topic, notes)
         return _in_order(topic, notes, stamp_ns, rows, log_ns)
 
-    def _by_log_times(self, topic: str, notes: Notes, log_ns: Ints, why: str) -> tuple[Ints, Ints]:
+    def by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
+        """The same by the log times alone, whatever the header stamps are."""
+        log_ns = np.array(self.log_ns, np.int64)
         notes.add(f"{topic} {why}; its log times are used instead.")
         return _in_order(topic, notes, log_ns, np.arange(len(log_ns)), log_ns)
+
+
+def rate_hz(stamp_ns: Ints) -> float | None:
+    """Messages a second of (T,) increasing stamps; None where they span no time, or none that a sensor would."""
+    span_ns = int(stamp_ns[-1]) - int(stamp_ns[0]) if len(stamp_ns) else 0
+    rate = (len(stamp_ns) - 1) * 1e9 / span_ns if span_ns else None
+    return round(rate, 3) if rate is not None and rate < _FASTEST_HZ else None
+
+
+def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
+    """Why header stamps are no times, as it follows the topic's name; empty where they may be."""
+    if len(np.unique(header_ns)) * _STANDING < len(header_ns):
+        return "has header stamps that do not advance"
+    steps = np.diff(header_ns[np.argsort(log_ns, kind="stable")])
+    if len(steps) >= _STANDING and 2 * int((steps < 0).sum()) > len(steps):
+        return "has header stamps that run backwards"
+    late_ns = log_ns - header_ns  # whole seconds are later by up to one; a receiver's on the second, by as much always
+    spread_ns = float(np.subtract(*np.quantile(late_ns, (0.9, 0.1))))
+    if len(steps) >= _STANDING and not (header_ns % _SECOND_NS).any() and _COARSE_NS < spread_ns < _SECOND_NS:
+        return "has header stamps in whole seconds"
+    return ""
+
+
+def find_steps_back(topics: Iterable[Stamps], notes: Notes) -> None:
+    """Undo each step back of the recorder's clock in all topics: what was received behind it is shifted on. Tell all
+    topics the least step back of a clock of the headers, which `order` undoes."""
+    topics = [one for one in topics if len(one.log_ns)]
+    _mend_log_times(topics, notes)
+    steps = [int(size) for one in topics for size in one.header_steps()]
+    for one in topics:
+        one.step_ns, one._found = min(steps, default=None), None
+
+
+def _mend_log_times(topics: list[Stamps], notes: Notes) -> None:
+    for _ in range(_MOST_STEPS):
+        found = [step for one in topics if (step := _first_step(one)) is not None]
+        if not found:
+            return
+        earliest = min(found)
+        last_ns = max(before for before, _, behind, _ in found if behind <= earliest[0])
+        period_ns, size_ns = min((period, size) for _, period, behind, size in found if behind <= earliest[0])
+        for one in topics:
+            one.shift(last_ns, period_ns, size_ns)
+        notes.add(
+            f"The recorder's clock was set back by {size_ns / 1e9:.3f} s; the log times from there on are shifted by "
+            "as much."
+        )
+
+
+def _first_step(one: Stamps) -> tuple[int, int, int, int] | None:
+    """Log time before the first step back, the period, log time behind the step, and its size; None where is none."""
+    log_ns, header_ns = np.array(one.log_ns, np.int64), np.array(one.header_ns, np.int64)
+    content = [np.array(one.content)] if len(one.content) == len(log_ns) else []
+    rows, sizes = steps_back(log_ns, header_ns, *content)
+    if not len(rows):
+        return None
+    row, size = int(rows[0]), int(sizes[0])
+    before, behind = int(log_ns[row - 1]), int(log_ns[row])
+    return before, size - (before - behind), behind, size
 
 
 def share_clock(topics: Iterable[Stamps]) -> None:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from array import array
-from itertools import compress
+from collections import Counter
+from itertools import compress, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog import geometry
 from vplog.data import Gps, Odometry
-from vplog.logs.containers import plural
+from vplog.geodesy import local_enu
+from vplog.logs.containers import Notes, plural
 from vplog.logs.stamps import Stamps
 from vplog.logs.transforms import are_usable, clean, is_usable
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.logs.containers import Notes
+    from vplog.data import Floats, Ints
     from vplog.logs.messages import FixMessage, PoseMessage
     from vplog.logs.odometry_message import Poses
 
@@ -27,8 +28,23 @@ _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UNKNOWN = [float("nan")] * 36
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
+_BACK_AND_FORTH = 1.5
+"""A path by header stamps that is so many times that by log times is out of order; one that is sorted rightly is
+shorter."""
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
+
+
+_NULL_ISLAND_DEG = 1e-6
+"""Degrees, 0.1 m: nobody drives that near to (0, 0), which lies in the Atlantic."""
+_HIGHEST_M = 1e5
+"""m; above it is space, so an altitude beyond is damage. As a sigma it lets an altitude say nothing."""
+_PLAIN_M = 3.0
+"""m; horizontal noise of a receiver under an open sky, as `gps.unknown_sigma_m`."""
+_FASTEST_M_S = 100.0
+"""m/s; what drives, walks or flies low is slower. Faster drives have their own speed as the measure:"""
+_TIMES_USUAL = 10.0
+"""times the median speed between fixes, beyond which they jump."""
 
 
 class PoseTrack:
@@ -43,7 +59,8 @@ class PoseTrack:
         """36 numbers of every pose, NaN where it has none."""
         self._bare = True
         """No pose has a covariance."""
-        self._dropped = 0
+        self._dropped = self._others = 0
+        """Poses that are unusable, and those of other bodies than the first."""
         self.child = ""
         """The frame that moves, as the first message names it."""
         self.parent = ""
@@ -52,7 +69,10 @@ class PoseTrack:
     def add(self, message: PoseMessage, log_ns: int) -> None:
         self.child = self.child or clean(message.child)
         self.parent = self.parent or clean(message.frame)
-        stamp_ns, _, _, position, quaternion, covariance = message
+        stamp_ns, _, child, position, quaternion, covariance = message
+        if clean(child) != self.child:
+            self._others += 1
+            return
         if not is_usable(*position, *quaternion):
             self._dropped += 1
             return
@@ -66,6 +86,9 @@ class PoseTrack:
         """The same of several messages that name the same frames."""
         self.child = self.child or clean(poses.child)
         self.parent = self.parent or clean(poses.frame)
+        if clean(poses.child) != self.child:
+            self._others += len(log_ns)
+            return
         usable = are_usable(poses.poses)
         self._dropped += int((~usable).sum())
         self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable.tolist())))
@@ -80,7 +103,9 @@ class PoseTrack:
         """The odometry, or None where no pose is usable."""
         if self._dropped:
             notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
-        stamp_ns, rows = self.stamps.order(self.topic, notes)
+        if self._others:
+            notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {self.child} left out.")
+        stamp_ns, rows = self._order(notes)
         if not len(rows):
             return None
         poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
@@ -100,6 +125,24 @@ class PoseTrack:
         why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
         notes.add(f"{self.topic} {why}; the noise of its motion is a guess.")
         return Odometry(stamp_ns, poses, None)
+
+    def tell_apart(self) -> None:
+        """Give the stamps a number of each pose, by which a pose that was written twice shows."""
+        self.stamps.content = array("d", np.frombuffer(self._poses).reshape(-1, 7)[:, :3].sum(1).tolist())
+
+    def _order(self, notes: Notes) -> tuple[Ints, Ints]:
+        """Stamps and rows; by the log times where the motion is continuous by them and not by the header stamps."""
+        position = np.frombuffer(self._poses).reshape(-1, 7)[:, :3]
+        _, by_header = self.stamps.order(self.topic, Notes())
+        if (np.diff(by_header) < 0).any():
+            _, by_log = self.stamps.by_log_times(self.topic, Notes(), "")
+            ways = [
+                float(np.linalg.norm(np.diff(position[rows], axis=0), axis=1).sum()) for rows in (by_header, by_log)
+            ]
+            if ways[0] > _BACK_AND_FORTH * ways[1]:
+                why = "has header stamps by which it moves back and forth"
+                return self.stamps.by_log_times(self.topic, notes, why)
+        return self.stamps.order(self.topic, notes)
 
 
 def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
@@ -129,31 +172,88 @@ class FixTrack:
         self._fixes: list[FixMessage] = []
         self.frame = ""
         """Of the antenna, by the first fix."""
-        self._dropped = 0
+        self._dropped: Counter[str] = Counter()
+        """Messages by why they are no fix."""
 
     def add(self, message: FixMessage, log_ns: int) -> None:
-        here = (message.latitude_deg, message.longitude_deg)
-        if not (message.valid and all(map(math.isfinite, here)) and abs(here[0]) <= 90 and abs(here[1]) <= 360):
-            self._dropped += 1
+        if why := _no_position(message):
+            self._dropped[why] += 1
             return
         self.frame = self.frame or message.frame
         self.stamps.add(message.stamp_ns, log_ns)
         self._fixes.append(message)
 
     def finish(self, notes: Notes) -> Gps | None:
-        """The fixes, or None where none is usable. Altitudes may be NaN."""
-        if self._dropped:
-            notes.add(f"{self.topic}: {plural(self._dropped, 'message')} without a fix dropped.")
+        """The fixes, or None where none is usable. Altitudes are known: where the log has none, those beside stand in,
+        with a variance that lets them say nothing."""
+        for why, count in sorted(self._dropped.items()):
+            notes.add(f"{self.topic}: {plural(count, 'message')} without a fix dropped: {why}.")
         stamp_ns, rows = self.stamps.order(self.topic, notes)
         if not len(rows):
             return None
         fixes = [self._fixes[row] for row in rows]
         covariance = np.array([fix.covariance for fix in fixes])
         covariance[~(covariance.any((1, 2)) & (np.abs(covariance) < _LARGEST).all((1, 2)))] = np.nan
-        return Gps(
-            stamp_ns,
-            np.array([fix.latitude_deg for fix in fixes], np.float64),
-            np.array([fix.longitude_deg for fix in fixes], np.float64),
-            np.array([fix.altitude_m for fix in fixes], np.float64),
-            covariance,
+        latitude, longitude, altitude = np.array(
+            [(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in fixes], np.float64
+        ).T
+        known = np.abs(altitude) < _HIGHEST_M
+        if not known.all():
+            missing = f"{int((~known).sum())} of {len(known)} fixes have no altitude"
+            notes.add(f"{self.topic}: {missing}; those beside, or 0 m, stand in and do not count.")
+            altitude = np.interp(stamp_ns, stamp_ns[known], altitude[known]) if known.any() else np.zeros(len(stamp_ns))
+            covariance[~known] = _without_altitude(covariance[~known])
+        gps = Gps(stamp_ns, latitude, longitude, altitude, covariance)
+        near = _reachable(gps)
+        if bool(near.all()):
+            return gps
+        notes.add(
+            f"{self.topic}: {int((~near).sum())} of {len(near)} fixes left out, which lie further from the others than "
+            "anything moves in the time between."
         )
+        return Gps(stamp_ns[near], latitude[near], longitude[near], altitude[near], covariance[near])
+
+
+def _no_position(fix: FixMessage) -> str:
+    """Why a message holds no position, as it follows `dropped:`; empty where it does."""
+    latitude, longitude = fix.latitude_deg, fix.longitude_deg
+    if not fix.valid:
+        return "its status is no fix"
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return "latitude or longitude is not a number"
+    if abs(latitude) < _NULL_ISLAND_DEG and abs(longitude) < _NULL_ISLAND_DEG:
+        return "it lies at (0, 0), which drivers write before they know"
+    if abs(latitude) > 90 and abs(latitude) <= 180 and abs(longitude) <= 90:
+        return "the latitude is beyond 90 degrees and the longitude is not; are the two swapped?"
+    if abs(latitude) > 90 or abs(longitude) > 360:
+        return "latitude or longitude is out of range"
+    return ""
+
+
+def _without_altitude(covariance: Floats) -> Floats:
+    """(K, 3, 3) with the horizontal part alone; where that is unknown, a plain receiver's."""
+    result = np.zeros_like(covariance)
+    plane = covariance[:, :2, :2]
+    known = np.asarray(np.isfinite(plane).all((1, 2)))
+    result[:, :2, :2] = np.where(known[:, None, None], plane, _PLAIN_M**2 * np.eye(2))
+    result[:, 2, 2] = _HIGHEST_M**2
+    return result
+
+
+def _reachable(gps: Gps) -> np.ndarray:
+    """(T,) bool: fixes of the longest run without a jump, and of those from where it can be reached."""
+    place, seconds = local_enu(gps).enu_m, gps.stamp_ns / 1e9
+    if len(place) < 2:
+        return np.ones(len(place), bool)
+    speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(seconds)
+    fastest = max(_FASTEST_M_S, _TIMES_USUAL * float(np.median(speed)))
+    bounds = [0, *(np.flatnonzero(speed > fastest) + 1).tolist(), len(place)]
+    runs = [(a, b - 1) for a, b in pairwise(bounds)]
+    first, last = main = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
+    reached = np.zeros(len(place), bool)
+    for a, b in [main, *(run for run in runs[::-1] if run < main), *(run for run in runs if run > main)]:
+        near, end = (b, first) if b < first else (a, last) if a > last else (a, a)
+        if np.linalg.norm(place[near] - place[end]) <= fastest * abs(seconds[near] - seconds[end]):
+            reached[a : b + 1] = True
+            first, last = min(first, a), max(last, b)
+    return reached

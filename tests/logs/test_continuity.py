@@ -1,0 +1,94 @@
+"""Jumps of odometry against drives that have none, and that have been given some."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vplog import geometry
+from vplog.data import Odometry
+from vplog.logs.containers import Notes
+from vplog.logs.continuity import find_jumps, without_jumps
+
+from .drives import START_NS, matrices, matrix
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def drive(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps and poses of something that speeds up, slows down, stands and turns, at any speed, rate and noise."""
+    rng = np.random.default_rng(seed)
+    count, rate_hz, fastest = int(rng.integers(60, 400)), rng.uniform(1, 100), 10 ** rng.uniform(-1, 1.5)
+    seconds = np.full(count, 1 / rate_hz) * rng.uniform(0.8, 1.2, count)
+    change = rng.normal(0, min(0.3 * fastest, 3.0), count) * np.sqrt(seconds)  # an acceleration that bodies have
+    speed = np.abs(np.cumsum(change)).clip(0, fastest) * (rng.random(count) < 0.98)
+    yaw = np.cumsum(rng.normal(0, 0.3, count) * seconds)
+    steps = (speed * seconds)[:, None] * np.stack([np.cos(yaw), np.sin(yaw), np.zeros(count)], 1)
+    position = np.cumsum(steps, axis=0) + rng.normal(0, 0.002, (count, 3))
+    poses = matrices(position, Rotation.from_rotvec(np.outer(yaw, [0, 0, 1])))
+    return START_NS + (np.cumsum(seconds) * 1e9).astype(np.int64), poses
+
+
+def path_m(poses: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+@given(seeds)
+def test_no_drive_without_a_jump_has_one(seed: int) -> None:
+    stamp_ns, poses = drive(seed)
+    odometry = without_jumps(Odometry(stamp_ns, poses, None), "/odom", notes := Notes())
+    assert notes.lines == []
+    np.testing.assert_array_equal(odometry.odom_from_body, poses)
+
+
+@given(seeds, st.integers(1, 3), st.booleans())
+def test_jumps_are_found_and_the_motion_continues(seed: int, times: int, resets: bool) -> None:
+    """Relocalisations by a multiple of what the drive moves in a second, or the pose set to zero."""
+    stamp_ns, true = drive(seed)
+    rng = np.random.default_rng([seed, 1])
+    rows = np.sort(rng.choice(np.arange(10, len(true) - 10, 8), times, replace=False))
+    poses = true.copy()
+    step_m = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).max())
+    for row in rows.tolist():
+        way = rng.normal(size=3)
+        shift = matrix(way / np.linalg.norm(way) * (200 + 100 * step_m), Rotation.from_rotvec(rng.normal(size=3) / 9))
+        behind = shift @ poses[row + 1 :]
+        poses[row + 1 :] = geometry.inverse(poses[row + 1]) @ poses[row + 1 :] if resets else behind
+    covariance = np.tile(np.eye(6), (len(true), 1, 1))
+    near = np.linalg.norm(poses[rows + 1, :3, 3] - poses[rows, :3, 3], axis=1) < 50 + 50 * step_m
+    if near.any():  # a reset close to zero is no jump that could be told
+        return
+    assert find_jumps(stamp_ns, poses).tolist() == rows.tolist()
+    odometry = without_jumps(Odometry(stamp_ns, poses, covariance), "/odom", notes := Notes())
+    assert odometry.covariance is not None
+    assert np.flatnonzero(np.isnan(odometry.covariance).any((1, 2))).tolist() == (rows + 1).tolist()
+    for first, stop in zip([0, *(rows + 1)], [*(rows + 1), len(true)], strict=True):  # every piece is as it was
+        part = slice(first, stop)
+        was, now = (geometry.between(poses[first], poses[part]) for poses in (true, odometry.odom_from_body))
+        np.testing.assert_allclose(now, was, atol=1e-6)
+    assert path_m(odometry.odom_from_body) <= path_m(true) + 3 * times * step_m
+    assert (
+        f"/odom: the poses jump by {np.linalg.norm(poses[rows[0] + 1, :3, 3] - poses[rows[0], :3, 3]):.1f} m"
+        in (notes.lines[0])
+    )
+
+
+@given(seeds, st.integers(1, 2))
+def test_stray_poses_are_left_out(seed: int, together: int) -> None:
+    stamp_ns, true = drive(seed)
+    rows = np.arange(20, len(true) - 20, 31)
+    stray = (rows[:, None] + np.arange(together)).ravel()
+    poses = true.copy()
+    poses[stray, :3, 3] += 500.0
+    odometry = without_jumps(Odometry(stamp_ns, poses, None), "/odom", notes := Notes())
+    np.testing.assert_array_equal(odometry.odom_from_body, np.delete(true, stray, axis=0))
+    assert f"{len(stray)} pose" in notes.lines[0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_poses_have_no_jumps(count: int) -> None:
+    poses = matrices(1e3 * np.random.default_rng(3).normal(size=(count, 3)), Rotation.identity(count))
+    assert not len(find_jumps(START_NS + 10**8 * np.arange(count), poses))

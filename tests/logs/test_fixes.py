@@ -1,0 +1,128 @@
+"""Messages of satellite receivers that hold no position, or one that cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vplog import geodesy, logs
+from vplog.logs.containers import Notes
+from vplog.logs.messages import FixMessage
+from vplog.logs.tracks import FixTrack
+
+from .drives import FRAMES, START_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros1, write_ros2
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Gps
+
+DEGREE_M = 111_000.0
+
+
+def track(fixes: list[FixMessage]) -> tuple[Gps | None, str]:
+    notes, found = Notes(), FixTrack("/fix")
+    for fix in fixes:
+        found.add(fix, fix.stamp_ns)
+    return found.finish(notes), " ".join(notes.lines)
+
+
+def drive(seed: int, count: int = 40) -> list[FixMessage]:
+    """Fixes at any rate of something at any place and speed below 50 m/s."""
+    rng = np.random.default_rng(seed)
+    latitude, longitude, hz = rng.uniform(-60, 60), rng.uniform(-170, 170), rng.uniform(0.5, 10)
+    east, north = np.cumsum(rng.uniform(-30, 50, (2, count)) / hz / DEGREE_M, axis=1)
+    return [
+        FixMessage(
+            START_NS + int(i / hz * 1e9), True, latitude + north[i], longitude + east[i] / 2, 500.0, np.eye(3), "gps"
+        )
+        for i in range(count)
+    ]
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seeds)
+def test_sound_fixes_are_all_taken(seed: int) -> None:
+    fixes = drive(seed)
+    gps, said = track(fixes)
+    assert gps is not None
+    assert gps.latitude_deg.tolist() == [fix.latitude_deg for fix in fixes]
+    assert said == ""
+
+
+@given(seeds, st.sampled_from([
+    ({"latitude_deg": 0.0, "longitude_deg": 0.0}, "(0, 0)"),
+    ({"latitude_deg": -0.0, "longitude_deg": 1e-12}, "(0, 0)"),
+    ({"valid": False}, "no fix"),
+    ({"latitude_deg": np.nan}, "not a number"),
+    ({"longitude_deg": np.inf}, "not a number"),
+    ({"latitude_deg": 139.7, "longitude_deg": 35.6}, "swapped"),
+    ({"latitude_deg": 91.0, "longitude_deg": 100.0}, "out of range"),
+    ({"longitude_deg": 400.0}, "out of range"),
+    ({"latitude_deg": 5.0, "longitude_deg": 5.0}, "further from the others"),
+]))  # fmt: skip
+def test_what_is_no_position_is_left_out_and_said(seed: int, case: tuple[dict[str, Any], str]) -> None:
+    rng = np.random.default_rng(seed)
+    change, says = case
+    fixes = drive(seed)
+    rows = np.sort(rng.choice(len(fixes), 5, replace=False)) if rng.random() < 0.5 else np.arange(5)  # or at the start
+    for row in rows.tolist():
+        fixes[row] = dataclasses.replace(fixes[row], **change)
+    gps, said = track(fixes)
+    assert gps is not None
+    assert gps.stamp_ns.tolist() == [fix.stamp_ns for row, fix in enumerate(fixes) if row not in rows]
+    assert says in said and "5 " in said
+
+
+def test_nothing_but_zeros_is_no_gps() -> None:
+    gps, said = track([dataclasses.replace(fix, latitude_deg=0.0, longitude_deg=0.0) for fix in drive(1)])
+    assert gps is None
+    assert "40 messages without a fix" in said
+
+
+@pytest.mark.parametrize("rows", [[3], [0, 1, 2], range(40)])
+@pytest.mark.parametrize("covariance", [np.eye(3), np.full((3, 3), np.nan)])
+def test_fixes_without_an_altitude_still_say_where(rows: Any, covariance: np.ndarray) -> None:
+    fixes = [dataclasses.replace(fix, covariance=covariance) for fix in drive(4)]
+    for row in rows:
+        fixes[row] = dataclasses.replace(fixes[row], altitude_m=np.nan)
+    gps, said = track(fixes)
+    assert gps is not None
+    assert len(geodesy.local_enu(gps)) == len(fixes)
+    assert set(gps.altitude_m) == ({0.0} if len(rows) == len(fixes) else {500.0})
+    assert (gps.covariance[list(rows), 2, 2] > 1e9).all()
+    assert np.isfinite(gps.covariance[list(rows)]).all()
+    assert "no altitude" in said
+
+
+def test_an_infinite_covariance_is_unknown() -> None:
+    fixes = drive(2)
+    fixes[7] = dataclasses.replace(fixes[7], covariance=np.diag([np.inf, 1.0, 1.0]))
+    gps, _ = track(fixes)
+    assert gps is not None
+    assert np.flatnonzero(np.isnan(gps.covariance).all((1, 2))).tolist() == [7]
+
+
+@pytest.mark.parametrize("fmt", ["cdr", "ros1", "protobuf", "json"])
+def test_zeros_before_the_first_fix_in_every_format(fmt: str, tmp_path: Path) -> None:
+    fox = fmt in ("protobuf", "json")
+    messages = foxglove_messages(Drive()) if fox else ros_messages(Drive(), 1 if fmt == "ros1" else 2)
+    for message in [message for message in messages if message.topic == "/fix"][:2]:
+        message.message.latitude = message.message.longitude = 0.0
+    if fox:
+        path = write_foxglove(tmp_path / "drive.mcap", messages, fmt)
+    else:
+        path = write_ros1(tmp_path / "drive.bag", messages) if fmt == "ros1" else write_ros2(tmp_path / "a", messages)
+    log = logs.open(path)
+    gps = log.gps()
+    assert gps is not None
+    assert len(gps.stamp_ns) == FRAMES - 2
+    assert gps.latitude_deg.min() > 47
+    assert "(0, 0)" in " ".join(log.warnings)
