@@ -21,14 +21,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 import vplog
 from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps import local
 from vplog.maps.earth import earth_from_plain, earth_of_made, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
-from vplog.parquet_bounds import check_file
+from vplog.parquet_bounds import read_footer
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
 from vplog.scratch import scratch
@@ -358,9 +357,8 @@ def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
 def row_count(path: Path) -> int:
     """Rows of a table, by its footer. Raises ResultError."""
     try:
-        check_file(path)
-        return pq.read_metadata(path).num_rows
-    except (OSError, pa.ArrowException) as error:
+        return read_footer(path).num_rows
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Remove the drive's folders.") from None
 
 

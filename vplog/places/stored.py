@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
-from vplog.parquet_bounds import check_file, open_table, read_table
+from vplog.parquet_bounds import check_columns, check_file, open_table, read_table, write_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,7 +78,8 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
         points = np.concatenate([f.points for f in features])
         descriptors = np.concatenate([f.descriptors for f in features])
-        pq.write_table(
+        _write(
+            folder / "features.parquet",
             pa.table(
                 {
                     "reference": owners,
@@ -92,10 +92,10 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
                 },
                 schema=_FEATURES,
             ),
-            folder / "features.parquet",
             compression="zstd",
         )
-        pq.write_table(
+        _write(
+            folder / "references.parquet",
             pa.table(
                 {
                     "drive": [r.drive for r in references],
@@ -106,7 +106,6 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
                 },
                 schema=_REFERENCES,
             ),
-            folder / "references.parquet",
             compression="none",
         )
         record = {
@@ -119,6 +118,11 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         (folder / "library.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise LibraryError(f"Cannot write the library {folder}: {error.strerror or error}.") from None
+
+
+def _write(path: Path, table: pa.Table, compression: str) -> None:
+    with path.open("wb") as stream:
+        write_table(stream, table, compression=compression)
 
 
 def read_library_record(folder: Path) -> dict[str, Any]:
@@ -177,9 +181,10 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
 
 def _table(path: Path, schema: pa.Schema) -> pa.Table:
     with open_table(path) as file:
-        if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
+        check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+        if file.metadata.num_rows > _MAX_FEATURES:
             raise LibraryError(f"{path.parent}: the tables are not those of a library; build it anew.")
-        return read_table(path, file)
+        return read_table(path, file, schema.names).select(schema.names)
 
 
 def _decode(data: bytes) -> np.ndarray | None:
