@@ -13,15 +13,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.benchmarks.scale import made_up_library, write_drive
+from tests.benchmarks.search import make_places
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_tables import write_all
+from vplog.cache_file import DamagedError, content_of, sealed
 from vplog.data import Features, Reference
-from vplog.errors import VplogError
+from vplog.errors import ResultError, VplogError
+from vplog.maps.index import update_index
+from vplog.maps.segment import open_segment
+from vplog.maps.store import Store
 from vplog.places.bobb import BobbSettings
 from vplog.places.stored import load_references, save_references
 from vplog.results import geo, kept_features, placed, places_map, tables
 from vplog.results.shown import Earth
 from vplog.stage_cache import digest_of
+from vplog.stage_codecs import _pack, _unpack
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -177,3 +184,27 @@ def test_the_checksums_take_little(tmp_path: Path, name: str) -> None:
     pq.write_table(pq.read_table(path), tmp_path / "bare", compression="zstd", row_group_size=tables.ROWS_PER_GROUP)
     pages = 2 * pq.ParquetFile(path).metadata.num_columns
     assert size - (tmp_path / "bare").stat().st_size <= 6 * pages + 16
+
+
+def test_no_flip_in_a_part_of_an_index_is_silent(tmp_path: Path) -> None:
+    settings = BobbSettings(references=4, windows_along=2)
+    state, store = made_up_library(settings, 30), Store(tmp_path)
+    write_drive(store, 0, make_places(40, settings, 0, 30, 40), state)
+    [part], _ = update_index(store, store.drives(), state.hash, state)
+    assert part.path is not None
+    assert silent(part.path, open_segment, 0) == []
+
+
+def test_no_flip_in_the_stage_cache_is_silent(tmp_path: Path) -> None:
+    """Of what a stage came to, and of its key, which is in the file."""
+    columns = {"a": np.arange(50.0), "b": np.arange(7)}
+    path, key = tmp_path / "stage", "ab" * 32
+    path.write_bytes(sealed(key, _pack(columns)))
+
+    def read(path: Path) -> Any:
+        try:
+            return _unpack(content_of(path.read_bytes(), key).tobytes())
+        except DamagedError as error:
+            raise ResultError(f"{path}: {error}") from None
+
+    assert silent(path, read, 0) == []

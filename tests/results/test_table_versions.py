@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 def rewritten(path: Path, table: pa.Table, **header: str) -> None:
     own = {key.encode(): text for key, text in header.items()}
-    pq.write_table(table.replace_schema_metadata({**table.schema.metadata, **own}), path, row_group_size=max(len(table) // 6, 1))
+    pq.write_table(
+        table.replace_schema_metadata({**table.schema.metadata, **own}), path, row_group_size=max(len(table) // 6, 1)
+    )
 
 
 def extra(table: pa.Table) -> pa.Table:

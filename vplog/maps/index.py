@@ -9,9 +9,10 @@ folder may be removed at any time.
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
@@ -20,8 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
-from vplog.maps.cache import is_sealed, seal, seal_of
-from vplog.maps.segment import SUFFIX, Content, Segment, checksum, open_segment, write_segment
+from vplog.maps.segment import SUFFIX, Content, Segment, open_segment, write_segment
 from vplog.maps.store import other_library
 from vplog.parquet_bounds import check_file
 from vplog.results import tables
@@ -82,8 +82,6 @@ def update_index(
     for group in groups:
         segment, path = _build(store, group, library, state, threads), None
         try:
-            if _in_cache(store):
-                seal(store.index / segment.name, checksum(segment))
             path = write_segment(store.index, segment)
             segment = open_segment(path)
         except (ResultError, OSError) as error:
@@ -133,16 +131,16 @@ def _open_all(store: Store, library: str, state: BobbState) -> tuple[list[tuple[
     known, useless, warnings = [], [], []
     shape = (len(state.matcher), state.settings.boxes)
     for path in sorted(store.index.glob(f"*{SUFFIX}")):
-        if _in_cache(store) and not is_sealed(path):  # without a word: it costs time alone
-            useless.append(path)
-            continue
         try:
             segment = open_segment(path)
+            if _in_cache(store):
+                with suppress(OSError):
+                    os.utime(path)  # what was not used for longest goes first
         except FileNotFoundError:  # another process has put it into a larger one
             continue
         except ResultError as error:
             useless.append(path)
-            warnings.append(f"{error} It was left out.")
+            warnings += [] if _in_cache(store) else [f"{error} It was left out."]  # there it costs time alone
             continue
         fits = segment.library == library
         if fits and (segment.lists.start.shape[0], segment.lists.boxes.shape[1]) == shape:
@@ -235,7 +233,7 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
 def _remove(paths: Sequence[Path], store: Store) -> None:
     """Who has them open keeps them. A file that cannot be removed does no harm."""
     parts = list(store.index.glob(".*.part"))
-    for path in [*paths, *map(seal_of, paths), *parts]:
+    for path in [*paths, *parts]:
         try:
             if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
                 path.unlink(missing_ok=True)
