@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from vplog.errors import ResultError
+from vplog.errors import NewerError
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -100,7 +100,7 @@ def write_table(stream: BinaryIO, table: pa.Table, rows_per_group: int | None = 
 
 def open_table(path: Path, **options: Any) -> pq.ParquetFile:
     """A Parquet file whose checksums are right. Raises OSError where there is something that is no file, too (a pipe
-    would be waited for), ValueError where it is damaged, and ResultError where it is of a newer version."""
+    would be waited for), ValueError where it is damaged, and NewerError where it is of a newer version."""
     check_file(path)
     _check_seal(path)
     file = pq.ParquetFile(path, page_checksum_verification=True, **options)
@@ -156,10 +156,10 @@ def _check_version(path: Path, schema: pa.Schema) -> None:
 
 
 def check_version(path: Path, version: object, newest: int, maker: object = None) -> None:
-    """Raises ResultError where a file says that it is of a newer version than the newest that is read."""
+    """Raises NewerError where a file says that it is of a newer version than the newest that is read."""
     if type(version) is not int or not 0 < version <= newest:
         by = f"by vplog {maker}" if isinstance(maker, str) and maker else "by another vplog"
-        raise ResultError(
+        raise NewerError(
             f"{path} was written {by} in version {str(version)[:20]} of its format, and this vplog reads up to version "
             f"{newest}. Update vplog: pip install --upgrade vplog"
         )

@@ -124,7 +124,7 @@ def test_places_of_another_library_are_refused(root: Path, finished: Path, drive
     table = pq.read_table(path)
     path.unlink()
     pq.write_table(table.replace_schema_metadata({**table.schema.metadata, b"vplog.library": b"e" * 64}), path)
-    assert "places do not compare" in verb("map", "query", root, drive.log).error
+    assert "all is damaged and left out" in verb("map", "query", root, drive.log).err
 
 
 def test_what_is_no_map_is_one_line(root: Path, drive: Drive, verb: Verb, tmp_path: Path) -> None:

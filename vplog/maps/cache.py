@@ -6,7 +6,8 @@
     CACHE/maps/open/...             the folders of processes that read at the moment, with links to the above
 
 Nothing in it is taken on trust: an object must have the hash that its manifest names, a library the hash that it is
-called by, a part of an index its checksum. What does not is fetched or made anew. The folder may be removed at any time.
+called by, a part of an index its checksum. What does not is fetched or made anew. The folder may be removed at any
+time.
 """
 
 from __future__ import annotations

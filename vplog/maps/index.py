@@ -12,7 +12,7 @@ import hashlib
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
@@ -21,13 +21,14 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
+from vplog.maps.damage import DamagedDriveError, reading_drive
 from vplog.maps.segment import SUFFIX, Content, Segment, open_segment, write_segment
 from vplog.maps.store import other_library
 from vplog.parquet_bounds import check_file
 from vplog.results import tables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from vplog.data import Int32s
@@ -105,7 +106,11 @@ def content_of(store: Store, drive: str, key: str) -> Content:
     """What a drive holds now; on an object store as its manifest says. Raises ResultError."""
     if store.mirror is not None and (mark := store.mirror.digest(drive, "descriptors.parquet")):
         return Content(drive, key, mark)
-    path = _descriptors(store, drive)
+    with reading_drive(drive):
+        return Content(drive, key, _footer_hash(_descriptors(store, drive)))
+
+
+def _footer_hash(path: Path) -> str:
     try:
         check_file(path)
         with path.open("rb") as stream:
@@ -114,12 +119,11 @@ def content_of(store: Store, drive: str, key: str) -> Content:
             end = stream.read(8)
             length = int.from_bytes(end[:4], "little")  # of the footer, as Parquet ends
             if end[4:] != b"PAR1" or length > size - 8:
-                raise ResultError(f"{path} is damaged. Remove the drive's folders, and add its log again.")
+                raise ResultError(f"{path} is damaged.")
             stream.seek(size - 8 - length)
-            mark = hashlib.sha256(stream.read(length)).hexdigest()
+            return hashlib.sha256(stream.read(length)).hexdigest()
     except OSError as error:
-        raise ResultError(f"{path} cannot be read: {error.strerror or error}. Remove the drive's folders.") from None
-    return Content(drive, key, mark)
+        raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
 
 
 def _descriptors(store: Store, drive: str) -> Path:
@@ -189,9 +193,10 @@ def _plan(
 def _build(store: Store, group: Sequence[Content], library: str, state: BobbState, threads: int) -> Segment:
     def read(one: Content) -> pa.Array:
         path = _descriptors(store, one.drive)
-        column, made_by = tables.read_descriptors(path)
-        if made_by != library:
-            raise LibraryError(other_library(store, one.drive, made_by, library))
+        with reading_drive(one.drive):
+            column, made_by = tables.read_descriptors(path)
+            if made_by != library:
+                raise LibraryError(other_library(store, one.drive, made_by, library))
         if content_of(store, one.drive, one.key) != one:
             raise ResultError(f"{path} was replaced while it was read. Run again.")
         return as_described(store, one.drive, column, state)
@@ -203,21 +208,10 @@ def _build(store: Store, group: Sequence[Content], library: str, state: BobbStat
         lists = state.lists(*columns)
     except LibraryError:
         for one, column in zip(group, columns, strict=True):  # whose they are
-            with of_drive(store, one.drive):
+            with reading_drive(one.drive):
                 state.lists(column)
         raise
     return Segment(library, tuple(group), first, lists)
-
-
-@contextmanager
-def of_drive(store: Store, drive: str) -> Iterator[None]:
-    """Raises what is wrong with the places of a drive with its name, and what to do."""
-    try:
-        yield
-    except LibraryError as error:
-        raise LibraryError(
-            f"The places of {drive} are damaged. {error} Take the drive out: vplog map remove {store} {drive}"
-        ) from None
 
 
 def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.Array:
@@ -225,9 +219,7 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
     try:
         return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:
-        raise ResultError(
-            f"{_descriptors(store, drive)} is of another recogniser. Remove the drive's folders."
-        ) from None
+        raise DamagedDriveError(f"{_descriptors(store, drive)} is of another recogniser.", drive) from None
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from vplog.errors import ResultError
+from vplog.parquet_bounds import check_version
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -49,11 +50,12 @@ def drive_record(folder: Path) -> dict[str, Any]:
 
 def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """What drive.json of `folder` says, checked. Raises ResultError."""
+    check_version(folder / "drive.json", record.get("format", 1), FORMAT)
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
-        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Remove the folder and run again.")
+        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Give its log to `vplog batch` again.")
     if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
-        raise ResultError(f"{folder} holds drive {record['drive']!r}. Remove the folder and run again.")
+        raise ResultError(f"{folder} holds drive {record['drive']!r}, which is another.")
     return record
 
 

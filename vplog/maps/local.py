@@ -65,7 +65,10 @@ def settle(store: Store) -> None:
             if not (store.root / "runs" / left.name).exists():
                 shutil.rmtree(left, ignore_errors=True)
     for drive in store.drives():
-        link_tables(store, drive)
+        try:
+            link_tables(store, drive)
+        except ResultError as error:
+            store.damaged[drive] = str(error)
 
 
 def _whole(made: Path) -> str | None:
@@ -117,7 +120,7 @@ def link_tables(store: Store, drive: str) -> None:
     for name in TABLES:
         source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
         if not source.is_file():
-            raise ResultError(f"{source} is not there. Remove {store.run(drive)} and run again.")
+            raise ResultError(f"{source} is not there.")
         if path.exists() and (path.samefile(source) or _same_copy(source, path)):
             continue
         part = store.staging / f"{name}-{os.getpid()}.parquet"

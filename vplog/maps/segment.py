@@ -95,7 +95,7 @@ def write_segment(folder: Path, segment: Segment) -> Path:
     if path.is_symlink() or (path.exists() and not path.is_file()):
         raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe. Remove it.")
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ResultError(f"Cannot write {folder}: {error.strerror}.") from None
     with replacing(path) as stream:
@@ -146,7 +146,7 @@ def open_segment(path: Path) -> Segment:
             if at + _CRC_BYTES != size:
                 raise ResultError(f"It has {size} bytes, and its header tells of {at + _CRC_BYTES}.")
             whole = np.asarray(np.memmap(stream, np.uint8, "r"))
-            if zlib.crc32(whole[:at]).to_bytes(_CRC_BYTES, "little") != whole[at:].tobytes():
+            if zlib.crc32(whole[:at].data).to_bytes(_CRC_BYTES, "little") != whole[at:].tobytes():
                 raise ResultError("It does not have the checksum that it names.")
     except FileNotFoundError:
         raise
