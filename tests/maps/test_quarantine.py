@@ -148,8 +148,9 @@ def test_every_flip_in_a_run_folder_is_found_by_the_check(root: Path, verb: Verb
     (run / names[2]).unlink()
     said = verb("map", "info", here, "--check", "--json")
     assert said.code == 1
-    assert len(said.json["damaged_files"]) == 3
-    assert all(any(name in line for line in said.json["damaged_files"]) for name in names[:3])
+    lines = json.loads(said.out)["damaged_files"]
+    assert len(lines) == 3
+    assert all(any(name in line for line in lines) for name in names[:3])
     said = verb("map", "info", here, "--check")
     assert said.code == 1
     assert all(sum(name in line for line in said.err.splitlines()) >= 1 for name in names[:3])
@@ -197,3 +198,15 @@ def test_a_map_without_hashes_is_read(root: Path, verb: Verb, tmp_path: Path) ->
     assert [one["drive"] for one in verb("map", "info", here, "--check", "--json").json["drives"]] == sorted(DRIVES)
     (here / "runs" / folder_name("walk") / "descriptors.parquet").unlink()
     assert list(verb("map", "info", here, "--json").json["damaged"]) == ["walk"]
+
+
+def test_the_check_reads_what_joins_drives_too(root: Path, verb: Verb, tmp_path: Path) -> None:
+    here = copied(root, tmp_path / "map")
+    path = here / "joins" / folder_name("walk") / "match=ride.parquet"
+    path.parent.mkdir(parents=True)
+    shutil.copyfile(here / "runs" / folder_name("walk") / "closures.parquet", path)
+    assert verb("map", "info", here, "--check").code == 0
+    flip(path)
+    said = verb("map", "info", here, "--check")
+    assert said.code == 1
+    assert str(path) in said.err

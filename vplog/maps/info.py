@@ -5,6 +5,8 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
+
 from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
@@ -13,6 +15,7 @@ from vplog.maps.earth import bounds_of, is_finite
 from vplog.maps.imports import ALONE
 from vplog.maps.joint_record import components_in, replaced_since
 from vplog.maps.store import other_library
+from vplog.parquet_bounds import open_table
 from vplog.places.stored import read_library_record
 from vplog.results import run_record
 
@@ -41,7 +44,11 @@ def _damaged_files(store: Store) -> list[str]:
     """A line for each; of a map on an object store every file is held against its manifest as it is fetched."""
     folders = sorted(path.parent for path in store.root.glob("runs/drive=*/drive.json"))
     if store.mirror is None:
-        return [line for folder in folders for line in damaged_files(folder)]
+        lines = [line for folder in folders for line in damaged_files(folder)]
+        tables = (
+            path for path in sorted(store.root.rglob("*.parquet")) if path.relative_to(store.root).parts[0] != "runs"
+        )
+        return [*lines, *(line for path in tables for line in _damaged_table(path))]
     wrong = []
     for drive in store.mirror.manifests:
         try:
@@ -50,6 +57,14 @@ def _damaged_files(store: Store) -> list[str]:
             wrong.append(str(error))
         store.forget(drive)
     return wrong
+
+
+def _damaged_table(path: Path) -> list[str]:
+    try:
+        open_table(path).close()
+    except (OSError, ValueError, pa.ArrowException, ResultError) as error:
+        return [f"{path}: {str(error).splitlines()[0]}"]
+    return []
 
 
 def _describe(store: Store) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.layout import TABLES, drive_record, folder_name, sha256_of
 from vplog.results.atomic import replacing
+from vplog.scratch import sync, sync_all
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -95,6 +96,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
     try:
         run.parent.mkdir(exist_ok=True)
         shutil.rmtree(replaced, ignore_errors=True)
+        sync_all(made)
         if not run.exists():
             made.rename(run)
         elif exchanged(made, run):
@@ -103,6 +105,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
             run.rename(replaced)
             (replaced / "drive.json").unlink(missing_ok=True)  # so that nobody takes it for a new one
             made.rename(run)
+        sync(run.parent)
     except OSError as error:
         raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
     shutil.rmtree(replaced, ignore_errors=True)

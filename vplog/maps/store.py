@@ -32,7 +32,7 @@ from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folde
 from vplog.parquet_bounds import check_version, read_footer
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
-from vplog.scratch import files_in, scratch
+from vplog.scratch import files_in, put_in_place, scratch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -355,7 +355,7 @@ def add_library(store: Store, made: Path, digest: str) -> Path:
     try:
         folder.parent.mkdir(exist_ok=True)
         if not folder.exists():
-            made.rename(folder)
+            put_in_place(made, folder)
     except OSError as error:
         raise ResultError(f"Cannot put the library into {store}: {error.strerror}.") from None
     if store.mirror is not None:

@@ -9,6 +9,7 @@ from vplog.errors import VplogError
 from vplog.maps import components
 from vplog.maps.damage import DamagedDriveError
 from vplog.maps.joint_record import read_joint, write_joint
+from vplog.scratch import put_in_place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -79,6 +80,6 @@ def _solved(store: Store, group: Group, drives: Drives, solving: components.Solv
             continue
         place.parent.mkdir(exist_ok=True)
         shutil.rmtree(place, ignore_errors=True)
-        (staging / component["folder"]).rename(place)
+        put_in_place(staging / component["folder"], place)
     shutil.rmtree(staging, ignore_errors=True)
     return told
