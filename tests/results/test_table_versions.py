@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
@@ -11,9 +12,11 @@ import pytest
 from tests.results.test_tables import write_all
 from tests.test_flipped_bits import plain, write_tables
 from vplog import parquet_bounds
-from vplog.errors import ResultError
+from vplog.errors import NewerError, ResultError
 from vplog.parquet_bounds import VERSION_KEY
+from vplog.places.stored import read_library_record
 from vplog.results import tables
+from vplog.results.run_record import read_finished_run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,3 +96,19 @@ def test_columns_that_are_missing_or_of_another_type(tmp_path: Path, number: int
         rewritten(path, table.set_column(at, changed, pa.nulls(len(table), other)))
         with pytest.raises(ResultError, match=f"no column {column.name} of type .*but of type {other}"):
             read(path)
+
+
+def test_records_of_a_newer_version_are_refused(tmp_path: Path) -> None:
+    """A run folder, a library; those before versions are of the first."""
+    run, library = tmp_path / "run.json", tmp_path / "library.json"
+    for version, newer in ((None, False), (1, False), (2, True)):
+        record = {"vplog": "9.8", "finished": True, "hash": "a", "settings": {}}
+        text = json.dumps(record if version is None else {**record, "format": version})
+        run.write_text(text)
+        library.write_text(text)
+        for read in (read_finished_run, read_library_record):
+            if not newer:
+                assert read(tmp_path)["hash"] == "a"
+                continue
+            with pytest.raises(NewerError, match=r"by vplog 9.8 in version 2 .* reads up to version 1. Update vplog"):
+                read(tmp_path)

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from vplog.maps.store import Store
 
-FORMAT = 1
-"""Version of this record. A reader refuses another one."""
+FORMAT = run_record.FORMAT
+"""Version of this record. A reader refuses a newer one."""
 
 
 def read_joint(root: Path) -> dict[str, Any]:

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from vplog.errors import ResultError
-from vplog.parquet_bounds import check_version
 from vplog.results import run_record
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-FORMAT = 1
-"""Version of this layout. A reader refuses another one."""
+FORMAT = run_record.FORMAT
+"""Version of this layout. A reader refuses a newer one."""
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 """Data sets of a map: each is a file of this name in every run folder."""
 AT_HAND = (*(f"{name}.parquet" for name in TABLES), "run.json")
@@ -50,7 +49,6 @@ def drive_record(folder: Path) -> dict[str, Any]:
 
 def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """What drive.json of `folder` says, checked. Raises ResultError."""
-    check_version(folder / "drive.json", record.get("format", 1), FORMAT)
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
         raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Give its log to `vplog batch` again.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,8 @@ import pyarrow as pa
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
-from vplog.parquet_bounds import check_columns, check_file, open_table, read_table, write_table
+from vplog.parquet_bounds import check_columns, check_file, check_version, open_table, read_table, write_table
+from vplog.scratch import put_in_place, sync_all
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
     from vplog.settings import Settings
 
+_FORMAT = 1
+"""Version of library.json. A reader refuses a newer one."""
 _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
@@ -109,13 +113,17 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
             compression="none",
         )
         record = {
+            "format": _FORMAT,
             "vplog": vplog.__version__,
             "hash": references_hash(references, settings),
             "references": len(references),
             "features": len(owners),
             "settings": settings.model_dump(mode="json"),
         }
-        (folder / "library.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        part = folder / f".library.json.{os.getpid()}.part"
+        part.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        sync_all(folder)
+        put_in_place(part, folder / "library.json")
     except OSError as error:
         raise LibraryError(f"Cannot write the library {folder}: {error.strerror or error}.") from None
 
@@ -138,6 +146,7 @@ def read_library_record(folder: Path) -> dict[str, Any]:
         raise LibraryError(f"{folder}/library.json cannot be read: {error}.") from None
     if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
         raise LibraryError(f"{folder}/library.json lacks its hash or settings; build the library anew.")
+    check_version(folder / "library.json", record.get("format", _FORMAT), _FORMAT, record.get("vplog"))
     return record
 
 
@@ -181,7 +190,12 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
 
 def _table(path: Path, schema: pa.Schema) -> pa.Table:
     with open_table(path) as file:
-        check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+        try:
+            check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+        except ValueError as error:
+            raise LibraryError(
+                f"{path.parent}: the tables are not those of a library ({error}); build it anew."
+            ) from None
         if file.metadata.num_rows > _MAX_FEATURES:
             raise LibraryError(f"{path.parent}: the tables are not those of a library; build it anew.")
         return read_table(path, file, schema.names).select(schema.names)
