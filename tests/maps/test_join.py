@@ -196,7 +196,7 @@ def test_a_drive_that_was_replaced_is_said(copy: Path, verb: Callable[..., Said]
     joint = json.loads(path.read_text())
     joint["groups"][0]["components"] = [{"folder": "x", "drives": 3}]
     path.write_text(json.dumps(joint))
-    assert "of another version or damaged" in verb("map", "info", copy).err
+    assert "joint.json is damaged" in verb("map", "info", copy).err
 
 
 def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
