@@ -242,6 +242,8 @@ def test_drives_with_gps_are_kept_apart(joint: Path, tmp_path: Path) -> None:
     keyframes, poses = tables.read_keyframes(path)
     settings = load_pipeline("default", [*QUICK, "gps.use=true"]).model_dump(mode="json")
     tables.write_keyframes(path, keyframes, poses, tables.TableMetadata(settings, ""))
+    record = json.loads(path.with_name("drive.json").read_text())
+    run_record.write_run_json(path.with_name("drive.json"), {**record, "files": {}})
     told = joined(tmp_path / "map")
     assert told["alone"] == ["after"]
     assert "was solved with GPS" in told["warnings"][0]

@@ -48,9 +48,10 @@ def without_damaged(store: Store, work: Callable[[], T]) -> T:
 
 
 def left_out(store: Store) -> list[str]:
-    """Each damaged drive of a map in a sentence, with what to do."""
+    """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
     return [
-        f"{drive} is damaged and left out: {why} Compute it again from its log: vplog batch LOG -o {store}"
+        f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
+        f"Compute it again from its log: vplog batch LOG -o {store}"
         for drive, why in sorted(store.damaged.items())
     ]
 

@@ -312,6 +312,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
     earth is noted with it. Raises ResultError; then the map has the drive as before.
     """
     about = {**drive_record(made), "format": FORMAT}
+    about.pop("files", None)  # of the map that it comes from
     if "earth" not in about:
         about["earth"] = earth_of_made(made)
     store.damaged.pop(drive, None)
