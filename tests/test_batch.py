@@ -165,6 +165,40 @@ def test_what_is_missing_or_changed_is_done_again(
     assert json.loads((whole / "failures.json").read_text()) == {}
 
 
+@pytest.mark.parametrize("damage", ["flip", "gone", "record", "report"])
+def test_a_damaged_drive_is_computed_again_and_stops_no_other(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    """By the batch that has its log; another one names it and leaves it out."""
+    root, pipeline = tmp_path / "map", load_pipeline("default", QUICK)
+    shutil.copytree(whole, root, copy_function=shutil.copyfile)
+    run = root / "runs" / "drive=drive-2"
+    name = {"flip": "edges.parquet", "gone": "edges.parquet", "record": "drive.json", "report": "report.html"}[damage]
+    data = bytearray((run / name).read_bytes())
+    (run / name).unlink()
+    if damage != "gone":
+        data[len(data) // 3] ^= 4 if damage != "record" else 128
+        (run / name).write_bytes(data)
+    asked: list[str] = []
+
+    def refuse(_: LocalEngine, task: Task, cores: int) -> Future[Outcome]:
+        asked.append(task.drive)
+        future: Future[Outcome] = Future()
+        future.set_result(Outcome("not now"))
+        return future
+
+    monkeypatch.setattr(LocalEngine, "start", refuse)
+    told = run_batch(logs[:1], root, pipeline)
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged")]
+    said = [*told["warnings"], *(told["joined"] or {}).get("warnings", [])]
+    if damage in ("gone", "record"):  # the other damages are found by who reads the file
+        assert sum("drive-2 is damaged and left out" in line for line in said) == 1
+    told = run_batch(logs, root, pipeline, join=False)
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged"), ("drive-2", "failed")]
+    assert asked == ["drive-2"]
+    assert any("drive-2 is damaged and left out" in line for line in told["warnings"])
+
+
 def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp_path: Path) -> None:
     pipeline = load_pipeline("default", QUICK)
     before = files(whole)

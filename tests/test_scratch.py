@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +13,11 @@ import pytest
 
 from vplog import scratch as scratch_of
 from vplog.errors import ResultError
-from vplog.scratch import files_in, own_folder, packed, pieces, scratch, unpacked, write_pieces
+from vplog.results.atomic import replacing
+from vplog.scratch import files_in, own_folder, packed, pieces, put_in_place, scratch, unpacked, write_pieces
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable
 
 
 @pytest.fixture
@@ -86,3 +89,41 @@ def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, machine: Path) ->
     own.symlink_to(tmp_path / "theirs")
     with pytest.raises(ResultError, match="TMPDIR"):
         own_folder()
+
+
+def written_in_pieces(path: Path) -> None:
+    write_pieces(path.parent, path.name, iter([np.arange(9, dtype=np.uint8)]))
+
+
+def written_as_a_whole(path: Path) -> None:
+    with replacing(path) as stream:
+        stream.write(b"whole")
+
+
+def moved_folder(path: Path) -> None:
+    put_in_place(make_folder(path.parent / "made"), path)
+
+
+@pytest.mark.parametrize("write", [written_in_pieces, written_as_a_whole, moved_folder])
+def test_content_is_on_the_disk_before_its_name_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], None]
+) -> None:
+    """Every file that is renamed was synced before, and the folder that has its new name after."""
+    synced, events, fsync, replace = set[int](), list[str](), os.fsync, Path.replace
+
+    def note_sync(handle: int) -> None:
+        synced.add(os.fstat(handle).st_ino)
+        events.append("folder" if os.fstat(handle).st_ino == tmp_path.stat().st_ino else "file")
+        fsync(handle)
+
+    def note_rename(self: Path, target: Path) -> Path:
+        assert {one.stat().st_ino for one in [self, *self.rglob("*")]} <= synced
+        events.append("rename")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(Path, "replace", note_rename)
+    write(tmp_path / "result")
+    assert (tmp_path / "result").exists()
+    assert events[-2:] == ["rename", "folder"]
+    assert "file" in events[:-2]

@@ -21,10 +21,11 @@ from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.inputs import bytes_of
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.damage import damaged_files, left_out
 from vplog.maps.imports import ALONE
 from vplog.maps.join import join as join_drives
 from vplog.maps.join import load_places
-from vplog.maps.layout import folder_name
+from vplog.maps.layout import drive_record, folder_name
 from vplog.own_processes import known_ahead
 from vplog.pipeline import load_pipeline, pipeline_from
 from vplog.remote import RemotePath
@@ -147,7 +148,7 @@ def run_batch(
             if log in errors:
                 done[drive] = Drive(drive, log, "failed", error=errors[log])
                 tell(done[drive])
-            elif drive in known and known[drive]["key"] == about["key"]:
+            elif drive in known and known[drive]["key"] == about["key"] and not _is_damaged(store, drive):
                 done[drive] = Drive(drive, log, "unchanged")
                 _relocate(store, drive, known[drive]["log"], log)
             else:
@@ -189,6 +190,7 @@ def run_batch(
         "join_error": join_error,
         "warnings": [
             *unsaid,
+            *([] if joined else left_out(store)),
             *_same(fate, inputs),
             *_mixed([about for drive, about in known.items() if drive not in done], alike),
         ],
@@ -196,8 +198,20 @@ def run_batch(
 
 
 def _failed(store: Store) -> dict[str, dict[str, Any]]:
-    """What is known of drives that failed, as of those that are in: their IDs are theirs as long as that is told."""
-    return {drive: {"log": told.get("log"), "inputs": None} for drive, told in store.failures().items()}
+    """What is known of drives that failed or are damaged: their IDs are theirs as long as that is told."""
+    found = {drive: {"log": told.get("log"), "inputs": None} for drive, told in store.failures().items()}
+    for drive in store.damaged:
+        with suppress(ResultError):
+            found[drive] = drive_record(store.root / "runs" / folder_name(drive))
+    return found
+
+
+def _is_damaged(store: Store, drive: str) -> bool:
+    """Whether a file of a drive of a map in a folder is not as it was written; then it is left out until it is."""
+    wrong = damaged_files(store.run(drive)) if store.mirror is None else []
+    if wrong:
+        store.damaged[drive] = wrong[0]
+    return bool(wrong)
 
 
 def tell_failures(store: Store, done: Mapping[str, Drive]) -> None:

@@ -153,13 +153,18 @@ def _end(
 
 def info_map(arguments: argparse.Namespace) -> None:
     """The drives, places and library of a map, and what failed."""
+    from vplog.errors import ResultError
     from vplog.maps.info import describe_map
 
-    found = describe_map(arguments.map)
+    found = describe_map(arguments.map, check=arguments.check)
     if arguments.json:
         print_json(found)
     else:
         print_map(found)
+    if wrong := found["damaged_files"]:
+        raise ResultError(
+            f"{len(wrong)} damaged files in {arguments.map}: vplog batch LOG -o MAP computes drives again."
+        )
 
 
 def query_map(arguments: argparse.Namespace) -> None:
@@ -217,6 +222,8 @@ def add_maps(
     sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
     sub.set_defaults(verb=info_map)
     sub.add_argument("map", type=place, metavar="MAP")
+    text = "read every file and hold it against its sha256; status 1 and a line for each that is damaged"
+    sub.add_argument("--check", action="store_true", help=text)
     text = "where a log's views are in a map"
     sub = maps.add_parser("query", help=text, description=query_map.__doc__, parents=[common, topics, threads])
     sub.set_defaults(verb=query_map)

@@ -204,11 +204,15 @@ def print_map(found: dict[str, Any]) -> None:
         say(f"failed: {drive}: {failure['error']}")
     for problem in found["problems"]:
         say(f"warning: {problem}")
+    for line in found["damaged_files"]:
+        say(f"damaged: {line}")
 
 
 def print_export(found: dict[str, Any]) -> None:
     for drive in found.get("left_out", ()):
         say(f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes.")
+    for warning in found.get("warnings", ()):
+        say(f"warning: {warning}")
     print(f"{found['written']}: {found['places']} places of {len(found['drives'])} drives")
 
 
@@ -226,6 +230,8 @@ def print_merge(found: dict[str, Any]) -> None:
     for one in found["drives"]:
         other = "" if one["as"] == one["drive"] else f" as {one['as']}"
         print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
+    for warning in found["warnings"]:
+        say(f"warning: {warning}")
     taken = sum(one["state"] != "there already" for one in found["drives"])
     print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
     if any(one["state"] == "taken" for one in found["drives"]):

@@ -29,6 +29,10 @@ class ResultError(VplogError):
     """A run folder cannot be written or read back."""
 
 
+class NewerError(ResultError):
+    """A file was written by a newer vplog in a way that this one does not read."""
+
+
 def was_interrupted(error: BaseException | None) -> bool:
     """Whether Ctrl-C is behind an error: compiled code and imports that it stops raise others in its place."""
     seen: set[int] = set()

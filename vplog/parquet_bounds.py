@@ -1,4 +1,8 @@
-"""What a Parquet file may take in memory: as much as its bytes can justify.
+"""Parquet files: their checksums, the version of their columns, and what they may take in memory.
+
+Every page has a CRC-32 as the format has it, which any reader may check. Headers of pages and the footer have none, so
+a seal of 16 bytes stands in the gap before the footer, where other readers do not look: CRC-32 of all before it, and of
+all behind it. A file without a seal was written by another program and is read by its page checksums alone.
 
 Equal values are one number and a count in Parquet, so 200 kB may say four million rows. Files may come from anyone, so
 what their rows come to is reckoned from the footer before any is read. Texts are read as numbers of a dictionary, whose
@@ -7,15 +11,21 @@ entries are in the file, and checked before each row gets its own.
 
 from __future__ import annotations
 
+import io
 import stat
-from typing import TYPE_CHECKING
+import struct
+import zlib
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from vplog.errors import NewerError
+
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
 ALWAYS_BYTES = 1 << 26
@@ -27,10 +37,151 @@ _NARROW = {"INT_8": 1, "UINT_8": 1, "INT_16": 2, "UINT_16": 2}
 _LEAF_BYTES = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
 
 
-def open_table(path: Path) -> pq.ParquetFile:
-    """A Parquet file. Raises OSError where there is something that is no file, too: a pipe would be waited for."""
+TABLE_VERSION = 1
+"""Version of the columns of all tables. A new nullable column does not raise it: older programs pass it over, and newer
+ones read null where it is missing. Any other change of a column does, and is refused by older programs."""
+VERSION_KEY = "vplog.table_version"
+"""In the header of a file; a file without it is of version 1."""
+VERSION_ABOUT = (
+    "Version of the columns. A reader takes this one and older ones; columns that it does not know it passes over."
+)
+"""What the contracts say of it."""
+_SEAL = struct.Struct("<8sII")
+"""Magic, CRC-32 of all before, CRC-32 of the footer with its length and magic."""
+_SEAL_MAGIC = b"vplogcrc"
+_TAIL = 8
+"""Bytes behind the footer: its length, little endian, and `PAR1`."""
+_BLOCK_BYTES = 1 << 22
+"""Read at once of a file that is summed up."""
+
+
+class _Sealed(io.RawIOBase):
+    """A stream that sums up what is written to it, and keeps back the footer."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream, self._crc, self.footer = stream, 0, bytearray()
+        self.hold = False
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        if self.hold:
+            self.footer += data
+        else:
+            self._crc = zlib.crc32(data, self._crc)
+            self._stream.write(data)
+        return memoryview(data).nbytes
+
+    def seal(self) -> None:
+        """Write the seal and the footer behind what was written so far."""
+        start = len(self.footer) - _TAIL - int.from_bytes(self.footer[-_TAIL:-4], "little")
+        self.hold, end = False, self.footer[start:]
+        self.write(self.footer[:start])
+        self._stream.write(_SEAL.pack(_SEAL_MAGIC, self._crc, zlib.crc32(end)) + end)
+
+
+@contextmanager
+def table_writer(stream: BinaryIO, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetWriter]:
+    """A writer of a Parquet file with checksums and the version of the columns; options as pyarrow has them."""
+    sink = _Sealed(stream)
+    schema = schema.with_metadata({**(schema.metadata or {}), VERSION_KEY: str(TABLE_VERSION)})
+    with pq.ParquetWriter(sink, schema, write_page_checksum=True, **options) as writer:
+        yield writer
+        sink.hold = True
+    sink.seal()
+
+
+def write_table(stream: BinaryIO, table: pa.Table, rows_per_group: int | None = None, **options: Any) -> None:
+    """Write a table with checksums and the version of its columns."""
+    with table_writer(stream, table.schema, **options) as writer:
+        writer.write_table(table.replace_schema_metadata(writer.schema.metadata), rows_per_group)
+
+
+def open_table(path: Path, **options: Any) -> pq.ParquetFile:
+    """A Parquet file whose checksums are right. Raises OSError where there is something that is no file, too (a pipe
+    would be waited for), ValueError where it is damaged, and NewerError where it is of a newer version."""
     check_file(path)
-    return pq.ParquetFile(path)
+    _check_seal(path)
+    file = pq.ParquetFile(path, page_checksum_verification=True, **options)
+    _check_version(path, file.schema_arrow)
+    return file
+
+
+def read_footer(path: Path) -> pq.FileMetaData:
+    """The footer of a Parquet file, by which alone it is checked. Raises as `open_table`."""
+    check_file(path)
+    _check_seal(path, footer_alone=True)
+    footer = pq.read_metadata(path)
+    _check_version(path, footer.schema.to_arrow_schema())
+    return footer
+
+
+def read_schema(path: Path) -> pa.Schema:
+    """The columns and the header of a Parquet file, of which the footer alone is read. Raises as `open_table`."""
+    return read_footer(path).schema.to_arrow_schema()
+
+
+def _check_seal(path: Path, footer_alone: bool = False) -> None:
+    with path.open("rb") as stream:
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(size - _TAIL, 0))
+        start = size - _TAIL - int.from_bytes(stream.read(4), "little") - _SEAL.size
+        if start < 0:
+            return  # pyarrow says what is wrong
+        stream.seek(start)
+        magic, body, footer = _SEAL.unpack(stream.read(_SEAL.size))
+        if magic != _SEAL_MAGIC:
+            return
+        sound = zlib.crc32(stream.read()) == footer
+        if sound and not footer_alone:
+            stream.seek(0)
+            sound = _summed(stream, start) == body
+    if not sound:
+        raise ValueError("It is damaged: it does not have the checksum that it names.")
+
+
+def _summed(stream: BinaryIO, count: int) -> int:
+    """CRC-32 of the next `count` bytes."""
+    total = 0
+    while count and (block := stream.read(min(count, _BLOCK_BYTES))):
+        total, count = zlib.crc32(block, total), count - len(block)
+    return total
+
+
+def _check_version(path: Path, schema: pa.Schema) -> None:
+    header = schema.metadata or {}
+    said, maker = (header.get(key, b"").decode(errors="replace") for key in (VERSION_KEY.encode(), b"vplog.version"))
+    check_version(path, int(said or 1) if said.isdecimal() or not said else said, TABLE_VERSION, maker)
+
+
+def check_version(path: Path, version: object, newest: int, maker: object = None) -> None:
+    """Raises NewerError where a file says that it is of a newer version than the newest that is read."""
+    if type(version) is not int or not 0 < version <= newest:
+        by = f"by vplog {maker}" if isinstance(maker, str) and maker else "by another vplog"
+        raise NewerError(
+            f"{path} was written {by} in version {str(version)[:20]} of its format, and this vplog reads up to version "
+            f"{newest}. Update vplog: pip install --upgrade vplog"
+        )
+
+
+def check_columns(found: pa.Schema, wanted: Iterable[pa.Field]) -> None:
+    """Columns that are not wanted may be there, and wanted ones that may be null be missing: those of another version.
+    Raises ValueError where one that may not be null is missing, or one has another type."""
+    for column in wanted:
+        at = found.get_field_index(column.name)
+        if (at < 0 and not column.nullable) or (at >= 0 and found.field(at).type != column.type):
+            has = f", but of type {found.field(at).type}" if at >= 0 else ""
+            raise ValueError(f"It has no column {column.name} of type {column.type}{has}: of another version of vplog.")
+
+
+def filled(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The columns of the schema; null where a table of an older version has none. Raises as `check_columns`."""
+    check_columns(table.schema, schema)
+    for column in schema:
+        if column.name not in table.column_names:
+            table = table.append_column(column, pa.nulls(len(table), column.type))
+    return table.select(schema.names)
 
 
 def check_file(path: Path) -> None:
@@ -67,15 +218,17 @@ def check_size(path: Path, file: pq.ParquetFile, columns: Collection[str] | None
 
 
 def read_table(path: Path, file: pq.ParquetFile, columns: Collection[str] | None = None) -> pa.Table:
-    """The rows of a file that is open, or some columns. Raises ValueError where they would take more than it may hold,
-    and KeyError where it lacks one."""
+    """The rows of a file that is open, or of these columns those that it has. Raises ValueError where they would take
+    more than it may hold."""
     check_size(path, file, columns)
-    schema = file.schema_arrow  # made anew by every look
-    names = schema.names if columns is None else list(columns)
+    schema = file.schema_arrow  # pyarrow makes it again at every call
+    names = [name for name in schema.names if columns is None or name in columns]
     texts = [name for name in names if _is_text(schema.field(name).type)]
     if not texts:
         return file.read(columns=names)
-    with pq.ParquetFile(path, metadata=file.metadata, read_dictionary=texts) as numbered:
+    with pq.ParquetFile(
+        path, metadata=file.metadata, read_dictionary=texts, page_checksum_verification=True
+    ) as numbered:
         table = numbered.read(columns=names)
     for name in texts:
         column = table[name]

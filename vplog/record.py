@@ -101,6 +101,7 @@ def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[
     files = [str(file.resolve()) for file in files_of(path)]
     packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
     return {
+        "format": run_record.FORMAT,
         "vplog": vplog.__version__,
         "log": files[0],
         **({"parts": files} if len(files) > 1 else {}),

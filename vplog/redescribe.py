@@ -14,6 +14,7 @@ from vplog.engine import RETRIES
 from vplog.errors import SettingsError
 from vplog.libraries import build_library
 from vplog.maps import store as map_store
+from vplog.maps.damage import reading_drive, without_damaged
 from vplog.maps.imports import ALONE
 from vplog.maps.merge import in_order
 from vplog.pipeline import Pipeline
@@ -25,6 +26,8 @@ from vplog.scratch import scratch
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from vplog.maps.store import Store
 
     Progress = Callable[[str, int, int], None]
 
@@ -51,10 +54,10 @@ def redescribe_map(
         raise SettingsError(f"{root} is given as its own target. Choose another map with -o.")
     with map_store.reading(root) as store:
         head = store.head()
-        _, drives = map_store.one_library(store)
-        topics = {drive: run_record.read_run_json(store.file(drive, "run.json")).get("topics") for drive in drives}
+        drives, topics = without_damaged(store, lambda: _drives_of(store))
+        damaged = {drive: Drive(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
         _bring_caches(store.root, target)
-    fate, missing, joined, join_error = [], dict[str, Drive](), None, ""
+    fate, missing, joined, join_error = [], damaged, None, ""
     groups: dict[str, list[str]] = {}
     for drive in in_order(drives):
         log = drives[drive]["log"]
@@ -94,6 +97,17 @@ def redescribe_map(
         "joined": joined,
         "join_error": join_error,
     }
+
+
+def _drives_of(store: Store) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """drive.json and the topics of each drive."""
+    _, drives = map_store.one_library(store)
+    topics = {}
+    for drive in drives:
+        record = store.file(drive, "run.json")
+        with reading_drive(drive):
+            topics[drive] = run_record.read_run_json(record).get("topics")
+    return drives, topics
 
 
 @contextmanager

@@ -66,6 +66,33 @@ def _sweep(among: Path) -> None:
             shutil.rmtree(path.parent, ignore_errors=True)
 
 
+def put_in_place(part: Path, path: Path) -> None:
+    """Rename a file or a folder with its files to `path`, so that after a power cut what is there is whole: content is
+    on the disk before the name is. Raises OSError."""
+    sync_all(part)
+    part.replace(path)
+    sync(path.parent)
+
+
+def sync_all(path: Path) -> None:
+    """Have a file, or a folder with all that is in it, on the disk. Raises OSError."""
+    for file in [*sorted(path.rglob("*")), path]:
+        if file.is_dir() or file.is_file():
+            sync(file)
+
+
+def sync(path: Path) -> None:
+    """Have a file, or the names in a folder, on the disk. Raises OSError."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:
+        if not path.is_dir():  # some file systems know no fsync of folders
+            raise
+    finally:
+        os.close(handle)
+
+
 def files_in(folder: Path) -> list[str]:
     """Names of all files in a folder and below it, in order; hidden ones are nobody's result."""
     found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
@@ -92,7 +119,7 @@ def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
         with whole.open("wb") as stream:
             for part in parts:
                 stream.write(part.data)
-        whole.replace(path)
+        put_in_place(whole, path)
     except OSError as error:
         raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
 

@@ -67,7 +67,7 @@ def put_library(store: Store, library: str = LIBRARY) -> None:
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir()
-    (made / "features.parquet").write_bytes(b"features")
+    (made / "features").write_bytes(b"features")
     (made / "library.json").write_text(json.dumps({"hash": library, "settings": {}, "references": 3, "features": 9}))
     map_store.add_library(store, made, library)
     store.write_head(map_store.Head(library, {"seed": 0}))

@@ -58,14 +58,17 @@ def test_a_map_is_there_as_it_is_in_a_folder(root: Any, tmp_path: Path) -> None:
     here, there = make_map(tmp_path / "map", drives), make_map(root, drives)
     with map_store.reading(here) as a, map_store.reading(there) as b:
         assert a.head() == b.head()
-        assert a.drives() == b.drives()
+        records = {drive: {**record} for drive, record in a.drives().items()}
+        for record in records.values():  # the manifest has them there
+            assert record.pop("files").keys() >= {"run.json"}
+        assert records == b.drives()
         assert b.library(LIBRARY).joinpath("library.json").read_bytes() == (
             a.library(LIBRARY).joinpath("library.json").read_bytes()
         )
         for drive in drives:
             assert a.sizes(drive) == {**b.sizes(drive), "drive.json": a.sizes(drive)["drive.json"]}
             assert a.rows("descriptors", drive) == b.rows("descriptors", drive) == PLACES
-            for name in b.sizes(drive):
+            for name in b.sizes(drive).keys() - {"drive.json"}:
                 assert (b.whole(drive) / name).read_bytes() == (a.run(drive) / name).read_bytes()
     for name in map_store.TABLES:
         system, place = root.place

@@ -130,7 +130,7 @@ def test_a_second_query_asks_for_manifests_alone(
 def test_what_is_damaged_is_fetched_or_made_again(root: Any, finished: Path, cache: Cache) -> None:
     expected = asked(root, finished, cache)
     kept = {path: path.read_bytes() for path in files(cache)}
-    assert len(kept) == 5 + 1 + 2, "objects, the record of a library, an index and its seal"
+    assert len(kept) == 5 + 1 + 1, "objects, the record of a library and an index"
 
     def turned(whole: bytes) -> bytes:
         middle = len(whole) // 2

@@ -196,7 +196,7 @@ def test_a_drive_that_was_replaced_is_said(copy: Path, verb: Callable[..., Said]
     joint = json.loads(path.read_text())
     joint["groups"][0]["components"] = [{"folder": "x", "drives": 3}]
     path.write_text(json.dumps(joint))
-    assert "of another version or damaged" in verb("map", "info", copy).err
+    assert "joint.json is damaged" in verb("map", "info", copy).err
 
 
 def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
@@ -242,6 +242,8 @@ def test_drives_with_gps_are_kept_apart(joint: Path, tmp_path: Path) -> None:
     keyframes, poses = tables.read_keyframes(path)
     settings = load_pipeline("default", [*QUICK, "gps.use=true"]).model_dump(mode="json")
     tables.write_keyframes(path, keyframes, poses, tables.TableMetadata(settings, ""))
+    record = json.loads(path.with_name("drive.json").read_text())
+    run_record.write_run_json(path.with_name("drive.json"), {**record, "files": {}})
     told = joined(tmp_path / "map")
     assert told["alone"] == ["after"]
     assert "was solved with GPS" in told["warnings"][0]

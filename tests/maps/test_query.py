@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import zlib
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
@@ -223,17 +224,17 @@ def test_a_damaged_segment_is_made_again(made: Map) -> None:
     for broken, why in (
         (whole[:-1], "bytes"), (whole + b"x", "bytes"), (whole[:20], "not a part"), (b"", "not a part"),
         (b"PAR1" + whole[4:], "not a part"), (whole.replace(b'"block":8192', b'"block":0000'), "not JSON"),
-        (whole.replace(b'"block":8192', b'"block":8191'), ""), (whole.replace(b'"format":1', b'"format":2'), "version"),
+        (whole.replace(b'"block":8192', b'"block":8191'), "checksum"),
+        (whole.replace(b'"format":2', b'"format":3'), "version"),
         (whole.replace(b'"windows":4', b'"windows":-'), "not JSON"),
         (whole.replace(b'"entries":', b'"entrees":'), "lacks a value"),
     ):  # fmt: skip
         part.path.unlink()
         part.path.write_bytes(broken)
-        if why:
-            with pytest.raises(ResultError, match=why):
-                open_segment(part.path)
-            _, warnings = made.update()
-            assert len(warnings) == 1
+        with pytest.raises(ResultError, match=why):
+            open_segment(part.path)
+        _, warnings = made.update()
+        assert len(warnings) == 1
         part.path.unlink(missing_ok=True)
         made.check()
         assert part.path.read_bytes() == whole
@@ -252,7 +253,7 @@ def test_no_bytes_lead_beyond_the_arrays(made: Map, seed: int) -> None:
         where = rng.integers(1000, len(data), 2000)
     data[where] = rng.integers(0, 256, len(where)) if seed % 3 else 255
     path = part.path.with_name("strange.lists")
-    path.write_bytes(data.tobytes())
+    path.write_bytes(data[:-4].tobytes() + zlib.crc32(data[:-4]).to_bytes(4, "little"))
     try:
         segment = open_segment(path)
     except ResultError:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from vplog.parquet_bounds import TABLE_VERSION
 from vplog.pipeline import pipeline_schema
 from vplog.results import messages
 from vplog.results.contracts import table_schemas, write_schemas
@@ -38,3 +39,21 @@ def test_proto_text_and_message_class_agree() -> None:
         )
         repeated = "repeated " if field.is_repeated else ""
         assert f"\n  {repeated}{kind} {field.name} = {field.number};\n" in text
+
+
+def test_columns_change_only_with_the_version() -> None:
+    """Those of the version that the tables have stay as they were written down when it began; new ones may be null.
+
+    Where this fails, raise TABLE_VERSION and write down the columns of the new one, or let the new column be nullable.
+    """
+    frozen = json.loads((Path(__file__).parent / f"tables_version_{TABLE_VERSION}.json").read_text())
+    now = {}
+    for name in table_schemas():
+        contract = json.loads((SCHEMAS / f"{name}.json").read_text())
+        assert contract["version"] == TABLE_VERSION
+        now[name] = {column["name"]: [column["type"], column["nullable"]] for column in contract["columns"]}
+    for name, columns in frozen.items():
+        kept = {column: now[name].get(column) for column in columns}
+        assert kept == columns, f"{name}: a column was removed or changed"
+        added = {column: about for column, about in now[name].items() if column not in columns}
+        assert all(nullable for _, nullable in added.values()), f"{name}: a column was added that may not be null"

@@ -97,7 +97,7 @@ def test_words_that_are_none_of_ours_are_named(tmp_path: Path, name: str) -> Non
         tables.read_closures(tmp_path / "c")
 
 
-@pytest.mark.parametrize("name", ["shared_references", "shared_overlap", "reverse_inliers", "scale", "covariance"])
+@pytest.mark.parametrize("name", ["shared_references", "shared_overlap", "reverse_inliers", "scale"])
 def test_a_ledger_of_an_older_version_is_told_apart(tmp_path: Path, name: str) -> None:
     tables.write_closures(tmp_path / "c", RUN.closures, RUN.keyframes, METADATA)
     pq.write_table(pq.read_table(tmp_path / "c").drop_columns([name]), tmp_path / "c")
@@ -167,7 +167,9 @@ def test_same_run_same_bytes(tmp_path: Path) -> None:
 def test_every_file_says_what_made_it(tmp_path: Path) -> None:
     for path in write_all(tmp_path):
         header = tables.read_metadata(path)
-        assert sorted(header) == ["vplog.library", "vplog.settings", "vplog.table", "vplog.version"]
+        assert sorted(header) == [
+            *("vplog.library", "vplog.settings", "vplog.table", "vplog.table_version", "vplog.version")
+        ]
         assert json.loads(header["vplog.settings"]) == METADATA.settings
         assert header["vplog.table"] == path.stem
 

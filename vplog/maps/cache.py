@@ -2,11 +2,12 @@
 
     CACHE/maps/objects/SHA256       files of drives and of libraries, by what is in them
     CACHE/maps/libraries/HASH.json  sha256 of each file of a library
-    CACHE/maps/index/ID/...         the index of a map, by where the map is, and of each of its files a seal
+    CACHE/maps/index/ID/...         the index of a map, by where the map is
     CACHE/maps/open/...             the folders of processes that read at the moment, with links to the above
 
 Nothing in it is taken on trust: an object must have the hash that its manifest names, a library the hash that it is
-called by, a part of an index its seal. What does not is fetched or made anew. The folder may be removed at any time.
+called by, a part of an index its checksum. What does not is fetched or made anew. The folder may be removed at any
+time.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import SettingsError
 from vplog.maps.layout import HASH, sha256_of
-from vplog.maps.segment import read_checksum
 from vplog.remote import s3_place
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ VARIABLE = "VPLOG_CACHE"
 MOST_GB = 20.0
 """That it takes, in 10^9 bytes, unless a verb is told: the index and the descriptors of 80 million places at 240 bytes
 each, and little of today's disks."""
-_SEAL = ".seal"
 _LEFT_OVER_S = 86_400.0
 """A half-written file of a process that was killed goes after a day: none takes that long."""
 _RECORD_BYTES = 10**5
@@ -170,29 +169,6 @@ def _users() -> Path | None:
         return Path.home() / ".cache" / "vplog"
     except RuntimeError:  # a user without a home
         return None
-
-
-def seal(path: Path, checksum: str) -> None:
-    """Write down what a part of an index says if it is whole, before it is there. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    part.write_text(checksum)
-    part.replace(seal_of(path))
-
-
-def seal_of(path: Path) -> Path:
-    return path.with_name(path.name + _SEAL)
-
-
-def is_sealed(path: Path) -> bool:
-    """Whether a part of an index is what was written; it is read through for that."""
-    try:
-        said = seal_of(path).read_text(encoding="ascii")
-        for file in (path, seal_of(path)):
-            os.utime(file)
-        return said == read_checksum(path)
-    except (OSError, ValueError):
-        return False
 
 
 def _link(source: Path, target: Path) -> None:

@@ -7,12 +7,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 
 from vplog.between import no_candidates, proposed_in, with_proposals
-from vplog.errors import ResultError
 from vplog.extract import map_in_order
-from vplog.maps.index import of_drive, update_index
+from vplog.maps.damage import reading_drive
+from vplog.maps.index import as_described, update_index
 from vplog.maps.search import best_places
 from vplog.maps.sequences import PLACES_A_VIEW, credits_of
 from vplog.places.bobb import BobbState
@@ -38,15 +37,11 @@ _AT_ONCE = 64
 
 
 def places_of(store: Store, member: Member, state: PlaceState) -> Sequence[Any]:
-    """The places of a drive. Raises ResultError where they are of another recogniser."""
+    """The places of a drive. Raises DamagedDriveError where they are of another recogniser."""
     path = store.file(member.drive, "descriptors.parquet")
-    column, _ = tables.read_descriptors(path)
-    try:
-        column = column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
-    except pa.ArrowException:
-        raise ResultError(f"{path} is of another recogniser. Remove the drive's folders.") from None
-    with of_drive(store, member.drive):
-        return state.from_arrow(column)
+    with reading_drive(member.drive):
+        column, _ = tables.read_descriptors(path)
+        return state.from_arrow(as_described(store, member.drive, column, state))
 
 
 def candidates_of(

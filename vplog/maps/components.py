@@ -23,6 +23,7 @@ from vplog.graph import joint as graph_joint
 from vplog.graph.build import parts
 from vplog.graph.correct import correct_trajectory
 from vplog.joint_graph import between_of, judged_by, own_drive
+from vplog.maps.damage import reading_drive
 from vplog.maps.keys import key_of
 from vplog.results import g2o, run_record, tables
 
@@ -111,7 +112,10 @@ def solve_group(group: Group, runs: dict[str, Path], solving: Solving, staging: 
     What joint.json says of the group: its `components`, and which pairs are kept `apart`, and why. Raises GraphError
     where it cannot be solved, and ResultError where a drive's folder is damaged.
     """
-    loaded = [_drive(runs[drive]) for drive in group.drives]
+    loaded = []
+    for drive in group.drives:
+        with reading_drive(drive):
+            loaded.append(_drive(runs[drive]))
     at = {drive: number for number, drive in enumerate(group.drives)}
     ledgers = [_ledger(tie) for tie in group.ties]
     between = [
@@ -174,7 +178,8 @@ def _write(
         place = folder / runs[drive].name
         place.mkdir(exist_ok=True)
         poses = joined.world_from_body[member]
-        _, odometry = tables.read_trajectory(runs[drive] / "trajectory.parquet")
+        with reading_drive(drive):
+            _, odometry = tables.read_trajectory(runs[drive] / "trajectory.parquet")
         tables.write_keyframes(place / "keyframes.parquet", own, poses, header)
         tables.write_trajectory(
             place / "trajectory.parquet", correct_trajectory(odometry, own, poses), odometry, header

@@ -10,6 +10,7 @@ import numpy as np
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import store as map_store
+from vplog.maps.damage import left_out, without_damaged
 from vplog.maps.earth import earth_as_plain, earth_of_run, inside
 from vplog.remote import local_copy
 from vplog.results import tables
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Floats
     from vplog.maps.earth import Box
+    from vplog.maps.store import Store
     from vplog.results.places_map import DrivePlaces
     from vplog.results.shown import Earth
 
@@ -64,17 +66,7 @@ def export_map(
         raise SettingsError(f"{maps[0]} is a map: export it alone, or put maps together first with `vplog map merge`.")
     if maps:
         with map_store.reading(maps[0]) as store:
-            _, known = map_store.one_library(store)
-            unknown = [drive for drive in drives if drive not in known]
-            if unknown:
-                raise SettingsError(f"{store} has no drive {unknown[0]!r}. Drives: {', '.join(known)}.")
-            about = ("inputs", "topics", "earth")
-            chosen = {
-                drive: {name: record[name] for name in about if record.get(name) is not None}
-                for drive, record in known.items()
-                if drive in drives or not drives
-            }
-            return _write(path, _Source(chosen, store.earth, store.read, store.forget), box, kind, progress)
+            return without_damaged(store, lambda: _export_drives(store, path, drives, box, kind, progress))
     if drives:
         raise SettingsError("--drive chooses among the drives of a map, and what is given are runs. Leave it out.")
     with ExitStack() as stack:
@@ -89,6 +81,23 @@ def export_map(
             lambda drive, of, _: of(run[drive]), lambda _: None,
         )  # fmt: skip
         return _write(path, source, box, kind, progress)
+
+
+def _export_drives(
+    store: Store, path: Path, drives: Sequence[str], box: Box | None, kind: str, progress: Progress
+) -> dict[str, Any]:
+    _, known = map_store.one_library(store)
+    unknown = [drive for drive in drives if drive not in known and drive not in store.damaged]
+    if unknown:
+        raise SettingsError(f"{store} has no drive {unknown[0]!r}. Drives: {', '.join(known)}.")
+    about = ("inputs", "topics", "earth")
+    chosen = {
+        drive: {name: record[name] for name in about if record.get(name) is not None}
+        for drive, record in known.items()
+        if drive in drives or not drives
+    }
+    written = _write(path, _Source(chosen, store.earth, store.read, store.forget), box, kind, progress)
+    return {**written, "warnings": left_out(store)}
 
 
 def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Progress) -> dict[str, Any]:

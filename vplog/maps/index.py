@@ -9,9 +9,10 @@ folder may be removed at any time.
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
@@ -20,14 +21,14 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
-from vplog.maps.cache import is_sealed, seal, seal_of
-from vplog.maps.segment import SUFFIX, Content, Segment, checksum, open_segment, write_segment
+from vplog.maps.damage import DamagedDriveError, reading_drive
+from vplog.maps.segment import SUFFIX, Content, Segment, open_segment, write_segment
 from vplog.maps.store import other_library
 from vplog.parquet_bounds import check_file
 from vplog.results import tables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from vplog.data import Int32s
@@ -82,8 +83,6 @@ def update_index(
     for group in groups:
         segment, path = _build(store, group, library, state, threads), None
         try:
-            if _in_cache(store):
-                seal(store.index / segment.name, checksum(segment))
             path = write_segment(store.index, segment)
             segment = open_segment(path)
         except (ResultError, OSError) as error:
@@ -107,7 +106,11 @@ def content_of(store: Store, drive: str, key: str) -> Content:
     """What a drive holds now; on an object store as its manifest says. Raises ResultError."""
     if store.mirror is not None and (mark := store.mirror.digest(drive, "descriptors.parquet")):
         return Content(drive, key, mark)
-    path = _descriptors(store, drive)
+    with reading_drive(drive):
+        return Content(drive, key, _footer_hash(_descriptors(store, drive)))
+
+
+def _footer_hash(path: Path) -> str:
     try:
         check_file(path)
         with path.open("rb") as stream:
@@ -116,12 +119,11 @@ def content_of(store: Store, drive: str, key: str) -> Content:
             end = stream.read(8)
             length = int.from_bytes(end[:4], "little")  # of the footer, as Parquet ends
             if end[4:] != b"PAR1" or length > size - 8:
-                raise ResultError(f"{path} is damaged. Remove the drive's folders, and add its log again.")
+                raise ResultError(f"{path} is damaged.")
             stream.seek(size - 8 - length)
-            mark = hashlib.sha256(stream.read(length)).hexdigest()
+            return hashlib.sha256(stream.read(length)).hexdigest()
     except OSError as error:
-        raise ResultError(f"{path} cannot be read: {error.strerror or error}. Remove the drive's folders.") from None
-    return Content(drive, key, mark)
+        raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
 
 
 def _descriptors(store: Store, drive: str) -> Path:
@@ -133,16 +135,16 @@ def _open_all(store: Store, library: str, state: BobbState) -> tuple[list[tuple[
     known, useless, warnings = [], [], []
     shape = (len(state.matcher), state.settings.boxes)
     for path in sorted(store.index.glob(f"*{SUFFIX}")):
-        if _in_cache(store) and not is_sealed(path):  # without a word: it costs time alone
-            useless.append(path)
-            continue
         try:
             segment = open_segment(path)
+            if _in_cache(store):
+                with suppress(OSError):
+                    os.utime(path)  # what was not used for longest goes first
         except FileNotFoundError:  # another process has put it into a larger one
             continue
         except ResultError as error:
             useless.append(path)
-            warnings.append(f"{error} It was left out.")
+            warnings += [] if _in_cache(store) else [f"{error} It was left out."]  # there it costs time alone
             continue
         fits = segment.library == library
         if fits and (segment.lists.start.shape[0], segment.lists.boxes.shape[1]) == shape:
@@ -191,9 +193,10 @@ def _plan(
 def _build(store: Store, group: Sequence[Content], library: str, state: BobbState, threads: int) -> Segment:
     def read(one: Content) -> pa.Array:
         path = _descriptors(store, one.drive)
-        column, made_by = tables.read_descriptors(path)
-        if made_by != library:
-            raise LibraryError(other_library(store, one.drive, made_by, library))
+        with reading_drive(one.drive):
+            column, made_by = tables.read_descriptors(path)
+            if made_by != library:
+                raise LibraryError(other_library(store, one.drive, made_by, library))
         if content_of(store, one.drive, one.key) != one:
             raise ResultError(f"{path} was replaced while it was read. Run again.")
         return as_described(store, one.drive, column, state)
@@ -205,21 +208,10 @@ def _build(store: Store, group: Sequence[Content], library: str, state: BobbStat
         lists = state.lists(*columns)
     except LibraryError:
         for one, column in zip(group, columns, strict=True):  # whose they are
-            with of_drive(store, one.drive):
+            with reading_drive(one.drive):
                 state.lists(column)
         raise
     return Segment(library, tuple(group), first, lists)
-
-
-@contextmanager
-def of_drive(store: Store, drive: str) -> Iterator[None]:
-    """Raises what is wrong with the places of a drive with its name, and what to do."""
-    try:
-        yield
-    except LibraryError as error:
-        raise LibraryError(
-            f"The places of {drive} are damaged. {error} Take the drive out: vplog map remove {store} {drive}"
-        ) from None
 
 
 def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.Array:
@@ -227,15 +219,13 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
     try:
         return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:
-        raise ResultError(
-            f"{_descriptors(store, drive)} is of another recogniser. Remove the drive's folders."
-        ) from None
+        raise DamagedDriveError(f"{_descriptors(store, drive)} is of another recogniser.", drive) from None
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:
     """Who has them open keeps them. A file that cannot be removed does no harm."""
     parts = list(store.index.glob(".*.part"))
-    for path in [*paths, *map(seal_of, paths), *parts]:
+    for path in [*paths, *parts]:
         try:
             if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
                 path.unlink(missing_ok=True)

@@ -5,13 +5,17 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
+
 from vplog.errors import LibraryError, ResultError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.damage import damaged_files, left_out, without_damaged
 from vplog.maps.earth import bounds_of, is_finite
 from vplog.maps.imports import ALONE
 from vplog.maps.joint_record import components_in, replaced_since
 from vplog.maps.store import other_library
+from vplog.parquet_bounds import open_table
 from vplog.places.stored import read_library_record
 from vplog.results import run_record
 
@@ -25,13 +29,42 @@ _READ_AT_ONCE = 16
 """Drives: on an object store each is a request that takes some 20 to 50 ms."""
 
 
-def describe_map(root: Path) -> dict[str, Any]:
-    """Drives, places, bytes, library, what joins the drives, and failures of a map, without reading a descriptor.
+def describe_map(root: Path, check: bool = False) -> dict[str, Any]:
+    """Drives, places, bytes, library, what joins the drives, and failures of a map, without reading a descriptor; with
+    `check` every file of its drives is read, and `damaged_files` are those that are not as they were written.
 
     Raises ResultError.
     """
     with map_store.reading(root) as store:
-        return _describe(store)
+        found = without_damaged(store, lambda: _describe(store))
+        return {**found, "damaged_files": _damaged_files(store) if check else []}
+
+
+def _damaged_files(store: Store) -> list[str]:
+    """A line for each; of a map on an object store every file is held against its manifest as it is fetched."""
+    folders = sorted(path.parent for path in store.root.glob("runs/drive=*/drive.json"))
+    if store.mirror is None:
+        lines = [line for folder in folders for line in damaged_files(folder)]
+        tables = (
+            path for path in sorted(store.root.rglob("*.parquet")) if path.relative_to(store.root).parts[0] != "runs"
+        )
+        return [*lines, *(line for path in tables for line in _damaged_table(path))]
+    wrong = []
+    for drive in store.mirror.manifests:
+        try:
+            store.whole(drive)
+        except ResultError as error:
+            wrong.append(str(error))
+        store.forget(drive)
+    return wrong
+
+
+def _damaged_table(path: Path) -> list[str]:
+    try:
+        open_table(path).close()
+    except (OSError, ValueError, pa.ArrowException, ResultError) as error:
+        return [f"{path}: {str(error).splitlines()[0]}"]
+    return []
 
 
 def _describe(store: Store) -> dict[str, Any]:
@@ -51,7 +84,8 @@ def _describe(store: Store) -> dict[str, Any]:
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
             f"another version of vplog. `vplog batch` with their logs makes them anew; the first is {other[0]}."
         )
-    problems += _left_behind(store, list(abouts))
+    problems += left_out(store)
+    problems += _left_behind(store, [*abouts, *store.damaged])
     places = sum(one["keyframes"] for one in drives)
     stored = sum(one["descriptor_bytes"] for one in drives)
     about_library = {}
@@ -73,6 +107,7 @@ def _describe(store: Store) -> dict[str, Any]:
         "components": _components(store, abouts, problems),
         "drives": drives,
         "failures": store.failures(),
+        "damaged": dict(sorted(store.damaged.items())),
         "problems": problems,
     }
 

@@ -14,6 +14,7 @@ from vplog.between import likely_drives, shared_of
 from vplog.cores import limited
 from vplog.maps import pairs
 from vplog.maps.candidates import candidates_of, places_of
+from vplog.maps.damage import left_out, without_damaged
 from vplog.maps.roster import is_up_to_date, read_drives, settled_ties
 from vplog.maps.store import reading, writing
 from vplog.maps.tasks import each_done
@@ -75,6 +76,13 @@ def join(
     left out with a reason, and tried again the next time. Raises VplogError where the map as a whole cannot be read or
     written.
     """
+    return without_damaged(store, lambda: _join(store, pipeline, executor, threads, progress, places))
+
+
+def _join(
+    store: Store, pipeline: Pipeline, executor: Executor | None, threads: int, progress: Progress,
+    places: Callable[[], PlaceState] | None,
+) -> dict[str, Any]:  # fmt: skip
     watch = Watch()
     if store.mirror is not None:  # what joins drives goes to and from an object store as a whole
         lean = pipeline.join.model_copy(update={"keep_features": False})
@@ -90,10 +98,10 @@ def join(
     with watch.stage("solve"), limited(threads):
         ties = settled_ties(store, drives)
         record = solve_groups(store, drives, ties, pipeline, progress)
-    left_out = [f"{later} in {earlier} was left out. {reason}" for (later, earlier), reason in reasons.items()]
+    unjoined = [f"{later} in {earlier} was left out. {reason}" for (later, earlier), reason in reasons.items()]
     for group in record["groups"]:
-        left_out += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
-        left_out += [
+        unjoined += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
+        unjoined += [
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
@@ -103,14 +111,14 @@ def join(
         if (sight := pairs.known_sight(store, member, pipeline)) is not None and sight.camera["matrix"] is None
     ]
     if blind:
-        left_out.append(f"No calibration, so no closure with metres that could join them: {', '.join(blind)}.")
+        unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(blind)}.")
     return {
         "searched": [drives.members[at].drive for at in new],
         "pairs": len(ties),
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
         "alone": record["alone"],
-        "warnings": [*drives.apart.values(), *left_out],
+        "warnings": [*left_out(store), *drives.apart.values(), *unjoined],
         "stages": watch.stages,
     }
 

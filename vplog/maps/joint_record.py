@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.parquet_bounds import check_version
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -13,8 +14,8 @@ if TYPE_CHECKING:
 
     from vplog.maps.store import Store
 
-FORMAT = 1
-"""Version of this record. A reader refuses another one."""
+FORMAT = run_record.FORMAT
+"""Version of this record. A reader refuses a newer one."""
 
 
 def read_joint(root: Path) -> dict[str, Any]:
@@ -36,8 +37,9 @@ def read_joint(root: Path) -> dict[str, Any]:
         and all(map(_is_component, group["components"]))
         for group in groups
     )
-    if record.get("format") != FORMAT or not sound:
-        raise ResultError(f"{path} is of another version or damaged. Run `vplog map join {root}` to write it anew.")
+    check_version(path, record.get("format"), FORMAT)
+    if not sound:
+        raise ResultError(f"{path} is damaged. Run `vplog map join {root}` to write it anew.")
     return record
 
 

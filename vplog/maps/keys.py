@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+BESIDE = ("key", "log", "earth", "format", "files")
+"""What of drive.json its key does not depend on."""
+
+
 def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, Any]], inputs: list[Any]) -> list[str]:
     """The ID of each log: that under which the map knows it, by its path or else by its content; else its name, with
     a number where others have the same. Logs given in the same order to an empty map get the same IDs."""
@@ -58,7 +62,7 @@ def free_name(drive: str, log: str, known: Collection[str]) -> str:
 
 def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
     """drive.json of the same drive under another ID: with the key that a batch would give it."""
-    made_from = {name: value for name, value in record.items() if name not in ("key", "log", "earth")}
+    made_from = {name: value for name, value in record.items() if name not in BESIDE}
     if key_of(made_from) != record["key"]:
         return {**record, "drive": drive}
     return {**record, "drive": drive, "key": key_of({**made_from, "drive": drive})}

@@ -13,8 +13,8 @@ from vplog.results import run_record
 if TYPE_CHECKING:
     from pathlib import Path
 
-FORMAT = 1
-"""Version of this layout. A reader refuses another one."""
+FORMAT = run_record.FORMAT
+"""Version of this layout. A reader refuses a newer one."""
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 """Data sets of a map: each is a file of this name in every run folder."""
 AT_HAND = (*(f"{name}.parquet" for name in TABLES), "run.json")
@@ -51,9 +51,9 @@ def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """What drive.json of `folder` says, checked. Raises ResultError."""
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
-        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Remove the folder and run again.")
+        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Give its log to `vplog batch` again.")
     if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
-        raise ResultError(f"{folder} holds drive {record['drive']!r}. Remove the folder and run again.")
+        raise ResultError(f"{folder} holds drive {record['drive']!r}, which is another.")
     return record
 
 

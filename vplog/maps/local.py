@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.layout import TABLES, drive_record, folder_name, sha256_of
 from vplog.results.atomic import replacing
+from vplog.scratch import sync, sync_all
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,7 +66,10 @@ def settle(store: Store) -> None:
             if not (store.root / "runs" / left.name).exists():
                 shutil.rmtree(left, ignore_errors=True)
     for drive in store.drives():
-        link_tables(store, drive)
+        try:
+            link_tables(store, drive)
+        except ResultError as error:
+            store.damaged[drive] = str(error)
 
 
 def _whole(made: Path) -> str | None:
@@ -92,6 +96,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
     try:
         run.parent.mkdir(exist_ok=True)
         shutil.rmtree(replaced, ignore_errors=True)
+        sync_all(made)
         if not run.exists():
             made.rename(run)
         elif exchanged(made, run):
@@ -100,6 +105,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
             run.rename(replaced)
             (replaced / "drive.json").unlink(missing_ok=True)  # so that nobody takes it for a new one
             made.rename(run)
+        sync(run.parent)
     except OSError as error:
         raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
     shutil.rmtree(replaced, ignore_errors=True)
@@ -117,7 +123,7 @@ def link_tables(store: Store, drive: str) -> None:
     for name in TABLES:
         source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
         if not source.is_file():
-            raise ResultError(f"{source} is not there. Remove {store.run(drive)} and run again.")
+            raise ResultError(f"{source} is not there.")
         if path.exists() and (path.samefile(source) or _same_copy(source, path)):
             continue
         part = store.staging / f"{name}-{os.getpid()}.parquet"

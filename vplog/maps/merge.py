@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
+from vplog.maps.damage import damaged_files, left_out
 from vplog.maps.imports import ALONE, drives_of_file, library_of_file, take_places
 from vplog.maps.layout import folder_name
 from vplog.maps.pairs import KEPT
@@ -49,7 +50,7 @@ def merge_maps(
 def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Sequence[str]) -> dict[str, Any]:
     library = _check_libraries(sources, target)
     _check_chosen(sources, chosen)
-    fate: list[dict[str, Any]] = []
+    fate, warnings = list[dict[str, Any]](), list[str]()
     with map_store.writing(target) as store:
         there = _There(store.drives())
         for number, source in enumerate(sources):
@@ -60,9 +61,18 @@ def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Se
                 _, drives = map_store.one_library(other)
                 _take_library(store, other, library)
                 for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
+                    if wrong := _damage(other, drive):
+                        other.damaged[drive] = wrong
+                        continue
                     fate.append(_take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}"))
                     progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
-        return {"map": str(store), "library": library, "drives": fate}
+                warnings += left_out(other)
+        return {"map": str(store), "library": library, "drives": fate, "warnings": warnings}
+
+
+def _damage(store: Store, drive: str) -> str:
+    """What is wrong with the files of a drive; empty where nothing is. A store has the sha256 of what it gives out."""
+    return "" if store.mirror is not None else " ".join(damaged_files(store.run(drive))[:1])
 
 
 def _check_libraries(sources: Sequence[Path], target: Path) -> str:
@@ -107,7 +117,7 @@ def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
             known |= drives_of_file(source).keys()
             continue
         with map_store.reading(source) as other:
-            known |= other.drives().keys()
+            known |= other.drives().keys() | other.damaged.keys()
     unknown = [drive for drive in chosen if drive not in known]
     if unknown:
         raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(in_order(known))}.")
@@ -215,7 +225,7 @@ def _content(record: dict[str, Any]) -> str:
     """What a drive is of: the content of its log and what of that was used; without that, all that is known of it."""
     if record["inputs"]:
         return run_record.canonical_json([record["inputs"], record.get("topics")])
-    own = ("earth", "key", "drive")
+    own = ("earth", "key", "drive", "format", "files")
     return run_record.canonical_json({name: value for name, value in record.items() if name not in own})
 
 

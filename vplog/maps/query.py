@@ -13,6 +13,7 @@ from vplog.errors import LibraryError, LogError, ResultError
 from vplog.extract import extract_frames, map_in_order, one_thread_each
 from vplog.keyframes import select_keyframes
 from vplog.maps import store as map_store
+from vplog.maps.damage import left_out, reading_drive, without_damaged
 from vplog.maps.index import update_index
 from vplog.maps.search import best_places
 from vplog.maps.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from vplog.data import Ints
     from vplog.maps.answers import Answers
     from vplog.maps.cache import Cache
+    from vplog.maps.index import Part
     from vplog.maps.store import Store
     from vplog.stages import Log, PlaceState
 
@@ -63,15 +65,21 @@ def query_map(
     if out is not None and out.is_dir():
         raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
     with map_store.reading(root, cache) as store:
-        drives, pipeline, state = open_map(store, threads)
+        _, pipeline, state = open_map(store, threads)
         settings = pipeline.sequence
         if sequence is not None:
             settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
         log = logs.open(path, topics)
         stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
-        warnings += _short(store, drives, settings.length)
-        answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
-        table = _table(store, list(drives), answers, stamps)
+
+        def look() -> tuple[list[str], Answers, list[str], pa.Table]:
+            drives = map_store.one_library(store)[1]
+            short = _short(store, drives, settings.length)
+            answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
+            return list(drives), answers, short + told, _table(store, list(drives), answers, stamps)
+
+        drives, answers, told, table = without_damaged(store, look)
+        warnings += left_out(store)
     if out is not None:
         pipeline = pipeline.model_copy(update={"sequence": settings})
         write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
@@ -100,10 +108,15 @@ def index_map(
     if isinstance(root, RemotePath) and cache is None:
         raise ResultError(f"The index of {root} is kept in a cache alone, and there is none. Name one with --cache.")
     with map_store.reading(root, cache) as store:
-        drives, _, state = open_map(store, threads)
+        _, _, state = open_map(store, threads)
         if not isinstance(state, BobbState):
             raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
-        parts, warnings = update_index(store, drives, state.hash, state, threads, progress)
+
+        def update() -> tuple[dict[str, Any], list[Part], list[str]]:
+            drives = map_store.one_library(store)[1]
+            return drives, *update_index(store, drives, state.hash, state, threads, progress)
+
+        drives, parts, warnings = without_damaged(store, update)
         files = [part.path for part in parts if part.path is not None]
         return {
             "map": str(root),
@@ -111,7 +124,7 @@ def index_map(
             "places": sum(part.places for part in parts),
             "segments": [str(path) for path in files],
             "bytes": sum(path.stat().st_size for path in files),
-            "warnings": warnings,
+            "warnings": left_out(store) + warnings,
         }
 
 
@@ -221,7 +234,8 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) 
     numbers: list[int] = number.tolist()
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
-        known = tables.read_stamps(path)
+        with reading_drive(drives[one]):
+            known = tables.read_stamps(path)
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")

@@ -25,7 +25,9 @@ def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
         failures, known = store.failures(), store.drives()
         _check(store, drives)
         for drive in drives:
-            if drive in known or drive in failures:  # of a drive that failed there may be a cache
+            if (
+                drive in known or drive in store.damaged or drive in failures
+            ):  # of a drive that failed there may be a cache
                 map_store.remove(store, drive)
         kept = {drive: told for drive, told in failures.items() if drive not in drives}
         if kept != failures:
@@ -48,7 +50,7 @@ def _still_joined(store: map_store.Store, drives: Sequence[str]) -> list[str]:
 
 
 def _check(store: map_store.Store, drives: Sequence[str]) -> None:
-    known = [*store.drives(), *store.failures()]
+    known = [*store.drives(), *store.damaged, *store.failures()]
     for drive in drives:
         if drive not in known:
             raise SettingsError(f"{store} has no drive {drive!r}. Drives: {', '.join(known) or 'none'}.")

@@ -15,7 +15,8 @@ import numpy as np
 
 from vplog.errors import LibraryError
 from vplog.maps.answers import NONE, Answers, answers_of, merge, no_answers
-from vplog.maps.index import as_described, of_drive
+from vplog.maps.damage import reading_drive
+from vplog.maps.index import as_described
 from vplog.maps.store import other_library
 from vplog.places.sequence import rank_places
 from vplog.results import tables
@@ -58,10 +59,11 @@ def best_lines(
     """
     best = no_answers(len(descriptors), top)
     for done, (number, drive) in enumerate(drives.items()):
-        column, made_by = tables.read_descriptors(store.file(drive, "descriptors.parquet"))
-        if made_by != library:
-            raise LibraryError(other_library(store, drive, made_by, library))
-        with of_drive(store, drive):
+        path = store.file(drive, "descriptors.parquet")
+        with reading_drive(drive):
+            column, made_by = tables.read_descriptors(path)
+            if made_by != library:
+                raise LibraryError(other_library(store, drive, made_by, library))
             index = index_of_part(state, state.from_arrow(as_described(store, drive, column, state)))
         stops = np.full(len(descriptors), len(column), np.int64)
         rankings = rank_places(index, descriptors, stops, top, settings, threads)

@@ -17,21 +17,22 @@ from __future__ import annotations
 
 import time
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import unquote
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 import vplog
-from vplog.errors import LibraryError, ResultError, VplogError
+from vplog.errors import LibraryError, NewerError, ResultError, VplogError
 from vplog.maps import local
+from vplog.maps.damage import check_at_hand, hashes_of, reading_drive
 from vplog.maps.earth import earth_from_plain, earth_of_made, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
-from vplog.parquet_bounds import check_file
+from vplog.parquet_bounds import check_version, read_footer
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
-from vplog.scratch import scratch
+from vplog.scratch import files_in, put_in_place, scratch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -71,6 +72,8 @@ class Store:
     root: Path
     mirror: Mirror | None = None
     """None for a map that is a folder."""
+    damaged: dict[str, str] = field(default_factory=dict)
+    """Drives that `drives` leaves out, and why."""
 
     def __str__(self) -> str:
         """As its user calls it."""
@@ -131,15 +134,17 @@ class Store:
         return {file.relative_to(run).as_posix(): file.stat().st_size for file in files}
 
     def rows(self, name: str, drive: str) -> int:
-        """Rows of a table of a drive, by its footer. Raises ResultError."""
+        """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
         if self.mirror is not None:
             return int(self.mirror.manifests[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
-        return row_count(self.run(drive) / f"{name}.parquet")
+        with reading_drive(drive):
+            return row_count(self.run(drive) / f"{name}.parquet")
 
     def earth(self, drive: str) -> Earth | None:
-        """Where on earth a drive is, None where nothing says so. Raises ResultError."""
-        about = drive_record(self.root / "runs" / folder_name(drive))
-        return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
+        """Where on earth a drive is, None where nothing says so. Raises DamagedDriveError."""
+        with reading_drive(drive):
+            about = drive_record(self.root / "runs" / folder_name(drive))
+            return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
 
     def keep(self) -> None:
         """Of a map on an object store, send what was made so far beside drives; a folder has it already. Where that
@@ -153,10 +158,34 @@ class Store:
                 send_rest(self.mirror)
 
     def drives(self) -> dict[str, dict[str, Any]]:
-        """drive.json of every finished drive, by ID in order. Raises ResultError where one cannot be read."""
-        folders = sorted(self.root.glob("runs/drive=*"))
-        found = [drive_record(folder) for folder in folders if (folder / "drive.json").is_file()]
-        return {record["drive"]: record for record in sorted(found, key=lambda record: record["drive"])}
+        """drive.json of every finished drive, by ID in order, but for those that are damaged. Raises NewerError."""
+        found = dict[str, dict[str, Any]]()
+        for folder in sorted(self.root.glob("runs/drive=*")):
+            if not (folder / "drive.json").is_file():
+                continue
+            try:
+                record = self._sound_record(folder)
+            except NewerError:
+                raise
+            except ResultError as error:
+                self.damaged.setdefault(_drive_of(folder), str(error))
+            else:
+                if record["drive"] not in self.damaged:
+                    found[record["drive"]] = record
+        return dict(sorted(found.items()))
+
+    def _sound_record(self, folder: Path) -> dict[str, Any]:
+        """drive.json of a run folder whose tables are there. Raises ResultError."""
+        record = drive_record(folder)
+        if self.mirror is None:
+            try:
+                check_at_hand(folder, record)
+            except ResultError:
+                if _identity(folder) is None:
+                    raise
+                record = drive_record(folder)  # of a folder that was replaced meanwhile
+                check_at_hand(folder, record)
+        return record
 
     def read(self, drive: str, of: Callable[[Path], T], names: Iterable[str] = AT_HAND) -> T:
         """What a function makes of these files of the run folder, all of one state of the drive: of the folder that a
@@ -172,7 +201,8 @@ class Store:
                 found = of(folder)
             except ResultError:
                 if before is not None and _identity(folder) == before:
-                    raise
+                    with reading_drive(drive):
+                        raise
                 continue
             if before is not None and _identity(folder) == before:
                 return found
@@ -194,11 +224,7 @@ class Store:
                 raise ResultError(f"{self} is the folder of one run, not a map. Make one: vplog batch LOG... -o MAP")
             raise ResultError(f"{self} is not a map: it has no map.json. Make one: vplog batch LOG... -o {self}")
         record = run_record.read_run_json(path)
-        if record.get("format") != FORMAT:
-            raise ResultError(
-                f"{path} is of format {record.get('format')!r}, and this vplog reads {FORMAT}. Use the vplog that made "
-                f"it ({record.get('vplog')!r})."
-            )
+        check_version(path, record.get("format"), FORMAT, record.get("vplog"))
         library, settings = record.get("library"), record.get("settings")
         known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
@@ -285,12 +311,17 @@ def publish(store: Store, drive: str, made: Path) -> None:
     """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have. Where it is on
     earth is noted with it. Raises ResultError; then the map has the drive as before.
     """
-    about = drive_record(made)
+    about = {**drive_record(made), "format": FORMAT}
+    about.pop("files", None)  # of the map that it comes from
     if "earth" not in about:
-        run_record.write_run_json(made / "drive.json", {**about, "earth": earth_of_made(made)})
+        about["earth"] = earth_of_made(made)
+    store.damaged.pop(drive, None)
     if store.mirror is None:
+        names = [name for name in files_in(made) if name != "drive.json"]
+        run_record.write_run_json(made / "drive.json", {**about, "files": hashes_of(made, names)})
         local.publish(store, drive, made)
         return
+    run_record.write_run_json(made / "drive.json", about)
     from vplog.maps import sending
 
     sending.publish(store.mirror, drive, made)
@@ -325,7 +356,7 @@ def add_library(store: Store, made: Path, digest: str) -> Path:
     try:
         folder.parent.mkdir(exist_ok=True)
         if not folder.exists():
-            made.rename(folder)
+            put_in_place(made, folder)
     except OSError as error:
         raise ResultError(f"Cannot put the library into {store}: {error.strerror}.") from None
     if store.mirror is not None:
@@ -358,10 +389,17 @@ def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
 def row_count(path: Path) -> int:
     """Rows of a table, by its footer. Raises ResultError."""
     try:
-        check_file(path)
-        return pq.read_metadata(path).num_rows
-    except (OSError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]} Remove the drive's folders.") from None
+        return read_footer(path).num_rows
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+
+
+def _drive_of(folder: Path) -> str:
+    """The drive of a damaged run folder: by its drive.json, else by its name."""
+    try:
+        return str(drive_record(folder)["drive"])
+    except ResultError:
+        return unquote(folder.name.removeprefix("drive="))
 
 
 def _identity(run: Path) -> tuple[int, int, int] | None:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from vplog.errors import VplogError
 from vplog.maps import components
+from vplog.maps.damage import DamagedDriveError
 from vplog.maps.joint_record import read_joint, write_joint
+from vplog.scratch import put_in_place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -68,7 +70,9 @@ def _solved(store: Store, group: Group, drives: Drives, solving: components.Solv
     runs = {drive: store.run(drive) for drive in group.drives}
     try:
         told = components.solve_group(group, runs, solving, staging)
-    except VplogError as error:  # a damaged drive must not take the others along; it is tried again
+    except DamagedDriveError:  # the others are solved without it
+        raise
+    except VplogError as error:  # one group must not take the others along; it is tried again
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
     for component in told["components"]:
         place = store.root / "joint" / component["folder"]
@@ -76,6 +80,6 @@ def _solved(store: Store, group: Group, drives: Drives, solving: components.Solv
             continue
         place.parent.mkdir(exist_ok=True)
         shutil.rmtree(place, ignore_errors=True)
-        (staging / component["folder"]).rename(place)
+        put_in_place(staging / component["folder"], place)
     shutil.rmtree(staging, ignore_errors=True)
     return told

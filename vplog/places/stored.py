@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -11,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
 from vplog.image_file import BadImageError, decode_image
-from vplog.parquet_bounds import check_file, open_table, read_table
+from vplog.parquet_bounds import check_columns, check_file, check_version, open_table, read_table, write_table
+from vplog.scratch import put_in_place, sync_all
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     from vplog.settings import Settings
 
+_FORMAT = 1
+"""Version of library.json. A reader refuses a newer one."""
 _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
@@ -80,7 +83,8 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
         points = np.concatenate([f.points for f in features])
         descriptors = np.concatenate([f.descriptors for f in features])
-        pq.write_table(
+        _write(
+            folder / "features.parquet",
             pa.table(
                 {
                     "reference": owners,
@@ -93,10 +97,10 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
                 },
                 schema=_FEATURES,
             ),
-            folder / "features.parquet",
             compression="zstd",
         )
-        pq.write_table(
+        _write(
+            folder / "references.parquet",
             pa.table(
                 {
                     "drive": [r.drive for r in references],
@@ -107,19 +111,27 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
                 },
                 schema=_REFERENCES,
             ),
-            folder / "references.parquet",
             compression="none",
         )
         record = {
+            "format": _FORMAT,
             "vplog": vplog.__version__,
             "hash": references_hash(references, settings),
             "references": len(references),
             "features": len(owners),
             "settings": settings.model_dump(mode="json"),
         }
-        (folder / "library.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        part = folder / f".library.json.{os.getpid()}.part"
+        part.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        sync_all(folder)
+        put_in_place(part, folder / "library.json")
     except OSError as error:
         raise LibraryError(f"Cannot write the library {folder}: {error.strerror or error}.") from None
+
+
+def _write(path: Path, table: pa.Table, compression: str) -> None:
+    with path.open("wb") as stream:
+        write_table(stream, table, compression=compression)
 
 
 def read_library_record(folder: Path) -> dict[str, Any]:
@@ -135,6 +147,7 @@ def read_library_record(folder: Path) -> dict[str, Any]:
         raise LibraryError(f"{folder}/library.json cannot be read: {error}.") from None
     if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
         raise LibraryError(f"{folder}/library.json lacks its hash or settings; build the library anew.")
+    check_version(folder / "library.json", record.get("format", _FORMAT), _FORMAT, record.get("vplog"))
     return record
 
 
@@ -178,9 +191,15 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
 
 def _table(path: Path, schema: pa.Schema) -> pa.Table:
     with open_table(path) as file:
-        if not file.schema_arrow.equals(schema) or file.metadata.num_rows > _MAX_FEATURES:
+        try:
+            check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+        except ValueError as error:
+            raise LibraryError(
+                f"{path.parent}: the tables are not those of a library ({error}); build it anew."
+            ) from None
+        if file.metadata.num_rows > _MAX_FEATURES:
             raise LibraryError(f"{path.parent}: the tables are not those of a library; build it anew.")
-        return read_table(path, file)
+        return read_table(path, file, schema.names).select(schema.names)
 
 
 def _decode(data: bytes) -> np.ndarray | None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
+from vplog.parquet_bounds import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.results import kept_features, messages, placed, places_map, tables
 from vplog.results.atomic import replacing
 from vplog.results.layouts import layouts
@@ -20,6 +21,7 @@ _HEADER = {
     "vplog.settings": "The full tree of settings as JSON with sorted keys.",
     "vplog.library": "Hash of the place library, empty where none was used.",
     "vplog.version": "Version of vplog that wrote the file.",
+    VERSION_KEY: VERSION_ABOUT,
 }
 
 _MAP_HEADER = {
@@ -78,7 +80,13 @@ def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
                 "description": metadata["description"],
             }
         )
-    contract = {"table": name, "file": f"{name}.parquet", "metadata": _HEADER, "columns": columns}
+    contract = {
+        "table": name,
+        "version": TABLE_VERSION,
+        "file": f"{name}.parquet",
+        "metadata": _HEADER,
+        "columns": columns,
+    }
     if name == "features":
         contract |= {"file": "MAP/joins/drive=ID/features.parquet", "metadata": kept_features.HEADER}
     if name == "joins":

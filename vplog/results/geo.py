@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.geodesy import geodetic
+from vplog.parquet_bounds import write_table
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def write_geoparquet(path: Path, trajectory: Trajectory, earth: Earth, header: d
     )
     table = pa.Table.from_arrays([pa.array(trajectory.stamp_ns, pa.int64()), points(where)], schema=schema)
     with replacing(path) as stream:
-        pq.write_table(table, stream, compression="zstd")
+        write_table(stream, table, compression="zstd")
 
 
 def points(where: Floats) -> pa.Array:

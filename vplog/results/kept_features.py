@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from vplog.data import Features
 from vplog.errors import ResultError
+from vplog.parquet_bounds import VERSION_ABOUT, VERSION_KEY, check_columns, open_table, table_writer
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ HEADER = {
     "vplog.table": "Name of the table.",
     "vplog.made_from": "Hash of all that the features depend on.",
     "vplog.most_features": "Features of a keyframe at most.",
+    VERSION_KEY: VERSION_ABOUT,
 }
 """What the file says of itself."""
 
@@ -61,7 +62,7 @@ def write_features(path: Path, count: int, features: Callable[[int], Features], 
     )
     with (
         replacing(path) as stream,
-        pq.ParquetWriter(stream, schema, compression="zstd", compression_level=_LEVEL, use_dictionary=False) as writer,
+        table_writer(stream, schema, compression="zstd", compression_level=_LEVEL, use_dictionary=False) as writer,
     ):
         for row in range(count):
             own = features(row)
@@ -73,7 +74,7 @@ def write_features(path: Path, count: int, features: Callable[[int], Features], 
                         *(pa.array([np.ascontiguousarray(values, np.float32)], _FLOATS) for values in floats),
                         pa.array([own.descriptors[:most].tobytes()], pa.binary()),
                     ],
-                    schema=schema,
+                    schema=writer.schema,
                 )
             )
 
@@ -84,15 +85,16 @@ class KeptFeatures:
     def __init__(self, path: Path, made_from: str, most: int) -> None:
         """Raises ResultError where there is no such file, or one made from something else or of fewer features."""
         try:
-            self._file = pq.ParquetFile(path)
-        except (OSError, pa.ArrowException) as error:
+            self._file = open_table(path)
+            check_columns(self._file.schema_arrow, FEATURES)
+        except (OSError, ValueError, pa.ArrowException) as error:
             raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}.") from None
         self._path, self._lock = path, threading.Lock()
         self._read = lru_cache(_IN_MEMORY)(self._from_file)
         header = self._file.schema_arrow.metadata or {}
         held = header.get(b"vplog.most_features", b"")
         fits = header.get(b"vplog.made_from") == made_from.encode() and held.isdigit() and int(held) >= most
-        if not fits or not self._file.schema_arrow.equals(FEATURES):
+        if not fits:
             self.close()
             raise ResultError(f"{path} is of another state of the drive, or holds fewer features.")
 
@@ -109,7 +111,7 @@ class KeptFeatures:
     def _from_file(self, row: int) -> Features:
         try:
             with self._lock:
-                table = self._file.read_row_group(row)
+                table = self._file.read_row_group(row, FEATURES.names)
             width, height = (int(table[name][0].as_py()) for name in ("width", "height"))
             x, y, size, depth = (
                 table[name].combine_chunks().flatten().to_numpy() for name in ("x", "y", "size", "depth")

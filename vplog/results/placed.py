@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from vplog.parquet_bounds import write_table
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
@@ -45,4 +45,4 @@ def write_placed(path: Path, table: pa.Table, metadata: TableMetadata) -> None:
     """Write the answers, with what the map is described with in the header."""
     header = {**metadata.record(), "vplog.table": "placed"}
     with replacing(path) as stream:
-        pq.write_table(table.replace_schema_metadata(header), stream, compression="zstd")
+        write_table(stream, table.replace_schema_metadata(header), compression="zstd")

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from vplog import geometry
 from vplog.errors import ResultError
-from vplog.parquet_bounds import check_file, check_size, open_table, read_table
+from vplog.parquet_bounds import check_size, filled, open_table, read_schema, read_table, table_writer
 from vplog.results import geo, run_record, tables
 from vplog.results.atomic import replacing
 
@@ -135,9 +135,9 @@ def write_places(
     points = [] if bounds is None else [pa.field("geometry", pa.binary(), False)]
     schema = pa.schema([*PLACE, *columns, *points], metadata=about)
     places = 0
-    with replacing(path) as stream, pq.ParquetWriter(
+    with replacing(path) as stream, table_writer(
         stream, schema, compression="zstd", compression_level=ZSTD_LEVEL,
-        use_dictionary=["drive"],  # pyright: ignore[reportArgumentType] (the stubs know bool alone)
+        use_dictionary=["drive"],
         column_encoding=dict.fromkeys(_COUNTED, "DELTA_BINARY_PACKED"),
     ) as writer:  # fmt: skip
         for part in chain([first], rest):
@@ -152,7 +152,7 @@ def write_places(
                 if part.where is None or np.any(part.where < bounds[0]) or np.any(part.where > bounds[1]):
                     raise ResultError(f"{part.source} was changed while it was read. Run again.")
                 arrays.append(geo.points(part.where))
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=ROWS_PER_GROUP)
+            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), ROWS_PER_GROUP)
             places += len(part.keyframe)
     return {"written": str(path), "drives": names, "places": places, "library": library}
 
@@ -189,7 +189,7 @@ def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
             "Write one with `vplog map export RUN... -o FILE.parquet`."
         )
     columns = iter([_unpacked(table[name].combine_chunks(), part) for name, part in parts])
-    return table.select(PLACE.names), _joined(kind, columns)
+    return filled(table, PLACE), _joined(kind, columns)
 
 
 @dataclass(frozen=True)
@@ -207,8 +207,7 @@ class AboutMap:
 def about_map(path: Path) -> AboutMap:
     """The header of a map of places. Raises ResultError where it is none."""
     try:
-        check_file(path)
-        header = {key.decode(): value.decode() for key, value in (pq.read_schema(path).metadata or {}).items()}
+        header = {key.decode(): value.decode() for key, value in (read_schema(path).metadata or {}).items()}
         settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
         run_record.canonical_json([settings, drives])  # not nested deeper than can be written again
     except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
@@ -249,7 +248,7 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
             for number in range(file.num_row_groups):
                 if (rows := file.metadata.row_group(number).num_rows) > _MOST_ROWS:
                     raise ResultError(f"{path} has {rows} places in a row group; write it with at most {_MOST_ROWS}.")
-                table = file.read_row_group(number, columns=schema.names).cast(schema)
+                table = filled(file.read_row_group(number, columns=schema.names), schema)
                 for drive, rows in _stretches(table):
                     if waiting and waiting[0]["drive"][0].as_py() != drive:
                         yield _places_of(waiting, path, parts, kind)
@@ -268,8 +267,7 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
 def _opened(path: Path, columns: list[str]) -> Iterator[pq.ParquetFile]:
     """A file of places that takes no more memory than it may, with its drives as numbers. Raises ValueError where these
     columns would take more."""
-    check_file(path)
-    with pq.ParquetFile(path, read_dictionary=["drive"]) as file:
+    with open_table(path, read_dictionary=["drive"]) as file:
         check_size(path, file, columns)
         yield file
 

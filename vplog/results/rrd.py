@@ -12,6 +12,7 @@ from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.results.geo import on_earth
 from vplog.results.mcap_read import read_camera_pose, read_images
+from vplog.scratch import put_in_place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +46,7 @@ def write_rrd(
         _log(recording, rr, keyframes, world_from_body, closures, before, after, earth)
         _log_camera(recording, rr, result)
         recording.disconnect()
-        part.replace(path)
+        put_in_place(part, path)
     except OSError as error:
         raise ResultError(f"Cannot write {path}: {error.strerror or error}.") from None
     finally:

@@ -8,13 +8,15 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
-from vplog.parquet_bounds import check_file
+from vplog.parquet_bounds import check_file, check_version
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
+FORMAT = 1
+"""Version of the records of runs and maps, as `format` in them. A new value does not raise it, another meaning does."""
 _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
@@ -27,7 +29,8 @@ def write_run_json(path: Path, record: dict[str, Any]) -> None:
 
 
 def read_run_json(path: Path) -> dict[str, Any]:
-    """The record of a run folder. Raises ResultError where the file is missing or is no JSON object."""
+    """A record of a run or a map. Raises ResultError where the file is missing or is no JSON object, and NewerError
+    where it is of a newer version."""
     try:
         check_file(path)
         record = _sound_json(path.read_text(encoding="utf-8"))
@@ -39,6 +42,8 @@ def read_run_json(path: Path) -> dict[str, Any]:
         raise ResultError(f"{path} is not JSON. Run `vplog run` again to write it anew.") from None
     if not isinstance(record, dict):
         raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again to write it anew.")
+    if type(version := record.get("format")) is int:
+        check_version(path, version, FORMAT, record.get("vplog"))
     return record
 
 

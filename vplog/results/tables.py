@@ -8,18 +8,26 @@ enters a file, and row groups have a fixed size.
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 import vplog
 from vplog import geometry
 from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.errors import ResultError
-from vplog.parquet_bounds import check_file, open_table, read_table
+from vplog.parquet_bounds import (
+    check_columns,
+    filled,
+    open_table,
+    read_schema,
+    read_table,
+    table_writer,
+    write_table,
+)
 from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
 
@@ -186,10 +194,10 @@ def joins_as_bytes(
     `vplog.made_from`."""
     table = _joins(ledgers)
     schema = _with_metadata(table.schema, "joins", metadata)
-    sink = pa.BufferOutputStream()
+    sink = io.BytesIO()
     table = table.cast(schema.with_metadata({**(schema.metadata or {}), "vplog.made_from": made_from}))
-    pq.write_table(table, sink, compression="zstd", row_group_size=ROWS_PER_GROUP)
-    return sink.getvalue().to_pybytes()
+    write_table(sink, table, ROWS_PER_GROUP, compression="zstd")
+    return sink.getvalue()
 
 
 def _joins(ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]]) -> pa.Table:
@@ -340,14 +348,14 @@ def write_descriptors(
     """
     schema = _with_metadata(descriptors_schema(descriptor), "descriptors", metadata)
     written = 0
-    with replacing(path) as stream, pq.ParquetWriter(stream, schema, compression="zstd") as writer:
+    with replacing(path) as stream, table_writer(stream, schema, compression="zstd") as writer:
         for group in _regrouped(batches, DESCRIPTORS_PER_GROUP):
             rows = np.arange(written, written + len(group), dtype=np.int32)
             written += len(group)
             if written > len(keyframes.stamp_ns):
                 break
             arrays = [pa.array(rows), pa.array(keyframes.stamp_ns[rows], pa.int64()), group]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=DESCRIPTORS_PER_GROUP)
+            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), DESCRIPTORS_PER_GROUP)
         if written != len(keyframes.stamp_ns):
             raise ResultError(
                 f"{path}: {written} descriptors came for {len(keyframes.stamp_ns)} keyframes; each keyframe has one."
@@ -404,8 +412,7 @@ def read_stamps(path: Path) -> Ints:
 def descriptors_type(path: Path) -> pa.DataType:
     """The recogniser's own type of a table of descriptors, of which the footer alone is read. Raises ResultError."""
     try:
-        check_file(path)
-        return pq.read_schema(path).field("descriptor").type
+        return read_schema(path).field("descriptor").type
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
 
@@ -413,8 +420,7 @@ def descriptors_type(path: Path) -> pa.DataType:
 def read_metadata(path: Path) -> dict[str, str]:
     """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
     try:
-        check_file(path)
-        header = pq.read_schema(path).metadata or {}
+        header = read_schema(path).metadata or {}
         return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
     except (OSError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
@@ -431,7 +437,7 @@ def _arrays(schema: pa.Schema, columns: dict[str, Any]) -> list[pa.Array]:
 def _write_table(path: Path, name: str, table: pa.Table, metadata: TableMetadata) -> None:
     table = table.cast(_with_metadata(table.schema, name, metadata))
     with replacing(path) as stream:
-        pq.write_table(table, stream, compression="zstd", row_group_size=ROWS_PER_GROUP)
+        write_table(stream, table, ROWS_PER_GROUP, compression="zstd")
 
 
 def _array(values: Any, column: pa.Field) -> pa.Array:
@@ -452,18 +458,12 @@ def _with_metadata(schema: pa.Schema, name: str, metadata: TableMetadata) -> pa.
 
 
 def _read(path: Path, name: str, schema: pa.Schema) -> pa.Table:
-    """The table with the columns of the schema, checked. Raises ResultError."""
+    """The table with the columns of the schema, checked; null where an older vplog wrote none. Raises ResultError."""
     try:
         with open_table(path) as file:
-            found = file.schema_arrow
-            _check_name(path, name, found)
-            for column in schema:
-                if column.name not in found.names or found.field(column.name).type != column.type:
-                    raise ResultError(
-                        f"{path} has no column {column.name} of type {column.type}: it is of another version of vplog. "
-                        "Run `vplog run` again."
-                    )
-            table = read_table(path, file, schema.names)
+            _check_name(path, name, file.schema_arrow)
+            check_columns(file.schema_arrow, schema)
+            table = filled(read_table(path, file, schema.names), schema)
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
     for column in schema:

@@ -1,0 +1,110 @@
+"""Damaged drives: a drive that cannot be read is named and left out of an answer, and the rest of the map is not."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from vplog.errors import LibraryError, NewerError, ResultError
+from vplog.maps.layout import AT_HAND, drive_record, sha256_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+    from pathlib import Path
+
+    from vplog.maps.store import Store
+
+    T = TypeVar("T")
+
+
+class DamagedDriveError(ResultError):
+    """A file of one drive is damaged or missing."""
+
+    def __init__(self, message: str, drive: str = "") -> None:
+        super().__init__(message)
+        self.drive = drive
+
+
+@contextmanager
+def reading_drive(drive: str) -> Iterator[None]:
+    """Raises DamagedDriveError where a file of the drive cannot be read."""
+    try:
+        yield
+    except (DamagedDriveError, NewerError):
+        raise
+    except (ResultError, LibraryError) as error:
+        raise DamagedDriveError(str(error), drive) from None
+
+
+def without_damaged(store: Store, work: Callable[[], T]) -> T:
+    """What `work` makes of a map; a drive that it finds damaged is left out, and it is done again without."""
+    while True:
+        try:
+            return work()
+        except DamagedDriveError as error:
+            if error.drive in store.damaged:
+                raise
+            store.damaged[error.drive] = str(error)
+
+
+def left_out(store: Store) -> list[str]:
+    """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
+    return [
+        f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
+        f"Compute it again from its log: vplog batch LOG -o {store}"
+        for drive, why in sorted(store.damaged.items())
+    ]
+
+
+def check_at_hand(folder: Path, record: dict[str, Any]) -> None:
+    """Raises ResultError where a table or run.json of a drive is missing or has another length than drive.json has; of
+    a drive whose drive.json has no lengths, as an older vplog wrote it, that is found when it is read."""
+    for wrong in _wrong_lengths(folder, record, AT_HAND if _files(record) else ()):
+        raise ResultError(wrong)
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """A line for each file of a run folder in a map that does not have the sha256 that drive.json names."""
+    try:
+        record = drive_record(folder)
+    except ResultError as error:
+        return [str(error)]
+    files, lines = _files(record), []
+    for name in sorted({*AT_HAND, *files}):
+        wrong = list(_wrong_lengths(folder, record, [name]))
+        if not wrong and name in files:
+            try:
+                if sha256_of(folder / name) != files[name].get("sha256"):
+                    wrong = [f"{folder / name} does not have the sha256 that drive.json names."]
+            except OSError as error:
+                wrong = [f"{folder / name} cannot be read: {error.strerror or error}."]
+        lines += wrong
+    return lines
+
+
+def hashes_of(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Length and sha256 of files of a folder, by name, as drive.json has them. Raises ResultError."""
+    try:
+        return {name: {"bytes": (folder / name).stat().st_size, "sha256": sha256_of(folder / name)} for name in names}
+    except OSError as error:
+        raise ResultError(f"Cannot read {error.filename or folder}: {error.strerror or error}.") from None
+
+
+def _wrong_lengths(folder: Path, record: dict[str, Any], names: Iterable[str]) -> Iterator[str]:
+    files = _files(record)
+    for name in names:
+        path, wanted = folder / name, files.get(name, {}).get("bytes")
+        if not path.is_file():
+            yield f"{path} is not there." if not path.exists() else f"{path} is not a file."
+        elif wanted is not None and path.stat().st_size != wanted:
+            yield f"{path} has {path.stat().st_size} bytes instead of {wanted}."
+
+
+def _files(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Of each file its length and sha256, by drive.json; empty where an older vplog wrote it."""
+    files = record.get("files")
+    sound = isinstance(files, dict) and all(
+        isinstance(about, dict) and not name.startswith("/") and ".." not in name.split("/")
+        for name, about in files.items()
+    )
+    return files if isinstance(files, dict) and sound else {}
