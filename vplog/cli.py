@@ -61,8 +61,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
         _unheard()
         sys.exit(0)
-    except KeyboardInterrupt:
-        _interrupted()
+    except KeyboardInterrupt as error:
+        _interrupted(error)
     except VplogError as error:
         _fail(arguments, str(error))
     except MemoryError:
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
     except Exception as error:  # a fault of ours: still one line, and how to see more
         if was_interrupted(error):
-            _interrupted()
+            _interrupted(error)
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
@@ -124,8 +124,9 @@ def _unheard() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _interrupted() -> NoReturn:
-    say("interrupted; nothing is lost of what was finished in the output folder")
+def _interrupted(error: BaseException) -> NoReturn:
+    known = getattr(error, "__notes__", ["nothing is lost of what was finished in the output folder"])
+    say(f"interrupted; {known[-1]}")
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
 
@@ -136,7 +137,7 @@ def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
         sys.stdout.flush()
     except OSError:  # what it was cannot be told there
         _unheard()
-    say(f"error: {message}")
+    say(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))
     sys.exit(1)
 
 
@@ -187,14 +188,16 @@ def run(arguments: argparse.Namespace) -> None:
             from vplog.joint import run_joint
 
             found = run_joint(
-                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache
-            )
+                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache,
+                arguments.force,
+            )  # fmt: skip
         else:
             from vplog.pipeline import run as run_pipeline
 
             found = run_pipeline(
-                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache=use_cache
-            ).record
+                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache=use_cache,
+                force=arguments.force,
+            ).record  # fmt: skip
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
     elif "maps" in found:
@@ -229,7 +232,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
         option = given[0].removesuffix("_file").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is gone on with as it began; leave out --{option}")
     asked = asked_for(arguments.output, arguments.logs)
-    arguments.one_drive = not asked.several
+    arguments.one_drive, arguments.force = not asked.several, True  # what it replaces, it was asked when it began
     return asked.logs, asked.pipeline, asked.library, asked.topics
 
 
@@ -349,6 +352,7 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub.add_argument("--resume", action="store_true", help="go on with the run in OUT that was killed; needs no LOG")
+    sub.add_argument("--force", action="store_true", help="replace the run of another log in OUT")
     sub.add_argument(
         "--no-cache", dest="cache", action="store_false", help="keep nothing in OUT for a run with other settings"
     )
