@@ -282,7 +282,10 @@ def demo(arguments: argparse.Namespace) -> None:
         progress("render", 0, 1)
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
         progress("render", 1, 1)
-        done = run_pipeline(drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress)
+        done = run_pipeline(
+            drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress,
+            force=arguments.force,
+        )  # fmt: skip
     found = evaluate_run(arguments.output / "run", str(drive.truth))
     write_report(arguments.output / "run", truth=str(drive.truth))
     if arguments.json:
@@ -331,6 +334,7 @@ def _parser() -> argparse.ArgumentParser:
     add_maps(add, group, common, topics, threads)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
+    _add_force(sub)
     sub = add("schemas", schemas)
     sub.add_argument(
         "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
@@ -345,6 +349,10 @@ def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 
 
+def _add_force(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--force", action="store_true", help="replace the run of another log in OUT")
+
+
 def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.set_defaults(refuse=sub.error)
     sub.add_argument("logs", type=place, nargs="*", metavar="LOG")
@@ -352,7 +360,7 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub.add_argument("--resume", action="store_true", help="go on with the run in OUT that was killed; needs no LOG")
-    sub.add_argument("--force", action="store_true", help="replace the run of another log in OUT")
+    _add_force(sub)
     sub.add_argument(
         "--no-cache", dest="cache", action="store_false", help="keep nothing in OUT for a run with other settings"
     )
