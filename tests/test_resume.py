@@ -470,8 +470,8 @@ def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_
     (out / ".vplog-lock").touch()
     log.write_text("a log")
 
-    def done(*library: Path) -> None:
-        with begun(out, pipeline, log, 1, *library) as made:
+    def done(library: Path | None = None) -> None:
+        with begun(out, pipeline, log, 1, library) as made:
             (made / "run.json").write_text(json.dumps({"vplog": "1", **head(pipeline, log, 1)}))
 
     done()

@@ -204,7 +204,7 @@ def test_a_log_that_changed_is_not_resumed(log: Path, tmp_path: Path, verb: Call
     with pytest.raises(KeyboardInterrupt):
         complete(out, log, stage=True)
     written(log, b"new log")
-    assert f"{log} changed since the run in {out} began. Begin again" in verb("run", "--resume", "-o", out).error
+    assert f"{log} changed since the run in {out} began. Begin it again" in verb("run", "--resume", "-o", out).error
 
 
 def _holds(*names: str) -> Callable[[Path], None]:

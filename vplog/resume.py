@@ -79,8 +79,8 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
     now = inputs_of(paths, out / CACHE)
     if now.token == key_of(now.look):  # the cache does not know the content either, so nothing of it would be found
         raise LogError(
-            f"{' '.join(map(str, paths))} changed since the run in {out} began. Begin again, without --resume and with "
-            "--force."
+            f"{' '.join(map(str, paths))} changed since the run in {out} began. Begin it again: the same command without "
+            "--resume."
         )
 
 

@@ -83,7 +83,7 @@ def killed(out: Path, after: int) -> bool:
 
 def test_killed_at_any_change_of_a_file(tmp_path: Path) -> None:
     """The next reader finds the old results or the new ones, the next writer writes; what is not ours stays."""
-    found: list[str] = []
+    found, ended = list[str](), False
     for after in range(1, 200):
         out = tmp_path / f"{after}" / "out"
         put(out, OLD | OWN)
