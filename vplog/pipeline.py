@@ -182,9 +182,8 @@ def run(
     log = logs.open_drive(files_of(path), topics)
     watch, warnings = Watch(), []
     check_library(library, pipeline)
-    resumable = use_cache and cache is None
     with (
-        begun(out, pipeline, path, threads, library, topics, resumable=resumable, force=force) as made,
+        begun(out, pipeline, path, threads, library, topics, resumable=use_cache and not cache, force=force) as made,
         StageCache((cache or out / CACHE) if use_cache else made / CACHE, watch, warnings, use_cache) as stages,
         ThreadPoolExecutor(1) as aside,
         record.heard(warnings),

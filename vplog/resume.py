@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -78,10 +79,8 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
         return  # of an older version; or the run says what is missing
     now = inputs_of(paths, out / CACHE)
     if now.token == key_of(now.look):  # the cache does not know the content either, so nothing of it would be found
-        raise LogError(
-            f"{' '.join(map(str, paths))} changed since the run in {out} began. Begin it again: the same command without "
-            "--resume."
-        )
+        given = shlex.join(map(str, paths))
+        raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
 
 
 def _texts(account: dict[str, Any], out: Path) -> list[str]:
