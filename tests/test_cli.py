@@ -281,9 +281,7 @@ def test_a_log_that_cannot_be_run_is_one_line(
     log = make(tmp_path, drive.log)
     error = verb("run", log, "-o", tmp_path / "run", *QUICK).error
     assert why in error
-    assert not (tmp_path / "run" / ".cache").exists()
-    if (tmp_path / "run" / "run.json").exists():
-        assert record_of(tmp_path / "run")["finished"] is False
+    assert not (tmp_path / "run").exists()
 
 
 def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive: Drive, tmp_path: Path) -> None:
@@ -529,8 +527,10 @@ def test_interrupted_in_the_middle(drive: Drive, tmp_path: Path, sent: signal.Si
     assert (process.returncode, out) == (code, "")
     assert err.startswith("vplog: interrupted")
     assert len(err.splitlines()) == 1, err
-    assert record_of(tmp_path / "run")["finished"] is False
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {".cache", "run.json"}
+    assert err.endswith(f"Go on with: vplog run --resume -o {tmp_path / 'run'}\n")
+    assert "(extract) are kept in" in err
+    assert record_of(tmp_path / "run" / ".cache")["finished"] is False
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {".cache"}
     assert not list((tmp_path / "run").rglob("*.part"))
 
 
@@ -556,9 +556,7 @@ def test_a_full_disk_is_one_line(drive: Drive, tmp_path: Path, limit: int) -> No
     assert (process.returncode, out) == (1, "")
     assert err.startswith("vplog: error: Cannot")
     assert len(err.splitlines()) == 1, err
-    assert not list((tmp_path / "run").rglob("*.part"))
-    if (tmp_path / "run" / "run.json").exists():
-        assert record_of(tmp_path / "run")["finished"] is False
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")  # noqa: PTH110

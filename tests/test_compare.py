@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -320,6 +321,21 @@ def test_probabilities_are_held_against_the_truth(verb: Verb, walks: tuple[Path,
     assert (out / "reliability.png").read_bytes()[1:4] == b"PNG"
     assert "calibration" not in verb(*arguments, "--methods", "thumbnail").json["methods"]["thumbnail"]
     assert not (out / "reliability.png").exists()
+
+
+def test_an_interrupted_comparison_leaves_the_one_before(
+    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    day, dusk = walks
+    out = tmp_path / "out"
+    arguments = ("compare", dusk, day, "--truth", "index", "--methods", "thumbnail", "-o", out, "--json", *QUICK)
+    assert verb(*arguments).code == 0
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    for last in ("vplog.compare._write_scores", "vplog.compare_figures.draw_curves"):
+        with monkeypatch.context() as patch:
+            patch.setattr(last, lambda *_: signal.raise_signal(signal.SIGINT))
+            assert verb(*arguments, "--library-size", 5).code == 130
+        assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
 def test_libraries_of_every_origin(verb: Verb, walks: tuple[Path, Path], tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,14 +12,14 @@ import pyarrow.parquet as pq
 from vplog import geometry
 from vplog.evaluate.truth import read_truth
 from vplog.evaluation import evaluate
-from vplog.pipeline import Pipeline
-from vplog.record import begin_folder
+from vplog.record import OWN_LIBRARY
 from vplog.results import tables
 
 from .joined import QUICK, cut
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from conftest import Said
 
@@ -52,17 +51,23 @@ def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_no
 def test_a_killed_run_of_several_drives_is_gone_on_with(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
     whole = json.loads((joint / "run.json").read_text())
     out = shutil.copytree(joint, tmp_path / "out")
-    paths = [Path(log) for log in whole["logs"]]
-    begin_folder(out, Pipeline.read(whole["settings"], "run.json"), paths[0], 1, drives=paths)
+    asked = {**whole, "finished": False, "topics": {}, "drives": None, "library": {"from": OWN_LIBRARY}}
+    (out / ".cache" / "run.json").write_text(json.dumps(asked))
+    (out / "run.json").unlink()
     assert f"vplog run --resume -o {out}" in verb("evaluate", out, "--truth", "gps").error
-    shutil.rmtree(out / "after")  # not come to yet
-    stale = [out / "map7.g2o", out / "drive" / "joint_keyframes.parquet"]
+    (out / "run.json").write_text(json.dumps({**whole, "drives": [*whole["drives"], {"folder": "gone"}]}))
+    shutil.rmtree(out / ".cache" / "after")  # not come to yet
+    (out / "gone").mkdir()
+    stale = [out / "map7.g2o", out / "drive" / "joint_keyframes.parquet", out / "gone" / "graph.g2o"]
     for file in stale:
         file.write_text("of an earlier run")
     assert "Leave out the log" in verb("run", "--resume", whole["logs"][0], "-o", out).error
     stages = {name: record["stages"]["extract"]["result"] for name, record in _resumed(verb, out).items()}
     assert stages == {"before": "reused", "after": "computed", "drive": "reused"}
     assert tables_of(out) == tables_of(joint)
+    assert not (out / "gone").exists()
+    assert not (out / ".cache" / "run.json").exists()
+    assert json.loads((out / "after" / "run.json").read_text())["library"]["from"] == str(out / "library")
 
 
 def _resumed(verb: Callable[..., Said], out: Path) -> dict[str, Any]:

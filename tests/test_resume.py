@@ -29,7 +29,8 @@ from vplog.logs.frames import RecordedFrame
 from vplog.loops.propose import Proposals
 from vplog.parts import compute_part, cut, extract, missing_parts, parts_of, put_part, stored_features
 from vplog.pipeline import Pipeline, load_pipeline, run
-from vplog.record import begin_folder
+from vplog.record import head
+from vplog.run_folder import begun
 from vplog.stage_cache import StageCache, digest_of, inputs_of
 from vplog.stage_codecs import arrays_codec, closures_codec, images_codec
 from vplog.timing import Watch
@@ -141,7 +142,8 @@ def test_a_killed_run_is_gone_on_with_to_the_same_bytes(
         code = KILLED.format(part=PART, after=after, before=chance.random() < 0.5)
         killed = subprocess.run([sys.executable, "-c", code, *command, *told], capture_output=True, check=False)
         assert killed.returncode == -9, killed.stderr
-        assert json.loads((out / "run.json").read_text())["finished"] is False
+        assert json.loads((out / ".cache" / "run.json").read_text())["finished"] is False
+        assert not (out / "run.json").exists()
     done = list((out / ".cache").glob("extract-*"))
     assert len(done) >= 2
     assert verb(*command, "--resume", "--json").json["stages"]["extract"]["parts_reused"] == len(done)
@@ -462,15 +464,23 @@ print(*[name for name in sys.modules if name.split(".")[0] == "vplog"])
 
 def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_is_given(tmp_path: Path) -> None:
     out, pipeline = tmp_path / "out", load_pipeline("default", QUICK)
-    out.mkdir()
-    (out / ".run.json.123.part").write_text("{")
-    begin_folder(out, pipeline, tmp_path / "log", 1)
+    log, staging = tmp_path / "log", out / ".vplog-staging"
+    staging.mkdir(parents=True)
+    (staging / "run.json").write_text("{")
+    (out / ".vplog-lock").touch()
+    log.write_text("a log")
+
+    def done(library: Path | None = None) -> None:
+        with begun(out, pipeline, log, 1, library) as made:
+            (made / "run.json").write_text(json.dumps({"vplog": "1", **head(pipeline, log, 1)}))
+
+    done()
     assert {file.name for file in out.iterdir()} == {"run.json"}
     (out / "library").mkdir()
     (out / "library" / "library.json").write_text("{}")
-    begin_folder(out, pipeline, tmp_path / "log", 1, out / "library")
+    done(out / "library")
     assert (out / "library" / "library.json").exists()
-    begin_folder(out, pipeline, tmp_path / "log", 1)
+    done()
     assert not (out / "library").exists(), "an earlier run's"
 
 

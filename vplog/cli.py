@@ -67,8 +67,8 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
         sys.exit(0)
-    except KeyboardInterrupt:
-        _interrupted()
+    except KeyboardInterrupt as error:
+        _interrupted(error)
     except VplogError as error:
         _fail(arguments, str(error))
     except MemoryError:
@@ -77,7 +77,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
     except Exception as error:  # a fault of ours: still one line, and how to see more
         if was_interrupted(error):
-            _interrupted()
+            _interrupted(error)
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
@@ -136,8 +136,9 @@ def _flush() -> None:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _interrupted() -> NoReturn:
-    say("interrupted; nothing is lost of what was finished in the output folder")
+def _interrupted(error: BaseException) -> NoReturn:
+    known = getattr(error, "__notes__", ["nothing is lost of what was finished in the output folder"])
+    say(f"interrupted; {known[-1]}")
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
 
@@ -145,7 +146,7 @@ def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
         raise  # noqa: PLE0704 (called from an except block)
     _flush()
-    say(f"error: {message}")
+    say(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))
     sys.exit(1)
 
 
@@ -199,14 +200,16 @@ def run(arguments: argparse.Namespace) -> None:
             from vplog.joint import run_joint
 
             found = run_joint(
-                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache
-            )
+                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache,
+                arguments.force,
+            )  # fmt: skip
         else:
             from vplog.pipeline import run as run_pipeline
 
             found = run_pipeline(
-                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache=use_cache
-            ).record
+                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache=use_cache,
+                force=arguments.force,
+            ).record  # fmt: skip
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
     elif "maps" in found:
@@ -241,7 +244,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
         option = given[0].removesuffix("_file").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is gone on with as it began; leave out --{option}")
     asked = asked_for(arguments.output, arguments.logs)
-    arguments.one_drive = not asked.several
+    arguments.one_drive, arguments.force = not asked.several, True  # what it replaces, it was asked when it began
     return asked.logs, asked.pipeline, asked.library, asked.topics
 
 
@@ -291,7 +294,10 @@ def demo(arguments: argparse.Namespace) -> None:
         progress("render", 0, 1)
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
         progress("render", 1, 1)
-        done = run_pipeline(drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress)
+        done = run_pipeline(
+            drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress,
+            force=arguments.force,
+        )  # fmt: skip
     found = evaluate_run(arguments.output / "run", str(drive.truth))
     write_report(arguments.output / "run", truth=str(drive.truth))
     if arguments.json:
@@ -340,6 +346,7 @@ def _parser() -> argparse.ArgumentParser:
     add_maps(add, group, common, topics, threads)
     sub = add("demo", demo, threads, settings)
     output(sub, "folder of the drive and the run")
+    _add_force(sub)
     sub = add("schemas", schemas)
     sub.add_argument(
         "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
@@ -354,6 +361,10 @@ def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 
 
+def _add_force(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--force", action="store_true", help="replace the run of another log in OUT")
+
+
 def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.set_defaults(refuse=sub.error)
     sub.add_argument("logs", type=place, nargs="*", metavar="LOG")
@@ -361,6 +372,7 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
     sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
     sub.add_argument("--resume", action="store_true", help="go on with the run in OUT that was killed; needs no LOG")
+    _add_force(sub)
     sub.add_argument(
         "--no-cache", dest="cache", action="store_false", help="keep nothing in OUT for a run with other settings"
     )

@@ -25,6 +25,7 @@ from vplog.places.stored import load_references, references_hash
 from vplog.references import PAPER_SIZE, LibrarySettings, choose
 from vplog.results import run_record
 from vplog.results.atomic import replacing
+from vplog.results.staging import staged
 from vplog.trials import evaluate_method
 from vplog.walks import Walk, candidate_stops, extract_walk
 
@@ -78,12 +79,11 @@ def compare(
         sequences = SequenceSettings.read({**pipeline.sequence.model_dump(), "length": sequence}, "--sequence")
     itself = same_drive(query, other)
     _check_gap(query, itself, min_gap)
-    if out is not None:
-        _begin(out)
     warnings: list[str] = []
     with ExitStack() as stack:
+        made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out)))
         stack.enter_context(record.heard(warnings))
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=out)))
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
         query_log = logs.open(query, topics)
         map_log = query_log if itself else logs.open(other, topics)
         known = open_truth(truth, query_log, map_log)
@@ -128,14 +128,14 @@ def compare(
                 reliable[name] = result.reliability
             if result.sequence_ranks is not None:
                 ranks[f"{name}, L={sequence}"] = result.sequence_ranks
-            if out is not None:
-                result.figures["scores"] = _write_scores(out, number, name, result.scores, query_walk, map_walk)
+            if made is not None:
+                result.figures["scores"] = _write_scores(made, number, name, result.scores, query_walk, map_walk)
         account["warnings"] = list(dict.fromkeys([*query_log.warnings, *map_log.warnings, *warnings]))
-    if out is not None:
-        compare_figures.draw_curves(ranks, out)
-        if reliable:
-            compare_figures.draw_reliability(reliable, out)
-        run_record.write_run_json(out / "compare.json", account)
+        if made is not None:
+            compare_figures.draw_curves(ranks, made)
+            if reliable:
+                compare_figures.draw_reliability(reliable, made)
+            run_record.write_run_json(made / "compare.json", account)
     return Comparison(account, ranks)
 
 
@@ -214,15 +214,11 @@ def same_drive(a: Path, b: Path) -> bool:
     return a.resolve() == b.resolve()
 
 
-def _begin(out: Path) -> None:
-    if out.is_dir() and any(out.iterdir()) and not (out / "compare.json").is_file():
+def _comparison_in(out: Path) -> list[str]:
+    """The files of a comparison in a folder that a new one replaces. Raises SettingsError where there are others."""
+    if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "compare.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a comparison. Choose another with -o.")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for file in ("compare.json", "reliability.png", "reliability.svg"):  # the record is written last
-            (out / file).unlink(missing_ok=True)
-    except OSError as error:
-        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
+    return ["compare.json", "scores-[0-9][0-9]-*.npz", *(f"{name}.[ps][nv]g" for name in ("curves", "reliability"))]
 
 
 def _write_scores(out: Path, number: int, name: str, scores: Float32s, query: Walk, other: Walk) -> str:

@@ -20,6 +20,8 @@ from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables, tum
+from vplog.results.run_record import CACHE
+from vplog.run_folder import begun
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
@@ -55,30 +57,34 @@ def run_joint(
     threads: int = 1,
     progress: Progress = lambda *_: None,
     use_cache: bool = True,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Drives in, `out` with a run folder for each and what joins them out; the record in its run.json.
 
-    All drives share one library, the one given or one of an equal share of each. Raises VplogError with one line.
+    What `out` holds stays until all is done; a run that has another log is replaced with `force` only. All drives
+    share one library, the one given or one of an equal share of each. Raises VplogError with one line.
     """
     if pipeline.gps.use:
         raise SettingsError("GPS holds one drive at a time: run each by itself with --gps, or several without.")
-    names = _names([logs.open(path, topics).name for path in paths])
+    drives_at = dict(zip(_names([logs.open(path, topics).name for path in paths]), paths, strict=True))
     check_library(library, pipeline)
     watch = Watch()
-    record.begin_folder(out, pipeline, paths[0], threads, library, topics, paths)
-    _remove_joint_results(out)
     with ExitStack() as stack:
+        made = stack.enter_context(
+            begun(out, pipeline, paths[0], threads, library, topics, drives_at, resumable=use_cache, force=force)
+        )
         if library is None:
-            library = out / "library"
+            library = made / "library"
             with watch.stage("library"):
                 build_library(paths, library, pipeline, topics, threads, progress)
         state = pipeline.places.load(library, threads)
         drives = []
-        for name, path in zip(names, paths, strict=True):
-            store = stack.enter_context(FeatureStore(out / f".features-{name}"))
+        for name, path in drives_at.items():
+            store = stack.enter_context(FeatureStore(made / f".features-{name}"))
+            cache = out / CACHE / name if use_cache else None
             with watch.stage(name):
                 alone = _alone(
-                    name, path, out / name, pipeline, library, state, topics, threads, progress, store, use_cache
+                    name, path, made / name, pipeline, library, state, topics, threads, progress, store, cache
                 )
                 drives.append(alone)
         with watch.stage("between"):
@@ -92,14 +98,14 @@ def run_joint(
             judged = [judged_by(*found) for found in zip(ledgers.values(), joined.weight, joined.residual, strict=True)]
             pairs = list(ledgers)
             tables.write_joins(
-                out / "joins.parquet",
+                made / "joins.parquet",
                 [
                     (drives[later].done.keyframes, drives[earlier].done.keyframes, ledger)
                     for (later, earlier), ledger in zip(pairs, judged, strict=True)
                 ],
                 header,
             )
-            _write_maps(out, drives, joined, header)
+            _write_maps(made, drives, joined, header)
         account = {
             **record.head(pipeline, paths[0], threads),
             **record.logs_of(paths),
@@ -109,15 +115,8 @@ def run_joint(
             "stages": watch.stages,
             "totals": watch.totals(),
         }
-        run_record.write_run_json(out / "run.json", account)
+        run_record.write_run_json(made / "run.json", account)
     return account
-
-
-def _remove_joint_results(out: Path) -> None:
-    """What an earlier run put together: drives may be apart now, or others."""
-    for name in ("map*.g2o", "joins.parquet", "*/joint_keyframes.parquet", "*/joint_trajectory.*"):
-        for file in out.glob(name):
-            file.unlink(missing_ok=True)
 
 
 def _ledgers(
@@ -147,11 +146,11 @@ def _ledgers(
 
 
 def _names(names: Sequence[str]) -> list[str]:
-    """A folder name for each drive: its own, with a number where several have the same."""
+    """A folder name for each drive: its own, with a number where several have the same, or the library has it."""
     result: list[str] = []
     for name in names:
         number, free = 2, name
-        while free in result:
+        while free in ("library", *result):
             free, number = f"{name}-{number}", number + 1
         result.append(free)
     return result
@@ -168,11 +167,12 @@ def _alone(
     threads: int,
     progress: Progress,
     store: FeatureStore,
-    use_cache: bool,
+    cache: Path | None,
 ) -> Alone:
     done = run_alone(
         path, folder, pipeline, library, topics, threads,
-        lambda stage, count, total: progress(f"{name}: {stage}", count, total), store, use_cache=use_cache,
+        lambda stage, count, total: progress(f"{name}: {stage}", count, total), store, cache,
+        use_cache=cache is not None,
     )  # fmt: skip
     done = replace(done, keyframes=replace(done.keyframes, drive=name))
     camera = logs.open(path, topics).camera()

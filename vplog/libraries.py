@@ -9,7 +9,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Reference
-from vplog.errors import LibraryError
+from vplog.errors import LibraryError, SettingsError
 from vplog.extract import extract_frames
 from vplog.places.coverage import (
     STRONGEST,
@@ -23,6 +23,7 @@ from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
 from vplog.places.stored import read_library_record, references_hash
 from vplog.references import PAPER_SIZE, choose, evenly
+from vplog.results.staging import recover, staged
 from vplog.stage_codecs import json_codec
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
     """Before any work: is what was given a library, and made as this run describes places? Raises LibraryError."""
     if folder is None:
         return
+    recover(folder)
     made = pipeline.places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
     for name, value in pipeline.places:
         if getattr(made, name) != value:
@@ -124,25 +126,35 @@ def build_library(
 ) -> PlaceState:
     """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
 
-    `warn` gets what the logs warn of, once they are read.
+    `warn` gets what the logs warn of, once they are read. A library that `out` holds stays until the new one is whole.
     Raises VplogError where that cannot be.
     """
     references: list[Reference] = []
     opened = [logs.open(path, topics) for path in paths]
     by_coverage = pipeline.library.choose == "coverage"
-    wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
-    for log, stamps in zip(opened, wanted, strict=True):
-        for done, (stamp_ns, frame, features, _) in enumerate(
-            extract_frames(log.frames(stamps), pipeline.features, threads)
-        ):
-            progress(f"extract {log.name}", done + 1, len(stamps))
-            if frame is not None and features is not None:
-                references.append(Reference(frame.image, features, log.name, stamp_ns))
-    for line in dict.fromkeys(line for log in opened for line in log.warnings):
-        warn(line)
-    state = pipeline.places.learn(references, threads)
-    state.save(out)
+    with staged(out, lambda: _library_in(out)) as made:
+        wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
+        for log, stamps in zip(opened, wanted, strict=True):
+            for done, (stamp_ns, frame, features, _) in enumerate(
+                extract_frames(log.frames(stamps), pipeline.features, threads)
+            ):
+                progress(f"extract {log.name}", done + 1, len(stamps))
+                if frame is not None and features is not None:
+                    references.append(Reference(frame.image, features, log.name, stamp_ns))
+        for line in dict.fromkeys(line for log in opened for line in log.warnings):
+            warn(line)
+        state = pipeline.places.learn(references, threads)
+        state.save(made)
     return state
+
+
+def _library_in(out: Path) -> list[str]:
+    """The files of a library in a folder that a new one may replace. Raises SettingsError where it may not."""
+    if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "library.json").is_file():
+        raise SettingsError(f"{out} is a folder with other things in it, not a library. Choose another with -o.")
+    if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
+        raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")
+    return ["library.json", "features.parquet", "references.parquet"]
 
 
 def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:

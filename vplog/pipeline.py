@@ -36,11 +36,12 @@ from vplog.places.bobb import BobbSettings
 from vplog.places.sequence import SequenceSettings
 from vplog.places.stored import load_references
 from vplog.recognise import describe, find_candidates, name_shared
-from vplog.record import CACHE
 from vplog.references import LibrarySettings
 from vplog.report import write_report
 from vplog.results import g2o, mcap, run_record, tables, tum
 from vplog.results.previews import PictureSettings
+from vplog.results.run_record import CACHE
+from vplog.run_folder import begun
 from vplog.settings import Settings, load_yaml, override
 from vplog.show import Seen, earth_of, finished_picture, reference_use
 from vplog.stage_cache import StageCache, inputs_of
@@ -167,21 +168,23 @@ def run(
     features: FeatureStore | None = None,
     cache: Path | None = None,
     use_cache: bool = True,
+    force: bool = False,
 ) -> Run:
     """Drive in, run folder out. Raises VplogError with one line where that cannot be.
 
     `path` is a log, or several that are the parts of one recording, in any order. The features of the keyframes go to
     the store given too, for who needs them afterwards. What stages come to is kept in `cache`, a folder of this drive
     alone (by default in `out`), and found there by a later run as far as that would make the same; without
-    `use_cache` nothing is found and nothing stays.
+    `use_cache` nothing is found and nothing stays. What `out` holds stays until the new run is whole; the run of
+    another log is replaced with `force` only.
     """
     topics = topics or logs.TopicChoice()
     log = logs.open_drive(files_of(path), topics)
     watch, warnings = Watch(), []
     check_library(library, pipeline)
-    record.begin_folder(out, pipeline, path, threads, library, topics)
     with (
-        StageCache(cache if cache and use_cache else out / CACHE, watch, warnings, use_cache) as stages,
+        begun(out, pipeline, path, threads, library, topics, resumable=use_cache and not cache, force=force) as made,
+        StageCache((cache or out / CACHE) if use_cache else made / CACHE, watch, warnings, use_cache) as stages,
         ThreadPoolExecutor(1) as aside,
         record.heard(warnings),
     ):
@@ -233,7 +236,7 @@ def run(
             done = Run(keyframes, closures, graph, solution)
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
             column = [state.to_arrow(descriptors)]
-            tables.write_descriptors(out / "descriptors.parquet", keyframes, column, state.arrow_type, header)
+            tables.write_descriptors(made / "descriptors.parquet", keyframes, column, state.arrow_type, header)
             previews = seen.pictures
             head, on_earth = record.head(pipeline, path, threads), about_gps(solved.fixes, solved.refined)
             shown = finished_picture(
@@ -242,9 +245,9 @@ def run(
                 gps=log.gps(), earth=earth_of(solved.trajectory, log.gps(), on_earth),
                 about={"versions": head["versions"], "inputs": hashes.result()},
             )  # fmt: skip
-            write_results(out, done, odometry, solved.trajectory, camera, header, shown)
+            write_results(made, done, odometry, solved.trajectory, camera, header, shown)
             if library is None:
-                state.save(out / "library")
+                state.save(made / "library")
             stages.finish(path, inputs, seen.files)
         account = {
             **head,
@@ -275,7 +278,7 @@ def run(
             "totals": watch.totals(),
             "warnings": log.warnings + warnings,
         }
-    return replace(done, record=finish(out, account, stages))
+        return replace(done, record=finish(made, account, stages))
 
 
 def finish(out: Path, account: dict[str, Any], stages: StageCache) -> dict[str, Any]:

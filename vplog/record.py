@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import platform
-import shutil
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import vplog
 from vplog import logs
 from vplog.data import Verdict
-from vplog.errors import LogError, ResultError, SettingsError
-from vplog.inputs import files_of
+from vplog.errors import LogError, ResultError
+from vplog.inputs import bytes_of, files_of, look_of
 from vplog.remote import local_copy, located, original
 from vplog.results import run_record
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 OWN_LIBRARY = "the drive's own keyframes"
 """Where the library of a run is from to which none was given."""
-CACHE = ".cache"
-"""Where a run folder keeps what its stages came to, unless another place is named."""
 
 
 def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice | None) -> Log:
@@ -44,34 +42,10 @@ def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice
     return logs.open_drive(known, topics)
 
 
-def begin_folder(
-    out: Path,
-    pipeline: Settings,
-    path: Path | Sequence[Path],
-    threads: int,
-    library: Path | None = None,
-    topics: logs.TopicChoice | None = None,
-    drives: Sequence[Path] = (),
-) -> None:
-    """Make the run folder, with a run.json that says the run is not finished until it is, and how it was asked for.
-
-    `drives` are the logs of a run of several drives, of which `path` is the first.
-    """
-    others = [file for file in out.iterdir() if not file.name.startswith(".")] if out.is_dir() else []
-    if others and not (out / "run.json").is_file():
-        raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
-    asked = {"topics": (topics or logs.TopicChoice()).model_dump(mode="json"), "library": {"from": library_of(library)}}
-    asked |= logs_of(drives)
-    run_record.write_run_json(out / "run.json", {**head(pipeline, path, threads), "finished": False, **asked})
-    for file in out.glob(".*.part"):  # what a killed run was writing
-        file.unlink(missing_ok=True)
-    own = out / "library"  # an earlier run's, which would not be this one's unless it is given
-    if (own / "library.json").is_file() and (library is None or library.resolve() != own.resolve()):
-        shutil.rmtree(own)
+def stat_of(files: Sequence[Path]) -> dict[str, Any]:
+    """Length of the files of a log, and a sha256 over their paths, lengths and times: unchanged means the same log."""
+    look = run_record.canonical_json(look_of(files)).encode()
+    return {"bytes": bytes_of(files), "sha256": hashlib.sha256(look).hexdigest()}
 
 
 def library_of(library: Path | None) -> str:
@@ -81,7 +55,7 @@ def library_of(library: Path | None) -> str:
 
 def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
     """What run.json says of the logs of several drives."""
-    return {"logs": [str(path.resolve()) for path in drives]} if drives else {}
+    return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)} if drives else {}
 
 
 @contextmanager
@@ -105,6 +79,7 @@ def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[
         "vplog": vplog.__version__,
         "log": files[0],
         **({"parts": files} if len(files) > 1 else {}),
+        "log_stat": stat_of(files_of(path)),
         "threads": threads,
         "settings": pipeline.model_dump(mode="json"),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in packages}},

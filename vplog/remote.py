@@ -291,13 +291,27 @@ def file_system(endpoint: str | None, region: str | None) -> FileSystem:
     )  # fmt: skip
 
 
-_COPIED: dict[Path, RemotePath] = {}
-"""What local copies are of, while they are there."""
+_STANDS_FOR: dict[Path, Path | RemotePath] = {}
+"""What folders and files of this machine stand for, while they are there."""
 
 
 def original(path: Path) -> Path:
-    """What a local copy is of; any other path itself."""
-    return cast("Path", _COPIED.get(path, path))
+    """What a local path stands for, itself or by the folder it is in; any other path itself."""
+    for folder in (path, *([] if isinstance(path, RemotePath) else path.parents)):
+        if folder in _STANDS_FOR:
+            place = _STANDS_FOR[folder]
+            return original(cast("Path", place if folder == path else place / path.relative_to(folder).as_posix()))
+    return path
+
+
+@contextmanager
+def stands_for(path: Path, place: Path | RemotePath) -> Iterator[Path]:
+    """For the time of the block, what is recorded of `path` is said of `place`, where its files come from or go to."""
+    _STANDS_FOR[path] = place
+    try:
+        yield path
+    finally:
+        del _STANDS_FOR[path]
 
 
 @contextmanager
@@ -314,11 +328,8 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
             _download(path, target)
         except OSError as error:
             raise LogError(f"Cannot read {path}: {reason(error)}.") from None
-        _COPIED[target] = path
-        try:
+        with stands_for(target, path):
             yield target
-        finally:
-            del _COPIED[target]
 
 
 def _download(path: RemotePath, target: Path) -> None:
@@ -345,7 +356,8 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
     _check_bucket(path)
     with scratch("url") as folder:
         target = folder / (path.name or "out")
-        yield target
+        with stands_for(target, path):
+            yield target
         files = [target] if target.is_file() else sorted(file for file in target.rglob("*") if file.is_file())
         files.sort(key=lambda file: file.name == "run.json" and file.parent == target)
         try:

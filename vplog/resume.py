@@ -1,16 +1,20 @@
-"""Going on with a run that was killed: what was asked for is in its run.json, what was done in its cache."""
+"""Going on with a run that was killed: what was asked for and what was done are in its cache."""
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.errors import ResultError, SettingsError
+from vplog.errors import LogError, ResultError, SettingsError
 from vplog.pipeline import Pipeline
-from vplog.record import OWN_LIBRARY
+from vplog.record import OWN_LIBRARY, stat_of
 from vplog.remote import located
 from vplog.results import run_record
+from vplog.results.run_record import CACHE, REQUEST
+from vplog.results.staging import recover
+from vplog.stage_cache import inputs_of, key_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,9 +39,11 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
 
     Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
     """
-    if not (out / "run.json").is_file():
+    recover(out)
+    file = out / REQUEST if (out / REQUEST).is_file() else out / "run.json"  # there older versions had it
+    if not file.is_file():
         raise ResultError(f"Nothing to resume: {out} has no run.json. Begin a run: vplog run LOG -o {out}")
-    account = run_record.read_run_json(out / "run.json")
+    account = run_record.read_run_json(file)
     if account.get("finished") is not False:
         raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")
     if not isinstance(account.get("topics"), dict):  # of an older version
@@ -51,7 +57,8 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
         raise SettingsError(
             f"The run in {out} is of {known}, not of {given[0]}. Leave out the log, or choose another -o."
         )
-    where = f"{out}/run.json"
+    _check_unchanged(paths, account, out)
+    where = str(file)
     pipeline = Pipeline.read(_tree(account, "settings", out), where)
     library = _tree(account, "library", out).get("from")
     if not isinstance(library, str):
@@ -63,6 +70,17 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
         None if library == OWN_LIBRARY else located(library),
         logs.TopicChoice.read(_tree(account, "topics", out), where),
     )
+
+
+def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) -> None:
+    """Raises LogError where a log is not what it was when the run began, by its stat, or by its content if known."""
+    about = account.get("log_stat")
+    if not isinstance(about, dict) or not all(path.exists() for path in paths) or stat_of(paths) == about:
+        return  # of an older version; or the run says what is missing
+    now = inputs_of(paths, out / CACHE)
+    if now.token == key_of(now.look):  # the cache does not know the content either, so nothing of it would be found
+        given = shlex.join(map(str, paths))
+        raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
 
 
 def _texts(account: dict[str, Any], out: Path) -> list[str]:

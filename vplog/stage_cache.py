@@ -14,7 +14,17 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 
-from vplog.cache_file import CONTENT_AT, ENDING, AbsentError, DamagedError, content_of, file_name, sealed
+from vplog.cache_file import (
+    CACHE_FILES,
+    CONTENT_AT,
+    ENDING,
+    INPUTS,
+    AbsentError,
+    DamagedError,
+    content_of,
+    file_name,
+    sealed,
+)
 from vplog.code_hash import code_of
 from vplog.errors import ResultError
 from vplog.inputs import hash_inputs, look_of
@@ -31,7 +41,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_INPUTS = "inputs.json"
 _INPUTS_BYTES = 2**26
 """Longest inputs.json that is read: a folder of 400,000 images has one of 60 MB."""
 
@@ -93,7 +102,7 @@ def _lengths(look: dict[str, str]) -> list[str]:
 
 def _known_inputs(cache: Path) -> dict[str, Any]:
     """inputs.json of a cache; empty where there is none, or another thing."""
-    path = cache / _INPUTS
+    path = cache / INPUTS
     try:
         if path.stat().st_size > _INPUTS_BYTES:
             return {}
@@ -266,7 +275,7 @@ class StageCache:
             return
         known = {"look": inputs.look, "token": inputs.token, "hashes": inputs.hashes, **_known_inputs(self.folder)}
         self._write_inputs({**known, "parts": list(parts)})
-        self._remove({*self._used, _INPUTS})
+        self._remove({*self._used, INPUTS})
 
     def drop(self) -> None:
         """Remove all of the cache, and its folder if nothing else is in it."""
@@ -276,13 +285,13 @@ class StageCache:
 
     def _write_inputs(self, known: dict[str, Any]) -> None:
         try:
-            write_run_json(self.folder / _INPUTS, known)
+            write_run_json(self.folder / INPUTS, known)
         except ResultError:  # it only spares work; the result's own files say that the disk is full
             self._full = True
 
     def _remove(self, kept: set[str]) -> None:
-        """Remove the cache's own files but these, and what a killed run was writing."""
-        for file in [*self.folder.glob(f"*{ENDING}"), *self.folder.glob(".*.part"), self.folder / _INPUTS]:
+        """Remove the cache's own files but these."""
+        for file in [file for pattern in CACHE_FILES for file in self.folder.glob(pattern)]:
             if file.name not in kept:
                 file.unlink(missing_ok=True)
 

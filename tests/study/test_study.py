@@ -221,12 +221,15 @@ def test_a_departure_that_is_no_more_is_one_line(
         (("DAY", "DUSK", "--truth", "a.tum,b.tum,c.tum"), "3 files for 2 drives"),
         (("DAY", "nowhere"), "nowhere"),
         (("DAY", "DUSK", "-o", "DAY"), "a folder with other things in it, not a study"),
+        (("DAY", "DUSK", "-o", "OTHER"), "holds a study of /other.mcap. Choose another folder"),
     ],
 )
 def test_what_cannot_be_studied_is_said_in_one_line(
     verb: Verb, walks: tuple[Path, Path], tmp_path: Path, arguments: tuple[str, ...], said: str
 ) -> None:
-    folders = {"DAY": walks[0], "DUSK": walks[1]}
+    folders = {"DAY": walks[0], "DUSK": walks[1], "OTHER": tmp_path / "other"}
+    folders["OTHER"].mkdir()
+    (folders["OTHER"] / "study.json").write_text('{"drives": [{"log": "/other.mcap", "hash": "0"}]}')
     named = [folders.get(argument, argument) for argument in arguments]
     assert said in verb("study", "--truth", "index", "-o", tmp_path / "out", *QUICK, *named).error
 

@@ -54,6 +54,9 @@ _DELAY_NS = (2_000_000, 30_000_000)
 """A message is logged this long after its stamp: drivers and transport take their time."""
 _CHUNK_BYTES = 1 << 20
 """Uncompressed size of a chunk; about ten frames."""
+_TRUTH_HEAD = "# timestamp tx ty tz qx qy qz qw (world_from_body)"
+_MARKED_BYTES = 100
+"""A demo's file says within so much that it is one: the log behind 8 bytes of magic, 17 of a header, and `ros2`."""
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 
@@ -77,6 +80,8 @@ def record_drive(folder: Path, settings: DemoSettings, threads: int | None = Non
     log, truth = folder / "drive.mcap", folder / "truth.tum"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _check_own(log, b"vplog demo")
+        _check_own(truth, _TRUTH_HEAD.encode())
         _write_truth(truth, settings, scene)
         _write_log(log, settings, scene, threads or allowed())
     except OSError as error:
@@ -84,10 +89,19 @@ def record_drive(folder: Path, settings: DemoSettings, threads: int | None = Non
     return Drive(log, truth, scene.camera, scene.stamp_ns, scene.world_from_body)
 
 
+def _check_own(path: Path, mark: bytes) -> None:
+    """Raises ResultError where a file is there that no demo has written, told by what one begins with."""
+    if path.exists():
+        with path.open("rb") as stream:
+            begins = stream.read(_MARKED_BYTES)
+        if begins and mark not in begins:
+            raise ResultError(f"{path} is not of a demo. Choose another folder with -o.")
+
+
 def _write_truth(path: Path, settings: DemoSettings, scene: Scene) -> None:
     stamp_ns = np.union1d(route.odometry_stamps(settings), scene.stamp_ns)
     poses = route.world_from_body(settings, stamp_ns)
-    lines = ["# timestamp tx ty tz qx qy qz qw (world_from_body)"]
+    lines = [_TRUTH_HEAD]
     for stamp, point, turn in zip(stamp_ns.tolist(), poses[:, :3, 3], quaternion(poses[:, :3, :3]), strict=True):
         numbers = " ".join(f"{x:.9f}" for x in (*point, *turn))
         lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
 from vplog.parquet_bounds import check_file, check_version
 from vplog.results.atomic import replacing
+from vplog.results.staging import recover
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -17,6 +19,10 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 """Version of the records of runs and maps, as `format` in them. A new value does not raise it, another meaning does."""
+CACHE = ".cache"
+"""Where a run folder keeps what its stages came to, unless another place is named."""
+REQUEST = f"{CACHE}/run.json"
+"""What a run that is not finished was asked for; run.json of its folder is that of the finished run before, if any."""
 _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
@@ -64,11 +70,22 @@ def _parts(one: dict[str, Any] | list[Any]) -> Iterable[Any]:
 
 
 def read_finished_run(folder: Path) -> dict[str, Any]:
-    """The record of a run that came to its end. Raises ResultError."""
-    record = read_run_json(folder / "run.json")
+    """The record of the run in a folder that came to its end. Raises ResultError."""
+    record = read_run_json(begun_in(folder) or folder / "run.json")
     if not record.get("finished"):
-        raise ResultError(f"The run in {folder} did not finish. Go on with it: vplog run --resume -o {folder}")
+        whose = f" of {record['log']}" if isinstance(record.get("log"), str) else ""
+        command = f"vplog run --resume -o {shlex.quote(str(folder))}"
+        raise ResultError(f"The run{whose} in {folder} did not finish. Go on with it: {command}")
     return record
+
+
+def begun_in(folder: Path) -> Path | None:
+    """The record of a run that was begun in a folder which holds no finished one; None elsewhere.
+
+    Results that a killed process had only to move into place are moved. Raises VplogError.
+    """
+    recover(folder)
+    return folder / REQUEST if (folder / REQUEST).is_file() and not (folder / "run.json").is_file() else None
 
 
 def read_single_run(folder: Path) -> dict[str, Any]:

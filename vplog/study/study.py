@@ -88,6 +88,7 @@ def study(
             known[query, other] = open_truth(of_pair, opened[query], opened[other])
             warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)
         hashes = [_hash(hash_inputs(path)) for path in drives]
+        _check_same_drives(out, hashes)
         common = {
             "features": pipeline.features.model_dump(mode="json"),
             "topics": None if topics is None else topics.model_dump(mode="json"),
@@ -194,6 +195,14 @@ def _begin(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
+
+
+def _check_same_drives(out: Path, hashes: Sequence[str]) -> None:
+    """Raises SettingsError where `out` holds the study of a drive that is not among these, by content."""
+    earlier = read_run_json(out / "study.json").get("drives") if (out / "study.json").is_file() else None
+    for drive in earlier if isinstance(earlier, list) else ():
+        if isinstance(drive, dict) and drive.get("hash") not in hashes:
+            raise SettingsError(f"{out} holds a study of {drive.get('log')}. Choose another folder with -o.")
 
 
 def truth_of_pair(truth: TruthChoice, query: int, other: int, drives: int) -> TruthChoice:
