@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import platform
 import shutil
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ import vplog
 from vplog import logs
 from vplog.data import Verdict
 from vplog.errors import LogError, ResultError, SettingsError
+from vplog.folders import check_regular
 from vplog.inputs import files_of
 from vplog.remote import local_copy, located, original
 from vplog.results import run_record
@@ -58,8 +60,9 @@ def begin_folder(
     `drives` are the logs of a run of several drives, of which `path` is the first.
     """
     others = [file for file in out.iterdir() if not file.name.startswith(".")] if out.is_dir() else []
-    if others and not (out / "run.json").is_file():
+    if others and not os.path.lexists(out / "run.json"):
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
+    check_regular(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

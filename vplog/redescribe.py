@@ -117,6 +117,6 @@ def _bring_caches(root: Path, target: Path) -> None:
     if not kept.is_dir() or "://" in str(target) or (target / ".cache").exists():
         return
     try:
-        shutil.copytree(kept, target / ".cache", copy_function=os.link)
+        shutil.copytree(kept, target / ".cache", symlinks=True, copy_function=os.link)
     except (OSError, shutil.Error):  # it only spares work
         shutil.rmtree(target / ".cache", ignore_errors=True)

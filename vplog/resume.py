@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vplog import logs
 from vplog.errors import ResultError, SettingsError
+from vplog.folders import check_regular
 from vplog.pipeline import Pipeline
 from vplog.record import OWN_LIBRARY
 from vplog.remote import located
@@ -35,6 +36,7 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
 
     Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
     """
+    check_regular(out, "run.json")
     if not (out / "run.json").is_file():
         raise ResultError(f"Nothing to resume: {out} has no run.json. Begin a run: vplog run LOG -o {out}")
     account = run_record.read_run_json(out / "run.json")

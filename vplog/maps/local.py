@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
+from vplog.folders import check_regular
 from vplog.maps.layout import TABLES, drive_record, folder_name, sha256_of
 from vplog.results.atomic import replacing
 
@@ -28,15 +29,13 @@ _REMOVED = "removed-"
 @contextmanager
 def locked(root: Path) -> Iterator[None]:
     """The folder for one writer, made where it is not there; the lock goes with the process that holds it."""
-    if root.is_dir() and not (root / "map.json").exists():
+    if root.is_dir() and not os.path.lexists(root / "map.json"):
         others = [path.name for path in root.iterdir() if not path.name.startswith(".")]
         if others:
             raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
+    check_regular(root)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        for path in root.iterdir():
-            if path.is_symlink() and not path.is_dir():  # of a map from elsewhere: what is written would go anywhere
-                raise SettingsError(f"{path} is a link, and a map holds its own files. Put a copy in its place.")
         lock = (root / ".lock").open("a")
     except OSError as error:
         raise SettingsError(f"Cannot make the map {root}: {error.strerror}. Choose another folder with -o.") from None

@@ -25,6 +25,7 @@ import pyarrow.parquet as pq
 
 import vplog
 from vplog.errors import LibraryError, ResultError, VplogError
+from vplog.folders import check_regular, regular_files
 from vplog.maps import local
 from vplog.maps.earth import earth_from_plain, earth_of_made, earth_of_run
 from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
@@ -127,8 +128,7 @@ class Store:
         if self.mirror is not None:
             return {name: about["bytes"] for name, about in self.mirror.manifests[drive]["files"].items()}
         run = self.run(drive)
-        files = [file for file in sorted(run.rglob("*")) if file.is_file()]
-        return {file.relative_to(run).as_posix(): file.stat().st_size for file in files}
+        return {name: (run / name).lstat().st_size for name in regular_files(run)}
 
     def rows(self, name: str, drive: str) -> int:
         """Rows of a table of a drive, by its footer. Raises ResultError."""
@@ -228,8 +228,9 @@ class Store:
 @contextmanager
 def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
     """A map, local or on an object store, for those who only read it; with a cache, what is read of the latter stays
-    there for the next one. Raises ResultError."""
+    there for the next one. Raises ResultError, also where something in it is not its own file."""
     if not isinstance(root, RemotePath):
+        check_regular(root, "map.json")
         yield Store(root)
         return
     from vplog.maps.mirror import Mirror

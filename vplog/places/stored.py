@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
+from vplog.folders import check_regular
 from vplog.parquet_bounds import check_file, open_table, read_table
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ _REFERENCES = pa.schema(
 
 def save_references(references: Sequence[Reference], settings: Settings, folder: Path) -> None:
     """Write references.parquet (images as PNG), features.parquet and library.json, the last one last."""
+    check_regular(folder, "library.json")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "library.json").unlink(missing_ok=True)
@@ -122,7 +124,9 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
 
 
 def read_library_record(folder: Path) -> dict[str, Any]:
-    """library.json of a saved library. Raises LibraryError where the folder is not one."""
+    """library.json of a saved library. Raises LibraryError where the folder is not one, ResultError where something in
+    it is not its own file."""
+    check_regular(folder, "library.json")
     try:
         check_file(folder / "library.json")
         record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
@@ -138,7 +142,9 @@ def read_library_record(folder: Path) -> dict[str, Any]:
 
 
 def load_references(folder: Path, threads: int = 1) -> list[Reference]:
-    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together."""
+    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together,
+    ResultError where something in the folder is not its own file."""
+    check_regular(folder, "library.json")
     try:
         features = _table(folder / "features.parquet", _FEATURES)
         references = _table(folder / "references.parquet", _REFERENCES)

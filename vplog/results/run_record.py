@@ -8,6 +8,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.folders import check_regular
 from vplog.parquet_bounds import check_file
 from vplog.results.atomic import replacing
 
@@ -59,7 +60,9 @@ def _parts(one: dict[str, Any] | list[Any]) -> Iterable[Any]:
 
 
 def read_finished_run(folder: Path) -> dict[str, Any]:
-    """The record of a run that came to its end. Raises ResultError."""
+    """The record of a run that came to its end. Raises ResultError, also where something in the folder is not its own
+    file."""
+    check_regular(folder, "run.json")
     record = read_run_json(folder / "run.json")
     if not record.get("finished"):
         raise ResultError(f"The run in {folder} did not finish. Go on with it: vplog run --resume -o {folder}")
