@@ -9,7 +9,7 @@ from vplog import logs
 from vplog.errors import ResultError, SettingsError
 from vplog.folders import check_regular
 from vplog.pipeline import Pipeline
-from vplog.record import OWN_LIBRARY
+from vplog.record import OWN_LIBRARY, stored_log
 from vplog.remote import located
 from vplog.results import run_record
 
@@ -47,11 +47,14 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
             f"{out}/run.json does not say all that its run was asked for. Give the same command again without "
             "--resume: what is done is found."
         )
-    paths = [located(text) for text in _texts(account, out)]
-    if given and {path.resolve() for path in given} != {path.resolve() for path in paths}:
-        known = " ".join(map(str, paths))
+    known = [str(located(text).resolve()) for text in _texts(account, out)]
+    paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
+    if not given:
+        again = f"Give it again: vplog run --resume LOG -o {out}"
+        paths = [stored_log(text, f"The log of the run in {out}", again) for text in known]
+    if sorted(str(path.resolve()) for path in paths) != sorted(known):
         raise SettingsError(
-            f"The run in {out} is of {known}, not of {given[0]}. Leave out the log, or choose another -o."
+            f"The run in {out} is of {' '.join(known)}, not of {given[0]}. Leave out the log, or choose another -o."
         )
     where = f"{out}/run.json"
     pipeline = Pipeline.read(_tree(account, "settings", out), where)
@@ -65,6 +68,12 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
         None if library == OWN_LIBRARY else located(library),
         logs.TopicChoice.read(_tree(account, "topics", out), where),
     )
+
+
+def _place(known: list[str], path: Path) -> int:
+    """Of a log among those of the run; behind all where it is none of them."""
+    text = str(path.resolve())
+    return known.index(text) if text in known else len(known)
 
 
 def _texts(account: dict[str, Any], out: Path) -> list[str]:
