@@ -178,9 +178,12 @@ def test_nothing_is_written_through_a_link(root: Path, tmp_path: Path) -> None:
 def test_a_killed_removal_is_finished_and_a_half_removed_drive_is_none(root: Path) -> None:
     store = map_store.Store(root)
     store.staging.mkdir()
-    store.run("one").rename(store.staging / "removed-1")
+    store.write_removed(["one"])
+    assert list(store.drives()) == ["two"]
+    store.run("one").rename(store.staging / "gone-1-0")
     with map_store.writing(root):
         assert list(store.drives()) == ["two"]
+    assert not (root / "removed.json").exists()
     assert {path.name for name in map_store.TABLES for path in (root / name).iterdir()} == {"drive=two"}
     (store.run("two") / "drive.json").unlink()  # `rm -r` takes files in any order
     assert store.drives() == {}

@@ -13,6 +13,7 @@ from vplog.between import no_candidates, proposed_in, with_proposals
 from vplog.errors import ResultError
 from vplog.extract import map_in_order
 from vplog.maps.index import of_drive, update_index
+from vplog.maps.layout import ADD_AGAIN
 from vplog.maps.search import best_places
 from vplog.maps.sequences import PLACES_A_VIEW, credits_of
 from vplog.places.bobb import BobbState
@@ -44,7 +45,7 @@ def places_of(store: Store, member: Member, state: PlaceState) -> Sequence[Any]:
     try:
         column = column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:
-        raise ResultError(f"{path} is of another recogniser. Remove the drive's folders.") from None
+        raise ResultError(f"{path} is of another recogniser. Where it should not be, {ADD_AGAIN}") from None
     with of_drive(store, member.drive):
         return state.from_arrow(column)
 

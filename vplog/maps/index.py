@@ -21,6 +21,7 @@ import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.cache import is_sealed, seal, seal_of
+from vplog.maps.layout import ADD_AGAIN
 from vplog.maps.segment import SUFFIX, Content, Segment, checksum, open_segment, write_segment
 from vplog.maps.store import other_library
 from vplog.parquet_bounds import check_file
@@ -116,11 +117,13 @@ def content_of(store: Store, drive: str, key: str) -> Content:
             end = stream.read(8)
             length = int.from_bytes(end[:4], "little")  # of the footer, as Parquet ends
             if end[4:] != b"PAR1" or length > size - 8:
-                raise ResultError(f"{path} is damaged. Remove the drive's folders, and add its log again.")
+                raise ResultError(f"{path} is damaged. Copy it back, or {ADD_AGAIN}")
             stream.seek(size - 8 - length)
             mark = hashlib.sha256(stream.read(length)).hexdigest()
     except OSError as error:
-        raise ResultError(f"{path} cannot be read: {error.strerror or error}. Remove the drive's folders.") from None
+        raise ResultError(
+            f"{path} cannot be read: {error.strerror or error}. Check its permissions, or {ADD_AGAIN}"
+        ) from None
     return Content(drive, key, mark)
 
 
@@ -217,9 +220,7 @@ def of_drive(store: Store, drive: str) -> Iterator[None]:
     try:
         yield
     except LibraryError as error:
-        raise LibraryError(
-            f"The places of {drive} are damaged. {error} Take the drive out: vplog map remove {store} {drive}"
-        ) from None
+        raise LibraryError(f"The places of {drive} are damaged. {error} Copy them back, or {ADD_AGAIN}") from None
 
 
 def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.Array:
@@ -228,7 +229,7 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
         return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:
         raise ResultError(
-            f"{_descriptors(store, drive)} is of another recogniser. Remove the drive's folders."
+            f"{_descriptors(store, drive)} is of another recogniser. Where it should not be, {ADD_AGAIN}"
         ) from None
 
 

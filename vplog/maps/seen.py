@@ -181,4 +181,4 @@ def camera_from(values: dict[str, Any]) -> Camera:
             disparity_zero_px=float(values["disparity_zero_px"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise ResultError(f"A camera in MAP/joins is damaged: {error}. Remove that folder and run again.") from None
+        raise ResultError(f"A camera in MAP/joins is damaged: {error}. Move that folder away, and run again.") from None

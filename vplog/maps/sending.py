@@ -30,7 +30,7 @@ _LEFT_OVER = timedelta(days=1)
 """Age of an object that no manifest names, from which it is nobody's: far beyond any upload."""
 _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
-_KNOWN = ("runs", "libraries", "map.json", "failures.json", *TABLES)
+_KNOWN = ("runs", "libraries", "map.json", "failures.json", "removed.json", *TABLES)
 """What in a map's folder has a place of its own on a store; the rest goes together."""
 
 
@@ -175,12 +175,12 @@ def remove(mirror: Mirror, drive: str) -> None:
         mirror.lock.check()
     with told(remote):
         objects.remove(remote / "runs" / named / "drive.json")
+        mirror.manifests.pop(drive, None)
         objects.remove(remote / "runs" / named)
         for name in objects.folders_in(remote):
             objects.remove(remote / name / named)
     for folder in mirror.local.glob(f"*/{named}"):
         shutil.rmtree(folder)
-    mirror.manifests.pop(drive, None)
 
 
 def send_rest(mirror: Mirror) -> None:
