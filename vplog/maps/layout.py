@@ -58,7 +58,7 @@ def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
         )
     if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
         raise ResultError(
-            f"{folder} holds drive {record['drive']!r}. Give it its own name, or move it out of the map, and {ADD_AGAIN}"
+            f"{folder} holds drive {record['drive']!r}. Rename it, or move it out of the map, and {ADD_AGAIN}"
         )
     return record
 

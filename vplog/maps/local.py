@@ -164,18 +164,16 @@ def take_out(store: Store, drives: Sequence[str]) -> None:
         for run, gone in moved:
             gone.rename(run)
         raise
-    for gone in store.staging.glob("gone-*"):  # those of a writer that was killed, too
-        (gone / "drive.json").unlink(missing_ok=True)  # without it the next writer puts nothing back
-        shutil.rmtree(gone, ignore_errors=True)
+    for folder in store.staging.glob("gone-*"):  # those of a writer that was killed, too
+        shutil.rmtree(folder)
     for drive in drives:
         for folder in _folders_of(store, drive):
-            shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(folder)
 
 
 def _folders_of(store: Store, drive: str) -> list[Path]:
-    """All that bears the name of a drive."""
-    named = folder_name(drive)
-    return [folder for folder in [*store.root.glob(f"*/{named}"), store.root / ".cache" / named] if folder.is_dir()]
+    """All that bears the name of a drive, its cache too."""
+    return list(store.root.glob(f"*/{folder_name(drive)}"))
 
 
 def _folders_below(folder: Path) -> set[str]:

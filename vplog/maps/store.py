@@ -363,7 +363,8 @@ def _sweep(store: Store) -> None:
         try:
             local.take_out(store, drives)
         except OSError as error:
-            raise ResultError(f"Cannot remove files from {store}: {error.strerror}. Check its permissions.") from None
+            where = error.filename or store
+            raise ResultError(f"Cannot remove {where}: {error.strerror}. Check its permissions.") from None
     else:
         from vplog.maps import sending
 
