@@ -102,7 +102,7 @@ def test_no_verb_writes_or_says_a_signature(server: str, verb: Verb, tmp_path: P
     assert "URLs are kept without their query" in said[4].error
     assert "--truth FILE.tum" in said[4].error
     assert said[6].code == 0
-    assert "Give it with --log LOG" in said[7].error
+    assert "Say where it is: --log LOG" in said[7].error
     assert json.loads(said[9].out)["drives"][0]["state"] == "unchanged", "a link that is signed anew is the same log"
     assert said[11].code == 0
     assert "vplog batch LOG -o" in said[13].out + said[13].err

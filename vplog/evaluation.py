@@ -89,7 +89,7 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
 def _against_gps(
     record: dict[str, Any], before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None
 ) -> dict[str, Any]:
-    fixes = reopened(record, None, topics, "Put it back there, or give a truth file: --truth FILE.tum").gps()
+    fixes = reopened(record, None, topics, "Put it back there, or give a truth file: --truth FILE.tum.").gps()
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     return {

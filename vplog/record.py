@@ -49,14 +49,14 @@ def stored_log(text: str, whose: str, again: str) -> Path:
     except OSError as error:
         why = f"cannot be opened ({reason(error)})"
     no_query = _NO_QUERY if text.startswith("http") else ""
-    raise LogError(f"{whose}, {path}, {why}.{no_query} {again}")
+    raise LogError(f"{whose} {path} {why}.{no_query} {again}")
 
 
 def reopened(
     account: dict[str, Any],
     log: Path | None,
     topics: logs.TopicChoice | None,
-    again: str = "Say where it is: --log LOG",
+    again: str = "Say where it is: --log LOG.",
 ) -> Log:
     """The log of a run by its run.json, or the one given in its place. Raises LogError, which says how to give it
     `again`, or ResultError where none is."""
