@@ -98,7 +98,7 @@ def check_all_or_none(root: Path, before: dict[str, bytes]) -> bool:
 def test_a_removal_stopped_anywhere_takes_all_or_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    outcomes, whole = set[bool](), whole_map(tmp_path / "whole")
+    outcomes, whole, step = set[bool](), whole_map(tmp_path / "whole"), 0
     for step in (*range(1, 20), *range(20, 1000, 5)):
         root = tmp_path / f"{step}"
         shutil.copytree(whole, root)
