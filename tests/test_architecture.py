@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
+    {"folders", "urls"},
     {"data", "settings", "timing", "cores", "google_store", "web", "scratch", "own_processes", "parquet_bounds"},
     {"image_file"},
     {"geometry", "geodesy", "remote"},

@@ -85,7 +85,7 @@ def test_a_map_grows_and_shrinks(server: str) -> None:
     root: Any = located("gs://bucket/map")
     make_map(root, {"one": 1, "two/3 %": 2})
     with map_store.writing(root) as store:
-        map_store.remove(store, "one")
+        map_store.remove(store, ["one"])
         put(store, "three", 3)
     with map_store.reading(root) as store:
         assert {drive: seeds(store.run(drive)) for drive in store.drives()} == {"two/3 %": {2}, "three": {3}}

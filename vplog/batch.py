@@ -28,7 +28,8 @@ from vplog.maps.join import load_places
 from vplog.maps.layout import drive_record, folder_name
 from vplog.own_processes import known_ahead
 from vplog.pipeline import load_pipeline, pipeline_from
-from vplog.remote import RemotePath
+from vplog.remote import RemotePath, located
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -128,7 +129,7 @@ def run_batch(
     given = [_place(path) for path in paths]
     twice = [log for log, count in Counter(given).items() if count > 1]
     if twice:
-        raise SettingsError(f"{twice[0]} is given twice. Give each log once.")
+        raise SettingsError(f"{shown(twice[0])} is given twice. Give each log once.")
     with (
         map_store.writing(root) as store,
         ThreadPoolExecutor(1) as aside,
@@ -137,16 +138,20 @@ def run_batch(
         digest = map_library(store, paths, library, pipeline, topics, threads, progress)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        at = dict(zip(given, paths, strict=True))
-        inputs, errors = known_hashes(at, topics, store.root / NAME, threads, progress)
-        drives = keys.drive_names([_name(path) for path in paths], given, {**_failed(store), **known}, inputs)
+        inputs, errors = known_hashes(
+            dict(zip(given, paths, strict=True)), topics, store.root / NAME, threads, progress
+        )
+        drives = keys.drive_names(
+            [_name(path) for path in paths], list(map(shown, given)), {**_failed(store), **known}, inputs
+        )
         alike = _alike(pipeline, topics, digest)
         done, wanted = dict[str, Drive](), list[dict[str, Any]]()
-        for drive, log, content in zip(drives, given, inputs, strict=True):
-            about = {"drive": drive, "inputs": content, **alike}
+        urls = dict(zip(drives, given, strict=True))
+        for drive, content in zip(drives, inputs, strict=True):
+            about, log = {"drive": drive, "inputs": content, **alike}, shown(urls[drive])
             about |= {"key": keys.key_of(about), "log": log}
-            if log in errors:
-                done[drive] = Drive(drive, log, "failed", error=errors[log])
+            if why := errors.get(urls[drive]):
+                done[drive] = Drive(drive, log, "failed", error=why)
                 tell(done[drive])
             elif drive in known and known[drive]["key"] == about["key"] and not _is_damaged(store, drive):
                 done[drive] = Drive(drive, log, "unchanged")
@@ -157,7 +162,7 @@ def run_batch(
         at_once = jobs or workers.at_once(each)
         progress("drives", len(done), len(paths))
         like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, join or keep_cache)
-        tasks = _tasks(store, wanted if at_once == 1 else _longest_first(wanted, at), like)
+        tasks = _tasks(store, wanted if at_once == 1 else _longest_first(wanted, urls), like, urls)
         places = None
         if join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
             places = aside.submit(load_places, like.library, pipeline, threads)
@@ -173,7 +178,7 @@ def run_batch(
         joined, join_error = None, ""
         if join:
             ready = None if places is None else places.result
-            joined, join_error = _join(store, pipeline, workers.helpers(threads), threads, progress, ready)
+            joined, join_error = _join(store, pipeline, workers.helpers(threads), threads, progress, ready, urls)
         if not keep_cache and not join_error:  # another join would need it
             _forget_all(store)
     fate = [done[drive] for drive in drives]
@@ -286,22 +291,22 @@ def _has_room(store: Store) -> bool:
     return shutil.disk_usage(store.root).free > _FREE_BYTES
 
 
-def _tasks(store: Store, wanted: Sequence[dict[str, Any]], like: Task) -> list[Task]:
+def _tasks(store: Store, wanted: Sequence[dict[str, Any]], like: Task, urls: Mapping[str, str]) -> list[Task]:
     """A task for each drive that is to be computed, by what drive.json will say of it."""
     return [
         replace(
-            like, drive=about["drive"], log=about["log"], about=about, cache=_cache(store, about["drive"]),
+            like, drive=about["drive"], log=urls[about["drive"]], about=about, cache=_cache(store, about["drive"]),
             folder=like.folder / f"{os.getpid()}-{number}",
         )
         for number, about in enumerate(wanted)
     ]  # fmt: skip
 
 
-def _longest_first(wanted: Sequence[dict[str, Any]], at: Mapping[str, Path]) -> list[dict[str, Any]]:
+def _longest_first(wanted: Sequence[dict[str, Any]], urls: Mapping[str, str]) -> list[dict[str, Any]]:
     """By the bytes of the logs, so that none of the long ones is begun when all others are done."""
 
     def size(about: dict[str, Any]) -> int:
-        path = at[about["log"]]
+        path = located(urls[about["drive"]])
         try:
             return 0 if isinstance(path, RemotePath) else bytes_of(path)  # of a URL it would be asked for again
         except OSError:  # its own run says why
@@ -328,9 +333,9 @@ def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
 
 
 def _place(path: Path) -> str:
-    """Where a log is, from any folder; by the name given, whatever that is a link to."""
+    """What opens a log from any folder, by the name given, whatever that is a link to: a URL with its query."""
     if isinstance(path, RemotePath):
-        return str(path)
+        return path.url
     if path.name in ("", ".."):
         return str(path.resolve())
     # `..` is of the folder that a link leads to
@@ -370,4 +375,4 @@ def _put_in(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
         shutil.rmtree(task.folder, ignore_errors=True)
     told = (outcome.seconds, outcome.worker, outcome.peak_memory_mb, error)
     told += (outcome.keyframes, outcome.accepted, outcome.warnings)
-    return Drive(task.drive, task.log, "failed" if error else "computed", attempts, *told)
+    return Drive(task.drive, task.about["log"], "failed" if error else "computed", attempts, *told)

@@ -54,7 +54,7 @@ def map_library(
         if known is None:
             digest = pipeline.places.load(given, threads).hash  # held against what it says of itself
             try:
-                shutil.copytree(given, made)
+                shutil.copytree(given, made, symlinks=True)
             except (OSError, shutil.Error) as error:
                 shutil.rmtree(made, ignore_errors=True)
                 told = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error

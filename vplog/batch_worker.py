@@ -29,6 +29,7 @@ class Task:
 
     drive: str
     log: str
+    """What opens it: a URL with its query, which `about` has without."""
     folder: Path
     """Where the run folder is made; it is the map's when it is renamed in."""
     library: Path
@@ -82,7 +83,7 @@ def compute_drive(task: Task) -> Outcome:
             )  # fmt: skip
         peak = done.record["totals"]["peak_memory_mb"]
         if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):
-            error = f"{task.log} changed while it was read. Run again."
+            error = f"{task.about['log']} changed while it was read. Run again."
         else:
             if done.keyframes.drive != task.drive:
                 keys.name_keyframes(task.folder / "keyframes.parquet", task.drive)

@@ -11,7 +11,7 @@ import sys
 import threading
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, cast
 
 import vplog
 from vplog.cli_maps import add_maps
@@ -30,6 +30,7 @@ from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
 from vplog.cores import available, limited
 from vplog.errors import VplogError, was_interrupted
+from vplog.urls import without_secrets
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -308,8 +309,15 @@ def demo(arguments: argparse.Namespace) -> None:
     print_evaluation(found)
 
 
+class _Parser(argparse.ArgumentParser):
+    """What is wrong with a command, without the tokens of URLs in it."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(without_secrets(message))
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="vplog", description=vplog.__doc__)
+    parser = cast("argparse.ArgumentParser", _Parser(prog="vplog", description=vplog.__doc__))
     parser.add_argument("--version", action="version", version=f"vplog {vplog.__version__}")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print one JSON object")

@@ -8,6 +8,8 @@ import textwrap
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from vplog.urls import without_secrets
+
 if TYPE_CHECKING:
     import argparse
     from pathlib import Path
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 def say(message: str) -> None:
     """A line on stderr. Where that is closed or full, no work is lost for it."""
     with suppress(OSError):
-        print(f"vplog: {message}", file=sys.stderr)
+        print(f"vplog: {without_secrets(message)}", file=sys.stderr)
 
 
 def print_info(found: dict[str, Any]) -> None:

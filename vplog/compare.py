@@ -5,6 +5,7 @@ Every method gets the same features, the same reference images and the same trut
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from contextlib import ExitStack
@@ -177,7 +178,7 @@ def _extract_all(
 
 
 def _is_saved(library: Path | None) -> bool:
-    return library is not None and (library / "library.json").is_file()
+    return library is not None and os.path.lexists(library / "library.json")
 
 
 def _check_gap(query: Path, itself: bool, min_gap: int | None) -> None:

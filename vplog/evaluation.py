@@ -14,6 +14,7 @@ from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.record import reopened
 from vplog.results import run_record, tables
+from vplog.urls import without_secrets
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,7 +42,7 @@ def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -
     settings = _recorded(record, folder, dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
     return {
-        "truth": truth,
+        "truth": without_secrets(truth),
         "ate_before": asdict(trajectory.ate(before, known)),
         "ate_after": asdict(trajectory.ate(after, known)),
         "rpe_before": asdict(trajectory.rpe(before, known)),
@@ -73,7 +74,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str) -> dict[str, Any]:
             for name, (after, odometry) in zip(names, parts, strict=True)
         ]
         maps.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known))})
-    return {"truth": truth, "maps": maps}
+    return {"truth": without_secrets(truth), "maps": maps}
 
 
 def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
@@ -88,7 +89,7 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
 def _against_gps(
     record: dict[str, Any], before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None
 ) -> dict[str, Any]:
-    fixes = reopened(record, None, topics).gps()
+    fixes = reopened(record, None, topics, "Put it back there, or give a truth file: --truth FILE.tum.").gps()
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     return {

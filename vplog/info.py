@@ -14,6 +14,7 @@ from vplog.errors import LogError
 from vplog.keyframes import KeyframeSettings, select_keyframes
 from vplog.logs.odometry_sources import in_words as evidence_in_words
 from vplog.logs.stamps import rate_hz
+from vplog.remote import address
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -98,7 +99,8 @@ def command(path: Path, topics: TopicChoice) -> str:
     """The command that runs on this log with these topics."""
     chosen = {name: value for name, value in topics if value is not None}
     options = [f"--{_OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
-    return " ".join(["vplog run", shlex.quote(str(path)), "-o OUT", *options])
+    log = "LOG" if address(path) != str(path) else shlex.quote(str(path))  # a URL with its query is shown nowhere
+    return " ".join(["vplog run", log, "-o OUT", *options])
 
 
 def _camera(log: Log, problems: list[str]) -> Camera | None:

@@ -29,6 +29,7 @@ def hash_inputs(drive: Path | Sequence[Path], told: Callable[[int], None] = lamb
     result: dict[str, str] = {}
     for own, file in _named(drive):
         name = str(file) if own in result else own
+        name = f"{name} ({len(result) + 1})" if name in result else name  # URLs that differ in their queries alone
         if isinstance(file, RemotePath):
             result[name] = file.version()
             continue
@@ -54,7 +55,7 @@ def look_of(drive: Path | Sequence[Path]) -> dict[str, str]:
     look = {}
     for _, file in _named(drive):
         if isinstance(file, RemotePath):
-            look[str(file)] = file.version()
+            look[str(file) if str(file) not in look else f"{file} ({len(look) + 1})"] = file.version()
         else:
             stat = file.stat()
             look[str(file.resolve())] = f"length {stat.st_size}, times {stat.st_mtime_ns} {stat.st_ctime_ns}"

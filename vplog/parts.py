@@ -27,10 +27,11 @@ from vplog.extract import extract_frames
 from vplog.extracted import Extracted, packed
 from vplog.inputs import files_of
 from vplog.keyframes import select_keyframes
-from vplog.remote import located
+from vplog.remote import address, located
 from vplog.results.atomic import replacing
 from vplog.results.previews import preview
 from vplog.stage_cache import StageCache, finished_parts, inputs_of, key_of
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -133,7 +134,9 @@ def put_part(cache: Path, part: Part, data: bytes) -> None:
     try:
         content_of(data, part.key)
     except DamagedError as error:
-        raise ResultError(f"Part {part.number} of {part.log[0]} came damaged: {error}. Compute it again.") from None
+        raise ResultError(
+            f"Part {part.number} of {shown(part.log[0])} came damaged: {error}. Compute it again."
+        ) from None
     try:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -165,7 +168,7 @@ def cut(
             f"{keyframes.drive}: by the odometry nothing moves far enough for a second keyframe, and a graph needs "
             "two. Set keyframes.distance_m lower, or choose another topic with --odometry-topic."
         )
-    topics, paths = topics or logs.TopicChoice(), tuple(str(file.resolve()) for file in files)
+    topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files)
     alike = {
         "inputs": inputs.token,
         "topics": images_topics(topics),

@@ -15,7 +15,7 @@ from vplog import logs
 from vplog.data import Verdict
 from vplog.errors import LogError, ResultError
 from vplog.inputs import bytes_of, files_of, look_of
-from vplog.remote import local_copy, located, original
+from vplog.remote import local_copy, located, original, reason
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -31,14 +31,37 @@ OWN_LIBRARY = "the drive's own keyframes"
 """Where the library of a run is from to which none was given."""
 
 
-def reopened(account: dict[str, Any], log: Path | None, topics: logs.TopicChoice | None) -> Log:
-    """The log of a run by its run.json, or the one given in its place. Raises LogError or ResultError where none is."""
+_NO_QUERY = " URLs are kept without their query, which may hold a token."
+
+
+def stored_log(text: str, whose: str, again: str) -> Path:
+    """A log by where a record says it is. Raises LogError, which ends with how to give it `again`, where it is gone or
+    cannot be asked for, as a signed link without its signature."""
+    path = located(text)
+    try:
+        if path.exists():
+            return path
+        why = "is not there any more"
+    except OSError as error:
+        why = f"cannot be opened ({reason(error)})"
+    no_query = _NO_QUERY if text.startswith("http") else ""
+    raise LogError(f"{whose} {path} {why}.{no_query} {again}")
+
+
+def reopened(
+    account: dict[str, Any],
+    log: Path | None,
+    topics: logs.TopicChoice | None,
+    again: str = "Say where it is: --log LOG.",
+) -> Log:
+    """The log of a run by its run.json, or the one given in its place. Raises LogError, which says how to give it
+    `again`, or ResultError where none is."""
     if log is None and not isinstance(account.get("log"), str):
         raise ResultError("The run's run.json lacks log. Run `vplog run` again to write it anew.")
-    known = [log] if log is not None else [located(str(part)) for part in account.get("parts") or [account.get("log")]]
-    for path in known:
-        if not path.exists():
-            raise LogError(f"The log of the run, {path}, is not there any more. Say where it is with --log PATH.")
+    parts = account.get("parts") or [account.get("log")]
+    known = [log] if log is not None else [stored_log(str(part), "The log of the run", again) for part in parts]
+    if log is not None and not log.exists():
+        raise LogError(f"There is no log at {log}. {again}")
     return logs.open_drive(known, topics)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vplog import logs
 from vplog.batch import Drive, run_batch, tell_failures
 from vplog.engine import RETRIES
-from vplog.errors import SettingsError
+from vplog.errors import LogError, SettingsError
 from vplog.libraries import build_library
 from vplog.maps import store as map_store
 from vplog.maps.damage import reading_drive, without_damaged
@@ -19,6 +19,7 @@ from vplog.maps.imports import ALONE
 from vplog.maps.merge import in_order
 from vplog.pipeline import Pipeline
 from vplog.places.stored import read_library_record
+from vplog.record import stored_log
 from vplog.remote import local_copy, located
 from vplog.results import run_record
 from vplog.scratch import scratch
@@ -61,15 +62,18 @@ def redescribe_map(
     groups: dict[str, list[str]] = {}
     for drive in in_order(drives):
         log = drives[drive]["log"]
-        if located(log).exists():
-            groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
-        else:
-            why = (
-                "Places alone are known of it. Put its log into the map first: vplog batch LOG"
-                if ALONE in drives[drive]
-                else f"Its log {log} is not there any more. Put it back, and give the same command again."
+        try:
+            if ALONE in drives[drive]:
+                raise LogError(
+                    f"Places alone are known of it. Put its log into the map first: vplog batch LOG -o {root}"
+                )
+            stored_log(
+                log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
             )
-            missing[drive] = Drive(drive, log, "failed", error=why)
+        except LogError as error:
+            missing[drive] = Drive(drive, log, "failed", error=str(error))
+        else:
+            groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
     with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), threads, progress) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
             raise SettingsError(f"{root} is described with {library} already. Give another library.")
@@ -113,7 +117,7 @@ def _drives_of(store: Store) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]
 @contextmanager
 def _made(library: Path, pipeline: Pipeline, threads: int, progress: Progress) -> Iterator[tuple[Path, Pipeline]]:
     """The folder of the library, and the settings with its own of places."""
-    if (library / "library.json").exists():
+    if not library.is_file() and (library / "library.json").exists():
         with local_copy(library) as folder:
             places = read_library_record(folder)["settings"]
             settings = {**pipeline.model_dump(mode="json"), "places": places}
@@ -131,6 +135,6 @@ def _bring_caches(root: Path, target: Path) -> None:
     if not kept.is_dir() or "://" in str(target) or (target / ".cache").exists():
         return
     try:
-        shutil.copytree(kept, target / ".cache", copy_function=os.link)
+        shutil.copytree(kept, target / ".cache", symlinks=True, copy_function=os.link)
     except (OSError, shutil.Error):  # it only spares work
         shutil.rmtree(target / ".cache", ignore_errors=True)

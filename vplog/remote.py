@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.google_store import google_file_system, google_place, plain, plain_errors
 from vplog.scratch import scratch
+from vplog.urls import shown, without_secrets
 from vplog.web import get_range, head
 
 if TYPE_CHECKING:
@@ -55,21 +56,47 @@ def located(text: str | Path | RemotePath) -> Path:
         return Path(text)
     scheme = str(text).split("://", 1)[0]
     if scheme not in SCHEMES:
-        raise SettingsError(f"Cannot open {text}: {scheme}:// is not known. Known: {', '.join(SCHEMES)}, or a path.")
-    return cast("Path", RemotePath(str(text)))
+        known = f"{scheme}:// is not known. Known: {', '.join(SCHEMES)}, or a path."
+        raise SettingsError(f"Cannot open {shown(str(text))}: {known}")
+    return cast("Path", RemotePath(_checked(str(text), scheme)))
+
+
+def address(path: Path) -> str:
+    """What opens a path from another process: a URL with its query, which is not to be stored or shown."""
+    return path.url if isinstance(path, RemotePath) else str(path)
+
+
+def _checked(url: str, scheme: str) -> str:
+    """The URL, if credentials are in the query of http alone. Raises SettingsError, which does not show them."""
+    host, store = re.split("[/?#]", url.split("://", 1)[1], maxsplit=1)[0], scheme in ("s3", "gs")
+    port = host.rpartition(":")[2]
+    if "@" in host or (":" in host and (store or not (port.isdigit() or port.endswith("]")))):
+        raise SettingsError(
+            f"A {scheme}:// URL names a user, a password, or a port that is no number, and vplog sends none. Leave "
+            "them out: a store's keys come from the environment, and a web server takes a signed link."
+        )
+    if store and "?" in url:
+        raise SettingsError(f"{shown(url)} has a query behind it, which {scheme}:// takes none. Spell ? in a name %3F.")
+    return url.replace("#", "%23") if store else url
 
 
 class RemotePath:
     """One object, or what has this prefix, on a server. A URL has % for what it cannot spell; names here have not."""
 
     def __init__(self, url: str) -> None:
-        self._url = url.rstrip("/")
+        self._url = url if "?" in url else url.rstrip("/")
 
-    def __str__(self) -> str:
+    @property
+    def url(self) -> str:
+        """With its query, which may hold a token."""
         return self._url
 
+    def __str__(self) -> str:
+        """As it is stored and shown: without its query."""
+        return shown(self._url)
+
     def __repr__(self) -> str:
-        return f"RemotePath({self._url!r})"
+        return f"RemotePath({str(self)!r})"
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RemotePath) and self._url == other._url
@@ -81,7 +108,9 @@ class RemotePath:
         return self._url < other._url
 
     def __truediv__(self, name: str) -> RemotePath:
-        return RemotePath(f"{self._url}/{str(name).replace('%', '%25')}")
+        place, mark, query = self._url.partition("?")
+        quoted = str(name).replace("%", "%25").replace("?", "%3F").replace("#", "%23")
+        return RemotePath(f"{place}/{quoted}{mark}{query}")
 
     @property
     def scheme(self) -> str:
@@ -103,7 +132,7 @@ class RemotePath:
         return self
 
     def relative_to(self, folder: RemotePath) -> PurePosixPath:
-        below = PurePosixPath(self._url).relative_to(PurePosixPath(str(folder)))
+        below = PurePosixPath(str(self)).relative_to(PurePosixPath(str(folder)))
         return PurePosixPath(urllib.parse.unquote(str(below)))
 
     def exists(self) -> bool:
@@ -398,5 +427,5 @@ def _check_bucket(path: RemotePath) -> None:
 
 
 def reason(error: OSError) -> str:
-    said = plain(error.strerror or str(error))
+    said = without_secrets(plain(error.strerror or str(error)))
     return (said.splitlines()[0] if said else type(error).__name__)[:300].rstrip(".")

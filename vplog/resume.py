@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from vplog import logs
 from vplog.errors import LogError, ResultError, SettingsError
+from vplog.folders import check_regular
 from vplog.pipeline import Pipeline
-from vplog.record import OWN_LIBRARY, stat_of
+from vplog.record import OWN_LIBRARY, stat_of, stored_log
 from vplog.remote import located
 from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
@@ -39,6 +40,8 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
 
     Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
     """
+    check_regular(out, "run.json")
+    check_regular(out / CACHE)
     recover(out)
     file = out / REQUEST if (out / REQUEST).is_file() else out / "run.json"  # there older versions had it
     if not file.is_file():
@@ -51,11 +54,14 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
             f"{out}/run.json does not say all that its run was asked for. Give the same command again without "
             "--resume: what is done is found."
         )
-    paths = [located(text) for text in _texts(account, out)]
-    if given and {path.resolve() for path in given} != {path.resolve() for path in paths}:
-        known = " ".join(map(str, paths))
+    known = [str(located(text).resolve()) for text in _texts(account, out)]
+    paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
+    if not given:
+        again = f"Give it again: vplog run --resume LOG -o {out}"
+        paths = [stored_log(text, f"The log of the run in {out}", again) for text in known]
+    if sorted(str(path.resolve()) for path in paths) != sorted(known):
         raise SettingsError(
-            f"The run in {out} is of {known}, not of {given[0]}. Leave out the log, or choose another -o."
+            f"The run in {out} is of {' '.join(known)}, not of {given[0]}. Leave out the log, or choose another -o."
         )
     _check_unchanged(paths, account, out)
     where = str(file)
@@ -81,6 +87,12 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
     if now.token == key_of(now.look):  # the cache does not know the content either, so nothing of it would be found
         given = shlex.join(map(str, paths))
         raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
+
+
+def _place(known: list[str], path: Path) -> int:
+    """Of a log among those of the run; behind all where it is none of them."""
+    text = str(path.resolve())
+    return known.index(text) if text in known else len(known)
 
 
 def _texts(account: dict[str, Any], out: Path) -> list[str]:

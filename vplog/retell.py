@@ -23,6 +23,7 @@ from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
 from vplog.results.report.content import Judged
 from vplog.show import Seen, choose_examples, draw_closures
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Features
@@ -47,7 +48,7 @@ def report(
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
         pictures = pictures_from(log, folder, record, threads)
     written = write_report(folder, record, path, judged, pictures)
-    return {"report": str(written), "bytes": written.stat().st_size, "truth": truth}
+    return {"report": str(written), "bytes": written.stat().st_size, "truth": truth and shown(truth)}
 
 
 def judge(folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None = None) -> Judged:
@@ -65,7 +66,7 @@ def judge(folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicCh
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
     path = geometry.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
-    return Judged(Path(truth).name, scores, path, found.true, found.known, found.curves)
+    return Judged(Path(shown(truth)).name, scores, path, found.true, found.known, found.curves)
 
 
 def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int) -> dict[int, bytes]:

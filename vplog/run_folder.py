@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vplog import logs, record
 from vplog.cache_file import CACHE_FILES, ENDING
 from vplog.errors import ResultError, SettingsError, was_interrupted
+from vplog.folders import check_regular
 from vplog.inputs import bytes_of, files_of, hash_inputs
 from vplog.remote import located, stands_for
 from vplog.results import run_record
@@ -61,6 +62,7 @@ def begun(
     }
 
     def begin() -> list[str]:
+        check_regular(out, "run.json")
         if not force:
             _check_same_logs(out, files)
         return _results_in(out, library, drives or {}, resumable)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import ResultError
+from vplog.folders import regular_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -95,8 +96,7 @@ def sync(path: Path) -> None:
 
 def files_in(folder: Path) -> list[str]:
     """Names of all files in a folder and below it, in order; hidden ones are nobody's result."""
-    found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
-    return [path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts)]
+    return [name for name in regular_files(folder) if not any(part.startswith(".") for part in name.split("/"))]
 
 
 def pieces(path: Path) -> Iterator[Bytes]:

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from vplog.urls import without_secrets
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -95,4 +97,4 @@ def _opener() -> urllib.request.OpenerDirector:
 
 
 def _printable(text: str) -> str:
-    return "".join(one if one.isprintable() else " " for one in text)[:200].rstrip(". ")
+    return "".join(one if one.isprintable() else " " for one in without_secrets(text))[:200].rstrip(". ")

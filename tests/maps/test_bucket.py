@@ -97,7 +97,7 @@ def test_all_else_of_a_map_goes_with_it(root: Any) -> None:
         write(store, "2")
     assert objects.get(root / "joins/drive=one/joins.parquet") == b"2"
     with map_store.writing(root) as store:
-        map_store.remove(store, "one")
+        map_store.remove(store, ["one"])
     with map_store.writing(root) as store:
         assert not (store.root / "joins/drive=one").exists()
         assert (store.root / "joins/drive=two/joins.parquet").read_text() == "2"
@@ -243,7 +243,7 @@ def test_a_reader_that_comes_late_takes_the_new_drive(root: Any) -> None:
         with pytest.raises(ResultError, match="replaced"):  # of which a part was handed out
             store.table("keyframes", "two")
         with map_store.writing(root) as writer:
-            map_store.remove(writer, "one")
+            map_store.remove(writer, ["one"])
         store.forget("one")
         with pytest.raises(ResultError, match="removed"):
             store.run("one")

@@ -250,4 +250,4 @@ def test_files_that_are_no_export_or_of_another_library_are_one_line(root: Path,
         with map_store.writing(mine) as store:
             for drive in store.drives():
                 if drive != "x":
-                    map_store.remove(store, drive)
+                    map_store.remove(store, [drive])

@@ -13,6 +13,7 @@ from vplog.errors import TruthError
 from vplog.evaluate import pairs
 from vplog.evaluate.gps import local_enu
 from vplog.evaluate.truth import read_truth
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,7 +72,7 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
     for name in ("tolerance", "distance_m", "heading_deg"):
         if getattr(choice, name) is not None and name not in _USES[kind]:
             option = name.replace("_", "-")
-            raise TruthError(f"--truth {choice.source} takes no --{option}: it is for {_takers(name)}.")
+            raise TruthError(f"--truth {shown(choice.source)} takes no --{option}: it is for {_takers(name)}.")
     distance_m = DISTANCE_M if choice.distance_m is None else choice.distance_m
     heading_deg = HEADING_DEG if choice.heading_deg is None else choice.heading_deg
     all_query, all_map = np.arange(len(query.stamps())), np.arange(len(other.stamps()))
@@ -81,7 +82,7 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
         return PlaceTruth(about, all_query, all_map, lambda q, m: pairs.index_pairs(q, m, tolerance))
     if kind == "csv":
         listed = pairs.read_pairs(Path(choice.source), len(all_query), len(all_map))
-        about = {"source": choice.source, "listed": len(listed)}
+        about = {"source": shown(choice.source), "listed": len(listed)}
         return PlaceTruth(about, all_query, all_map, lambda q, m: pairs.listed_pairs(listed, q, m))
     if kind == "gps":
         (here, here_known), (there, there_known) = _fixes(query, other)
@@ -98,7 +99,7 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
             pairs.poses_at(trajectory, log.stamps())
             for trajectory, log in zip(trajectories, (query, other), strict=True)
         )
-        about = {"source": choice.source, "distance_m": distance_m, "heading_deg": heading_deg}
+        about = {"source": shown(choice.source), "distance_m": distance_m, "heading_deg": heading_deg}
         found = PlaceTruth(
             about,
             np.flatnonzero(here_known),
@@ -108,8 +109,8 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
     for name, known, log in (("query", found.query_frames, query), ("map", found.map_frames, other)):
         if not len(known):
             raise TruthError(
-                f"--truth {choice.source} covers none of the {len(log.stamps())} frames of the {name} {log.name}. "
-                "Give the truth of this drive, in the log's clock."
+                f"--truth {shown(choice.source)} covers none of the {len(log.stamps())} frames of the {name} "
+                f"{log.name}. Give the truth of this drive, in the log's clock."
             )
     return found
 

@@ -38,7 +38,8 @@ def find_pose(points: Floats, rays: Floats, radius: float, rounds: int) -> tuple
         return None
     if not found or not (np.isfinite(turn).all() and np.isfinite(moved).all()):
         return None
-    pose = geometry.pose(cv2.Rodrigues(turn)[0], moved.ravel())
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
+    pose = geometry.pose(rotation, np.asarray(moved, np.float64).ravel())
     return pose, inliers(pose, points, rays, radius)
 
 

@@ -22,6 +22,7 @@ import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.damage import DamagedDriveError, reading_drive
+from vplog.maps.layout import ADD_AGAIN
 from vplog.maps.segment import SUFFIX, Content, Segment, open_segment, write_segment
 from vplog.maps.store import other_library
 from vplog.parquet_bounds import check_file
@@ -119,11 +120,13 @@ def _footer_hash(path: Path) -> str:
             end = stream.read(8)
             length = int.from_bytes(end[:4], "little")  # of the footer, as Parquet ends
             if end[4:] != b"PAR1" or length > size - 8:
-                raise ResultError(f"{path} is damaged.")
+                raise ResultError(f"{path} is damaged. Copy it back, or {ADD_AGAIN}")
             stream.seek(size - 8 - length)
             return hashlib.sha256(stream.read(length)).hexdigest()
     except OSError as error:
-        raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
+        raise ResultError(
+            f"{path} cannot be read: {error.strerror or error}. Check its permissions, or {ADD_AGAIN}"
+        ) from None
 
 
 def _descriptors(store: Store, drive: str) -> Path:
@@ -219,7 +222,9 @@ def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.A
     try:
         return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:
-        raise DamagedDriveError(f"{_descriptors(store, drive)} is of another recogniser.", drive) from None
+        raise DamagedDriveError(
+            f"{_descriptors(store, drive)} is of another recogniser. Where it should not be, {ADD_AGAIN}", drive
+        ) from None
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:

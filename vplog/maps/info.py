@@ -179,4 +179,4 @@ def _left_behind(store: Store, drives: list[str]) -> list[str]:
         for path in sorted(root.glob(f"{name}/drive=*"))
         if path.name not in known
     ]
-    return [f"{root}/{name} is of no drive in the map: remove it." for name in left]
+    return [f"{root}/{name} is of no drive in the map, and is not read: it may be moved away." for name in left]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from vplog.between import likely_drives, shared_of
@@ -23,7 +24,7 @@ from vplog.pipeline import Pipeline
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
@@ -67,8 +68,10 @@ def join(
     threads: int = 1,
     progress: Progress = lambda *_: None,
     places: Callable[[], PlaceState] | None = None,
+    urls: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Verify what was not yet looked at, solve what that touches, and say what joins.
+    """Verify what was not yet looked at, solve what that touches, and say what joins. `urls` open logs of drives that
+    were given now: a map has URLs without their queries.
 
     The caller holds the map's lock. With an executor its processes verify, pair by pair, each with `threads`; they
     must see the map and the logs under the same paths. Neither counts for the result. `places` gives what `load_places`
@@ -76,18 +79,18 @@ def join(
     left out with a reason, and tried again the next time. Raises VplogError where the map as a whole cannot be read or
     written.
     """
-    return without_damaged(store, lambda: _join(store, pipeline, executor, threads, progress, places))
+    return without_damaged(store, lambda: _join(store, pipeline, executor, threads, progress, places, urls))
 
 
 def _join(
     store: Store, pipeline: Pipeline, executor: Executor | None, threads: int, progress: Progress,
-    places: Callable[[], PlaceState] | None,
+    places: Callable[[], PlaceState] | None, urls: Mapping[str, str],
 ) -> dict[str, Any]:  # fmt: skip
     watch = Watch()
     if store.mirror is not None:  # what joins drives goes to and from an object store as a whole
         lean = pipeline.join.model_copy(update={"keep_features": False})
         pipeline = pipeline.model_copy(update={"join": lean})
-    drives = read_drives(store)
+    drives = read_drives(store, urls)
     new = [at for at in range(len(drives.members)) if not is_up_to_date(store, drives, at, pipeline)]
     with watch.stage("search"):
         load = places or (lambda: load_places(store.library(drives.library), pipeline, threads))

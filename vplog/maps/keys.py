@@ -33,7 +33,8 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
             places.setdefault(run_record.canonical_json(record[told]), []).append(drive)
         for at, name in enumerate(names):
             own = re.compile(re.escape(name) + r"(-\d+)?")
-            for drive in places.get(run_record.canonical_json(given[at]), []):
+            found = places.get(run_record.canonical_json(given[at]), [])
+            for drive in sorted(found, key=lambda drive: known[drive]["inputs"] != inputs[at]):
                 if result[at] is None and drive not in taken and own.fullmatch(drive):
                     result[at] = drive
                     taken.add(drive)

@@ -23,6 +23,8 @@ HASH = re.compile(r"[0-9a-f]{64}")
 """How a library is called: the sha256 of all that descriptors depend on."""
 
 
+ADD_AGAIN = "compute the drive again: vplog batch LOG -o MAP"
+"""What to do about a drive that is damaged: nothing that may still be of use is removed for it."""
 _MOST_NAME = 200
 """Characters of a drive's name in a file's; what stands around them takes up to thirty more."""
 
@@ -51,9 +53,13 @@ def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """What drive.json of `folder` says, checked. Raises ResultError."""
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
-        raise ResultError(f"{folder}/drive.json lacks one of {', '.join(wanted)}. Give its log to `vplog batch` again.")
+        raise ResultError(
+            f"{folder}/drive.json lacks one of {', '.join(wanted)}. Move the folder out of the map, and {ADD_AGAIN}"
+        )
     if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
-        raise ResultError(f"{folder} holds drive {record['drive']!r}, which is another.")
+        raise ResultError(
+            f"{folder} holds drive {record['drive']!r}. Rename it, or move it out of the map, and {ADD_AGAIN}"
+        )
     return record
 
 

@@ -7,40 +7,40 @@ import fcntl
 import os
 import shutil
 from contextlib import contextmanager
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps.layout import TABLES, drive_record, folder_name, sha256_of
+from vplog.folders import check_regular, regular_files
+from vplog.maps.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
 from vplog.results.atomic import replacing
 from vplog.scratch import sync, sync_all
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from vplog.maps.store import Store
 
 _HERE, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
-_REMOVED = "removed-"
-"""Begins the name of a folder in staging that is on its way out."""
 
 
 @contextmanager
 def locked(root: Path) -> Iterator[None]:
     """The folder for one writer, made where it is not there; the lock goes with the process that holds it."""
-    if root.is_dir() and not (root / "map.json").exists():
+    if root.is_dir() and not os.path.lexists(root / "map.json"):
         others = [path.name for path in root.iterdir() if not path.name.startswith(".")]
         if others:
             raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
+    check_regular(root)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        for path in root.iterdir():
-            if path.is_symlink() and not path.is_dir():  # of a map from elsewhere: what is written would go anywhere
-                raise SettingsError(f"{path} is a link, and a map holds its own files. Put a copy in its place.")
         lock = (root / ".lock").open("a")
     except OSError as error:
-        raise SettingsError(f"Cannot make the map {root}: {error.strerror}. Choose another folder with -o.") from None
+        raise SettingsError(
+            f"Cannot write to {root}: {error.strerror}. Check its permissions, or choose another folder."
+        ) from None
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -52,13 +52,12 @@ def locked(root: Path) -> Iterator[None]:
 
 
 def settle(store: Store) -> None:
-    """Put in what a killed writer had finished: a folder with drive.json, which is written last. Take out what is left
-    of drives that it was removing: their tables without a run folder."""
+    """Put in what a killed writer had finished: a folder with drive.json, which is written last. Drives that are being
+    removed are taken out first, so what is left of them here is tables without a run folder."""
     for file in sorted(store.staging.glob("*/drive.json")):
-        if not file.parent.name.startswith(_REMOVED):
-            drive = _whole(file.parent)
-            if drive is not None and not store.run(drive).exists():
-                publish(store, drive, file.parent)
+        drive = _whole(file.parent)
+        if drive is not None and not store.run(drive).exists():
+            publish(store, drive, file.parent)
     shutil.rmtree(store.staging, ignore_errors=True)
     store.staging.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
@@ -123,7 +122,7 @@ def link_tables(store: Store, drive: str) -> None:
     for name in TABLES:
         source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
         if not source.is_file():
-            raise ResultError(f"{source} is not there.")
+            raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
         if path.exists() and (path.samefile(source) or _same_copy(source, path)):
             continue
         part = store.staging / f"{name}-{os.getpid()}.parquet"
@@ -145,15 +144,44 @@ def _same_copy(source: Path, path: Path) -> bool:
     return source.stat().st_size == path.stat().st_size and sha256_of(source) == sha256_of(path)
 
 
-def remove(store: Store, drive: str) -> None:
-    """Take a drive out: its run folder by one rename, then all else that bears its name."""
-    gone, named = store.staging / f"{_REMOVED}{os.getpid()}", folder_name(drive)
+def check_removable(store: Store, drives: Sequence[str]) -> None:
+    """Raises ResultError where this user may not remove a folder of these drives."""
+    for path in [folder for drive in drives for folder in _folders_of(store, drive)]:
+        for folder in [path.parent, path, *(path / name for name in _folders_below(path))]:
+            if not os.access(folder, os.W_OK | os.X_OK):
+                raise ResultError(
+                    f"Cannot remove {', '.join(drives)} from {store}: no permission to change {folder}. The map is as "
+                    "it was. Ask the owner of that folder for the permission, or let the owner remove the drive."
+                )
+
+
+def take_out(store: Store, drives: Sequence[str]) -> None:
+    """Rename the run folders of drives out of the data set, all or none, then remove them and all that bears their
+    names. Raises OSError; the drives are as they were where that is at a rename."""
+    moved: list[tuple[Path, Path]] = []
     try:
-        shutil.rmtree(gone, ignore_errors=True)
-        if store.run(drive).exists():
-            store.run(drive).rename(gone)
-            shutil.rmtree(gone)
-        for folder in [*store.root.glob(f"*/{named}"), store.root / ".cache" / named]:
-            shutil.rmtree(folder, ignore_errors=not folder.exists())
-    except OSError as error:
-        raise ResultError(f"Cannot take {drive} out of {store.root}: {error.strerror}.") from None
+        for number, drive in enumerate(drives):
+            run, gone = store.root / "runs" / folder_name(drive), store.staging / f"gone-{os.getpid()}-{number}"
+            if run.exists():
+                gone.parent.mkdir(parents=True, exist_ok=True)
+                run.rename(gone)
+                moved.append((run, gone))
+    except OSError:
+        for run, gone in moved:
+            gone.rename(run)
+        raise
+    for folder in store.staging.glob("gone-*"):  # those of a writer that was killed, too
+        shutil.rmtree(folder)
+    for drive in drives:
+        for folder in _folders_of(store, drive):
+            shutil.rmtree(folder)
+
+
+def _folders_of(store: Store, drive: str) -> list[Path]:
+    """All that bears the name of a drive, its cache too."""
+    return list(store.root.glob(f"*/{folder_name(drive)}"))
+
+
+def _folders_below(folder: Path) -> set[str]:
+    """Names of the folders below one that hold files."""
+    return {str(above) for name in regular_files(folder) for above in PurePosixPath(name).parents}

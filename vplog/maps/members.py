@@ -12,6 +12,7 @@ from vplog.inputs import hash_inputs
 from vplog.maps.keys import key_of
 from vplog.maps.store import folder_name
 from vplog.pipeline import Pipeline
+from vplog.record import stored_log
 from vplog.remote import located
 from vplog.results import run_record, tables
 
@@ -77,9 +78,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
 
 def opened_log(member: Member) -> Log:
     """Raises LogError where it is not there any more."""
-    path = located(member.log)
-    if not path.exists():
-        raise LogError(f"The log of {member.drive}, {path}, is not there any more.")
+    path = stored_log(member.log, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
     try:
         return logs.open_drive([path], member.topics)
     except OSError as error:

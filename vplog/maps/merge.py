@@ -129,7 +129,7 @@ def _take_library(store: Store, other: Store, library: str) -> None:
         return
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
-    shutil.copytree(other.library(library), made)
+    shutil.copytree(other.library(library), made, symlinks=True)
     map_store.add_library(store, made, library)
     store.write_head(map_store.Head(library, other.head().settings))
 
@@ -171,7 +171,7 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
         shutil.rmtree(made, ignore_errors=True)
         try:
             ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-            shutil.copytree(other.whole(drive), made, copy_function=_linked, ignore=ignored)
+            shutil.copytree(other.whole(drive), made, symlinks=True, copy_function=_linked, ignore=ignored)
         except (OSError, shutil.Error) as error:
             raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
 

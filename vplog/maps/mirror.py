@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from vplog.errors import ResultError
 from vplog.maps import objects
-from vplog.maps.layout import HASH, folder_name, sound_record
+from vplog.maps.layout import ADD_AGAIN, HASH, folder_name, sound_record
 from vplog.remote import reason
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Mirror:
         self._fetched: set[str] = set()
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         with told(remote):
-            for name in ("map.json", "failures.json"):
+            for name in ("map.json", "failures.json", "removed.json"):
                 if (data := objects.get(remote / name)) is not None:
                     (local / name).write_bytes(data)
             folders = [name for name in objects.folders_in(remote / "runs") if name.startswith("drive=")]
@@ -108,7 +108,7 @@ class Mirror:
         if found is None:
             raise ResultError(f"{drive} was removed from {self.remote} while it was read. Run again.")
         if found["generation"] == old["generation"]:
-            raise ResultError(f"{place} has lost files that its drive.json names. Remove it (all below) and run again.")
+            raise ResultError(f"{place} has lost files that its drive.json names. Copy them back, or {ADD_AGAIN}")
         if drive in self._fetched:
             raise ResultError(f"{drive} was replaced in {self.remote} while it was read. Run again.")
         self.lay(found)
@@ -141,8 +141,8 @@ class Mirror:
                 return
             if manifest["generation"] == before:
                 raise ResultError(
-                    f"{self.remote}/rest has lost files that rest.json names. Remove {self.remote}/rest.json, and join "
-                    f"the drives again: vplog map join {self.remote}"
+                    f"{self.remote}/rest has lost files that rest.json names. Move {self.remote}/rest.json away, and "
+                    f"join the drives again: vplog map join {self.remote}"
                 )
             before = manifest["generation"]
             place = self.remote / "rest" / manifest["generation"]
@@ -250,7 +250,7 @@ def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         sound, manifest = False, {}
     if not sound:
-        raise ResultError(f"{place} is not a manifest of vplog. Remove what is beside it and run again.")
+        raise ResultError(f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}")
     return manifest
 
 

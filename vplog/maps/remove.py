@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
-    """Take drives out of a map, each by one step; what is left. Failures of these names are forgotten too.
+    """Take drives out of a map, all of them or none; what is left. Failures of these names are forgotten too.
 
     Raises SettingsError, before anything is touched, where a drive is not in the map.
     """
@@ -22,16 +22,8 @@ def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
         store.head()
         _check(store, drives)
     with map_store.writing(root) as store:
-        failures, known = store.failures(), store.drives()
         _check(store, drives)
-        for drive in drives:
-            if (
-                drive in known or drive in store.damaged or drive in failures
-            ):  # of a drive that failed there may be a cache
-                map_store.remove(store, drive)
-        kept = {drive: told for drive, told in failures.items() if drive not in drives}
-        if kept != failures:
-            store.write_failures(kept)
+        map_store.remove(store, list(dict.fromkeys(drives)))
         return {
             "map": str(store),
             "removed": list(dict.fromkeys(drives)),

@@ -12,6 +12,8 @@ from vplog.maps.components import Tie
 from vplog.maps.members import apart, member_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from vplog.maps.members import Member
     from vplog.maps.pairs import Joins
     from vplog.maps.store import Store
@@ -39,13 +41,13 @@ class Drives:
         return at < later and self.members[at].key == pair["match_key"]
 
 
-def read_drives(store: Store) -> Drives:
+def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     """Give new drives their place in the order. What is given stays, so a killed join goes on as it began."""
     library = store.head().library or ""
     members, reasons, known = [], {}, store.drives()
     for drive, about in known.items():
         try:
-            member = member_of(store, about)
+            member = member_of(store, {**about, "log": urls.get(drive, about["log"])})
         except VplogError as error:
             reasons[drive] = f"{drive} is joined with no other drive. {error}"
             continue

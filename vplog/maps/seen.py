@@ -21,6 +21,7 @@ from vplog.parts import stored_features
 from vplog.results import run_record, tables
 from vplog.results.kept_features import KeptFeatures, write_features
 from vplog.scratch import scratch
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -144,11 +145,13 @@ class _Again:
             found = extract_frames(frames, pipeline.features, self._threads, pipeline.stereo)
             for row, (stamp_ns, _, features, why) in zip(missing, found, strict=False):
                 if features is None or stamp_ns != self._stamp_ns[row]:
-                    raise LogError(f"{self._member.log} does not have keyframe {row} of {self._member.drive}. {why}")
+                    raise LogError(
+                        f"{shown(self._member.log)} does not have keyframe {row} of {self._member.drive}. {why}"
+                    )
                 self._store.append(features)
                 self._at[row] = len(self._store) - 1
             if missing[-1] not in self._at:
-                raise LogError(f"{self._member.log} does not have all keyframes of {self._member.drive}.")
+                raise LogError(f"{shown(self._member.log)} does not have all keyframes of {self._member.drive}.")
 
     def __getitem__(self, row: int) -> Features:
         if row not in self._at:
@@ -178,4 +181,4 @@ def camera_from(values: dict[str, Any]) -> Camera:
             disparity_zero_px=float(values["disparity_zero_px"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise ResultError(f"A camera in MAP/joins is damaged: {error}. Remove that folder and run again.") from None
+        raise ResultError(f"A camera in MAP/joins is damaged: {error}. Move that folder away, and run again.") from None

@@ -93,7 +93,7 @@ def write_segment(folder: Path, segment: Segment) -> Path:
     """Write a segment under its name, whole or not at all. Raises ResultError where the folder cannot be written."""
     path = folder / segment.name
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe. Remove it.")
+        raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe. Move it away.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -17,6 +17,7 @@ from vplog.maps import objects
 from vplog.maps.layout import AT_HAND, TABLES, folder_name, sha256_of
 from vplog.maps.mirror import read_rest, told
 from vplog.results import run_record
+from vplog.scratch import files_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -29,7 +30,7 @@ _LEFT_OVER = timedelta(days=1)
 """Age of an object that no manifest names, from which it is nobody's: far beyond any upload."""
 _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
-_KNOWN = ("runs", "libraries", "map.json", "failures.json", *TABLES)
+_KNOWN = ("runs", "libraries", "map.json", "failures.json", "removed.json", *TABLES)
 """What in a map's folder has a place of its own on a store; the rest goes together."""
 
 
@@ -84,7 +85,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
     place, generation = mirror.remote / "runs" / folder_name(drive), secrets.token_hex(8)
     rows = {f"{name}.parquet": {"rows": _rows(made / f"{name}.parquet")} for name in TABLES}
     with told(mirror.remote):
-        sent = _send_all(_listed(made), made, place / generation)
+        sent = _send_all(files_in(made), made, place / generation)
         old = mirror.read_manifest(place.name)
         manifest = {
             **run_record.read_run_json(made / "drive.json"),
@@ -111,21 +112,15 @@ def relocate(mirror: Mirror, drive: str, log: str) -> None:
     mirror.lay(manifest)
 
 
-def _listed(folder: Path) -> list[Path]:
-    """Names of the files of a folder, in order, without what is hidden."""
-    names = [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]
-    return [name for name in names if not any(part.startswith(".") for part in name.parts)]
-
-
-def _send_all(names: list[Path], folder: Path, place: RemotePath) -> dict[str, dict[str, Any]]:
+def _send_all(names: list[str], folder: Path, place: RemotePath) -> dict[str, dict[str, Any]]:
     """Files of a folder: length and sha256, by name."""
 
-    def sent(name: Path) -> dict[str, Any]:
+    def sent(name: str) -> dict[str, Any]:
         file = folder / name
-        return {"bytes": file.stat().st_size, "sha256": objects.send(place / name.as_posix(), file)}
+        return {"bytes": file.stat().st_size, "sha256": objects.send(place / name, file)}
 
     with ThreadPoolExecutor(_SENT_AT_ONCE) as pool:
-        return dict(zip(map(str, names), pool.map(sent, names), strict=True))
+        return dict(zip(names, pool.map(sent, names), strict=True))
 
 
 def _rows(file: Path) -> int:
@@ -169,9 +164,8 @@ def send_library(mirror: Mirror, digest: str) -> None:
     with told(mirror.remote):
         if objects.get(place / "library.json") is not None:
             return
-        names = sorted(_listed(folder), key=lambda name: name.name == "library.json")
-        for name in names:
-            objects.send(place / name.as_posix(), folder / name)
+        for name in sorted(files_in(folder), key=lambda name: name == "library.json"):
+            objects.send(place / name, folder / name)
 
 
 def remove(mirror: Mirror, drive: str) -> None:
@@ -181,12 +175,12 @@ def remove(mirror: Mirror, drive: str) -> None:
         mirror.lock.check()
     with told(remote):
         objects.remove(remote / "runs" / named / "drive.json")
+        mirror.manifests.pop(drive, None)
         objects.remove(remote / "runs" / named)
         for name in objects.folders_in(remote):
             objects.remove(remote / name / named)
     for folder in mirror.local.glob(f"*/{named}"):
         shutil.rmtree(folder)
-    mirror.manifests.pop(drive, None)
 
 
 def send_rest(mirror: Mirror) -> None:
@@ -194,8 +188,7 @@ def send_rest(mirror: Mirror) -> None:
     names, for those who read them as data sets."""
     old = mirror.rest_manifest
     known: dict[str, dict[str, Any]] = old.get("files", {})
-    names = [name for name in _listed(mirror.local) if name.parts[0] not in _KNOWN]
-    now = {str(name): sha256_of(mirror.local / name) for name in names}
+    now = {name: sha256_of(mirror.local / name) for name in files_in(mirror.local) if name.split("/")[0] not in _KNOWN}
     if now == {name: one["sha256"] for name, one in known.items()}:
         return
     if mirror.lock is not None:
@@ -206,7 +199,7 @@ def send_rest(mirror: Mirror) -> None:
         kept = {name: known[name] for name in now if name in known and known[name]["sha256"] == now[name]}
         for name in kept:
             objects.copy(remote / "rest" / old["generation"] / name, place / name)
-        files = {**kept, **_send_all([name for name in names if str(name) not in kept], mirror.local, place)}
+        files = {**kept, **_send_all([name for name in now if name not in kept], mirror.local, place)}
         manifest = {"generation": generation, "replaces": old.get("generation"), "files": dict(sorted(files.items()))}
         put_json(remote / "rest.json", manifest)
         mirror.rest_manifest = manifest

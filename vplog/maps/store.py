@@ -6,11 +6,13 @@
     MAP/keyframes/drive=ID/keyframes.parquet   its tables as data sets, partitioned by drive as DuckDB and Spark have
     MAP/descriptors/... closures/... edges/... trajectory/...   it; hard links to the run folder's files
     MAP/failures.json                          drives that could not be run, each with its error
+    MAP/removed.json                           drives that are being removed, while that is not done
 
 A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when its manifest is
 (mirror.py). Its tables are links: no byte is stored twice, both names always show the same bytes (every writer here
-replaces a file and never changes one), and one look at the inode tells whether a link is missing. Removing a drive is
-removing its folders: `rm -r MAP/*/drive=ID`.
+replaces a file and never changes one), and one look at the inode tells whether a link is missing. Drives are removed
+by naming them in removed.json, one step that decides for all of them; then their files go, by the next writer where
+this one is killed.
 """
 
 from __future__ import annotations
@@ -25,17 +27,18 @@ import pyarrow as pa
 
 import vplog
 from vplog.errors import LibraryError, NewerError, ResultError, VplogError
+from vplog.folders import check_regular, regular_files
 from vplog.maps import local
 from vplog.maps.damage import check_at_hand, hashes_of, reading_drive
 from vplog.maps.earth import earth_from_plain, earth_of_made, earth_of_run
-from vplog.maps.layout import AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
+from vplog.maps.layout import ADD_AGAIN, AT_HAND, FORMAT, HASH, TABLES, drive_record, folder_name
 from vplog.parquet_bounds import check_version, read_footer
 from vplog.remote import RemotePath, check_writable
 from vplog.results import run_record
 from vplog.scratch import files_in, put_in_place, scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from vplog.maps.cache import Cache
@@ -130,8 +133,13 @@ class Store:
         if self.mirror is not None:
             return {name: about["bytes"] for name, about in self.mirror.manifests[drive]["files"].items()}
         run = self.run(drive)
-        files = [file for file in sorted(run.rglob("*")) if file.is_file()]
-        return {file.relative_to(run).as_posix(): file.stat().st_size for file in files}
+        return {name: (run / name).lstat().st_size for name in regular_files(run)}
+
+    def is_whole(self, drive: str) -> bool:
+        """Whether all of a drive is where it was, though its removal may be decided. Of one that failed nothing is."""
+        if self.mirror is None:
+            return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
+        return drive in self.mirror.manifests or drive in self.failures()
 
     def rows(self, name: str, drive: str) -> int:
         """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
@@ -159,9 +167,10 @@ class Store:
 
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order, but for those that are damaged. Raises NewerError."""
+        removed = set(map(folder_name, self.removed()))
         found = dict[str, dict[str, Any]]()
         for folder in sorted(self.root.glob("runs/drive=*")):
-            if not (folder / "drive.json").is_file():
+            if folder.name in removed or not (folder / "drive.json").is_file():
                 continue
             try:
                 record = self._sound_record(folder)
@@ -208,12 +217,27 @@ class Store:
                 return found
         raise ResultError(f"{folder} is being replaced or removed. Run again when that is done.")
 
+    def removed(self) -> list[str]:
+        """Drives whose removal is decided and not done yet. Raises ResultError."""
+        path = self.root / "removed.json"
+        drives = run_record.read_run_json(path).get("drives") if path.exists() else []
+        if not isinstance(drives, list) or not all(isinstance(drive, str) for drive in drives):
+            raise ResultError(f"{path} is damaged. Move it away: the drives that it named are in the map then.")
+        return drives
+
+    def write_removed(self, drives: Sequence[str]) -> None:
+        """Decide that these drives are removed; none: that this is done."""
+        self._write("removed.json", {"drives": list(drives)})
+        if not drives:
+            with suppress(OSError):
+                (self.root / "removed.json").unlink()
+
     def failures(self) -> dict[str, dict[str, Any]]:
         """Log and error of each drive that failed when it was last tried, by ID."""
         path = self.root / "failures.json"
         found = run_record.read_run_json(path) if path.exists() else {}
         if any(not isinstance(told, dict) or not isinstance(told.get("error"), str) for told in found.values()):
-            raise ResultError(f"{path} is damaged. Remove it: the next batch tries what failed again.")
+            raise ResultError(f"{path} is damaged. Move it away: the next batch tries what failed again.")
         return found
 
     def head(self) -> Head:
@@ -254,12 +278,15 @@ class Store:
 @contextmanager
 def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
     """A map, local or on an object store, for those who only read it; with a cache, what is read of the latter stays
-    there for the next one. Raises ResultError."""
+    there for the next one. Raises ResultError, also where something in it is not its own file."""
     if not isinstance(root, RemotePath):
+        check_regular(root, "map.json")
         yield Store(root)
         return
     from vplog.maps.mirror import Mirror
 
+    if root.scheme not in ("s3", "gs"):
+        raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3:// or gs://.")
     try:
         with scratch("map", None if cache is None else cache.open_folders) as folder:
             yield Store(folder, Mirror(root, folder, cache=cache))
@@ -281,6 +308,7 @@ def writing(root: Path) -> Iterator[Store]:
         return
     with local.locked(root):
         store = Store(root)
+        _sweep(store)
         local.settle(store)
         yield store
         local.clear(store)
@@ -294,9 +322,10 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
     check_writable(root)
     with bucket_lock.held(root) as lock, scratch("map") as folder:
         mirror = Mirror(root, folder, lock)
+        store = Store(folder, mirror)
+        _sweep(store)
         sending.begin(mirror)
         mirror.rest()
-        store = Store(folder, mirror)
         store.staging.mkdir()
         try:
             yield store
@@ -338,14 +367,44 @@ def relocate(store: Store, drive: str, log: str) -> None:
     sending.relocate(store.mirror, drive, log)
 
 
-def remove(store: Store, drive: str) -> None:
-    """Take a drive out, with all that bears its name. Raises ResultError."""
+def remove(store: Store, drives: Sequence[str]) -> None:
+    """Take drives out with all that bears their names, and forget their failures: all of them or none, whatever ends
+    this. Raises ResultError, which says whether they are out."""
+    named = f"{', '.join(drives)} {'is' if len(drives) == 1 else 'are'}"
     if store.mirror is None:
-        local.remove(store, drive)
-        return
-    from vplog.maps import sending
+        local.check_removable(store, drives)
+    store.write_removed(drives)
+    try:
+        _sweep(store)
+    except ResultError as error:
+        out = f"{error} {named} out of {store}; the next command that writes to it deletes what is left of the files."
+        if all(map(store.is_whole, drives)):
+            with suppress(ResultError):  # where that cannot be taken back they are out
+                store.write_removed([])
+                out = f"{error} {named} in {store} as before."
+        raise ResultError(out) from None
 
-    sending.remove(store.mirror, drive)
+
+def _sweep(store: Store) -> None:
+    """Remove the files of drives whose removal is decided. Raises ResultError; of a folder they are as they were."""
+    drives = store.removed()
+    if not drives:
+        return
+    if store.mirror is None:
+        try:
+            local.take_out(store, drives)
+        except OSError as error:
+            where = error.filename or store
+            raise ResultError(f"Cannot remove {where}: {error.strerror}. Check its permissions.") from None
+    else:
+        from vplog.maps import sending
+
+        for drive in drives:
+            sending.remove(store.mirror, drive)
+    kept = {drive: told for drive, told in store.failures().items() if drive not in drives}
+    if kept != store.failures():
+        store.write_failures(kept)
+    store.write_removed([])
 
 
 def add_library(store: Store, made: Path, digest: str) -> Path:
@@ -370,7 +429,7 @@ def other_library(store: Store, drive: str, found: str, wanted: str | None) -> s
     """Why a drive's places may not be mixed with those of the map, in one line."""
     return (
         f"{drive} in {store} was described with library {found[:12]}, and the map's is {str(wanted)[:12]}: their "
-        f"places do not compare. Take it out (vplog map remove {store} {drive}), or add its log with `vplog batch`."
+        f"places do not compare. Describe it with that library too: add its log with `vplog batch`."
     )
 
 
@@ -391,7 +450,9 @@ def row_count(path: Path) -> int:
     try:
         return read_footer(path).num_rows
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+        raise ResultError(
+            f"{path} cannot be read: {str(error).splitlines()[0]} Check its permissions, or {ADD_AGAIN}"
+        ) from None
 
 
 def _drive_of(folder: Path) -> str:

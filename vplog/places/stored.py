@@ -16,6 +16,7 @@ import pyarrow as pa
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
+from vplog.folders import check_regular
 from vplog.image_file import BadImageError, decode_image
 from vplog.parquet_bounds import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.scratch import put_in_place, sync_all
@@ -76,6 +77,7 @@ _REFERENCES = pa.schema(
 
 def save_references(references: Sequence[Reference], settings: Settings, folder: Path) -> None:
     """Write references.parquet (images as PNG), features.parquet and library.json, the last one last."""
+    check_regular(folder, "library.json")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "library.json").unlink(missing_ok=True)
@@ -135,7 +137,9 @@ def _write(path: Path, table: pa.Table, compression: str) -> None:
 
 
 def read_library_record(folder: Path) -> dict[str, Any]:
-    """library.json of a saved library. Raises LibraryError where the folder is not one."""
+    """library.json of a saved library. Raises LibraryError where the folder is not one, ResultError where something in
+    it is not its own file."""
+    check_regular(folder, "library.json")
     try:
         check_file(folder / "library.json")
         record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
@@ -152,7 +156,9 @@ def read_library_record(folder: Path) -> dict[str, Any]:
 
 
 def load_references(folder: Path, threads: int = 1) -> list[Reference]:
-    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together."""
+    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together,
+    ResultError where something in the folder is not its own file."""
+    check_regular(folder, "library.json")
     try:
         features = _table(folder / "features.parquet", _FEATURES)
         references = _table(folder / "references.parquet", _REFERENCES)

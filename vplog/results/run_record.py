@@ -9,6 +9,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.folders import check_regular
 from vplog.parquet_bounds import check_file, check_version
 from vplog.results.atomic import replacing
 from vplog.results.staging import recover
@@ -70,7 +71,9 @@ def _parts(one: dict[str, Any] | list[Any]) -> Iterable[Any]:
 
 
 def read_finished_run(folder: Path) -> dict[str, Any]:
-    """The record of the run in a folder that came to its end. Raises ResultError."""
+    """The record of the run in a folder that came to its end. Raises ResultError, also where something in the folder is
+    not its own file."""
+    check_regular(folder, "run.json")
     record = read_run_json(begun_in(folder) or folder / "run.json")
     if not record.get("finished"):
         whose = f" of {record['log']}" if isinstance(record.get("log"), str) else ""

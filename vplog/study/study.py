@@ -27,6 +27,7 @@ from vplog.study.bench import Bench, all_pairs
 from vplog.study.charts import CHARTS
 from vplog.study.experiments import NUMBERS, Plan
 from vplog.study.pictures import PICTURES
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -105,7 +106,7 @@ def study(
                 {"name": name, "log": str(path), "frames": len(log.stamps()), "hash": digest}
                 for name, path, log, digest in zip(names, drives, opened, hashes, strict=True)
             ],
-            "truth": asdict(truth),
+            "truth": _shown(truth),
             **common,
             "library_size": library_size,
             "sizes": list(plan.sizes),
@@ -212,7 +213,7 @@ def truth_of_pair(truth: TruthChoice, query: int, other: int, drives: int) -> Tr
     """
     if truth.source.lower().endswith(".csv") and drives > 1:
         raise TruthError(
-            f"--truth {truth.source} lists the pairs of one query and one map, and here every drive is both. "
+            f"--truth {shown(truth.source)} lists the pairs of one query and one map, and here every drive is both. "
             "Use index, poses, gps or a TUM file for each drive."
         )
     files = truth.source.split(",")
@@ -255,10 +256,15 @@ def _hash(tree: Any) -> str:
     return hashlib.sha256(canonical_json(tree).encode()).hexdigest()
 
 
+def _shown(truth: TruthChoice) -> dict[str, Any]:
+    """The choice as it is stored."""
+    return {**asdict(truth), "source": shown(truth.source)}
+
+
 def _truth_hash(truth: TruthChoice) -> str:
     """Of the choice, and of the files it names."""
     files = [Path(file) for file in {truth.source, *truth.source.split(",")} if Path(file).is_file()]
-    return _hash([asdict(truth), [hash_inputs(file) for file in sorted(files)]])
+    return _hash([_shown(truth), [hash_inputs(file) for file in sorted(files)]])
 
 
 def _code_hash(without: set[str]) -> str:

@@ -1,0 +1,64 @@
+"""Maps, run folders and libraries may come from anyone: they hold regular files, and nothing that leads elsewhere.
+
+A link inside a stranger's folder would make vplog copy, send or overwrite a file of its user; a pipe or a device would
+be waited for. Every verb that is given such a folder checks it here first. The folder itself may be a link: that is
+its user's own.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import TYPE_CHECKING
+
+from vplog.errors import ResultError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+_KINDS = {
+    stat.S_IFLNK: "link", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device",
+}  # fmt: skip
+
+
+def regular_files(folder: Path) -> Iterator[str]:
+    """Names of the files in a folder and below it, hidden ones too, in order, relative to it; none where there is no
+    such folder.
+
+    Links are not followed. What goes away meanwhile, as while a map is written, is left out. Raises ResultError at the
+    first link, pipe, socket or device.
+    """
+    try:
+        with os.scandir(folder) as found:
+            entries = sorted(found, key=lambda entry: entry.name)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise ResultError(f"Cannot read {folder}: {error.strerror}. Check its permissions.") from None
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            yield from (f"{entry.name}/{name}" for name in regular_files(folder / entry.name))
+        elif entry.is_file(follow_symlinks=False):
+            yield entry.name
+        elif kind := _kind(entry):
+            raise ResultError(
+                f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold their own files alone. Put a "
+                "copy of what is meant in its place."
+            )
+
+
+def check_regular(folder: Path, record: str = "") -> None:
+    """Raises ResultError where something in a folder or below it is neither a regular file nor a folder; with the name
+    of a record only where that is there: what is no map may be a home folder."""
+    if os.path.lexists(folder / record):
+        for _ in regular_files(folder):
+            pass
+
+
+def _kind(entry: os.DirEntry[str]) -> str:
+    """What a file that is not regular is; empty where it went away."""
+    try:
+        return _KINDS.get(stat.S_IFMT(entry.stat(follow_symlinks=False).st_mode), "")
+    except FileNotFoundError:
+        return ""
