@@ -138,7 +138,7 @@ class SqliteBag:
             except _DAMAGE as error:
                 again = isinstance(error, _OrderError)
                 detail = f"{self._name} is damaged: {error}."
-            if waiting and not again:
+            if waiting and (not again or waiting[0] == last + 1):  # else it may be the one with a wrong number
                 last, last_ns = waiting[0], _integer(waiting[2])
                 yield waiting
             self._damaged, before, found, missing = True, last, None, 0
