@@ -160,7 +160,7 @@ def _print_closures(closures: dict[str, Any], indent: str = "") -> None:
     )
     print(
         f"{blank}true by pose: within {bounds['translation_m']:.2f} m and {bounds['rotation_deg']:g} deg of the truth, "
-        f"or the claimed covariance, at most {bounds['most']:g} times that; bounds for {bounds['length_m']:.0f} m of drive"
+        f"or the claimed covariance, at most {bounds['most']:g} times that: {bounds['length_m']:.0f} m of drive"
     )
     if closures["overconfident"]:
         print(f"{blank}{closures['overconfident']} true ones are further off than their covariance claims (99.9 %)")

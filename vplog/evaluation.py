@@ -164,8 +164,9 @@ def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCri
     for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():
         query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
         bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
+        cameras = _camera(folder / later), _camera(folder / earlier)
         oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
-        judged = closures.judge_closures(ledger, query, match, bounds, place, _camera(folder / later), oriented)
+        judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
         counts = closures.count_closures(ledger, judged)
         criterion = closures.criterion_of(bounds, place)
         found.append({"query_drive": later, "match_drive": earlier, **counts, "criterion": criterion})

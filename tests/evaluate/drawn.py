@@ -44,7 +44,7 @@ class Drawn:
 
 
 def draw(kind: str, seed: int) -> Drawn:
-    """Half of the closures are right: within 2.5 sigma of what they claim. The others are wrong as closures are."""
+    """Half of the closures are right: within 3 sigma of what they claim. The others are wrong as closures are."""
     rng = np.random.default_rng(seed)
     poses = _laps(kind, rng)
     stamps = START_NS + PERIOD_NS * np.arange(len(poses))
@@ -124,8 +124,8 @@ def _closures(kind: str, poses: Floats, rng: np.random.Generator) -> tuple[Closu
     match = away.argmin(1).astype(np.int32)
     sigma = np.repeat(SIGMA[kind], 3)
     draws = rng.normal(size=(60, 6))
-    for part in (draws[:, :3], draws[:, 3:]):  # no honest outlier: the labels are exact
-        part *= np.minimum(1.0, 3.0 / np.linalg.norm(part, axis=1, keepdims=True))
+    parts = draws.reshape(60, 2, 3)  # no honest outlier: the labels are exact
+    draws = (parts * np.minimum(1.0, 3.0 / np.linalg.norm(parts, axis=2, keepdims=True))).reshape(60, 6)
     measured = geometry.between(poses[match], poses[query]) @ geometry.exp(draws * sigma)
     information = np.tile(np.diag(1.0 / sigma**2), (60, 1, 1))
     right = rng.random(60) < 0.5

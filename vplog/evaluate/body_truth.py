@@ -56,7 +56,7 @@ class TruthAt:
     known: Bools
     """(N,) at a sample of the truth, or between two near in time."""
     error: Floats
-    """(N, 2) rad and m by which it may be off as it is interpolated; 0 at a sample."""
+    """(N, 2) rad and m by which it may be off, as it is interpolated and by its noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +75,8 @@ class BodyTruth:
     """(4, 4) of that point; None for the body."""
     oriented: bool = True
     """Whether the truth has orientations, not positions alone."""
+    noise: tuple[float, float] = (0.0, 0.0)
+    """rad and m by which single poses of the truth are off their neighbours."""
 
     def at(self, stamp_ns: Ints) -> TruthAt:
         """Poses at the stamps.
@@ -98,7 +100,7 @@ class BodyTruth:
         found, error = np.full((len(stamp_ns), 4, 4), np.nan), np.zeros((len(stamp_ns), 2))
         found[known] = geometry.interpolate(poses[0], poses[1], share)
         sizes = np.stack([geometry.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1)], axis=1)
-        error[known] = np.sqrt(share * (1.0 - share))[:, None] * sizes
+        error[known] = np.hypot(np.sqrt(share * (1.0 - share))[:, None] * sizes, self.noise)
         return TruthAt(found, known, error)
 
 
@@ -122,7 +124,23 @@ def body_truth(
     frame, body_from_truth = _frame(true, moved, body_from_camera)
     if body_from_truth is not None:
         truth = Trajectory(truth.stamp_ns, truth.world_from_body @ geometry.inverse(body_from_truth))
-    return BodyTruth(truth, odometry, offset_s, frame, body_from_truth)
+    noise = _noise(truth, odometry)
+    return BodyTruth(truth, odometry, offset_s, frame, body_from_truth, noise=noise)
+
+
+def _noise(truth: Trajectory, odometry: Trajectory) -> tuple[float, float]:
+    """rad and m: twice what every other pose is off the bridge between its neighbours, by the median.
+
+    Their noise is in it with a half more of its variance; what the bridge itself may be off is taken off.
+    """
+    even = BodyTruth(Trajectory(truth.stamp_ns[::2], truth.world_from_body[::2]), odometry)
+    at = even.at(truth.stamp_ns[1::2])
+    if not at.known.any():
+        return 0.0, 0.0
+    apart = geometry.between(at.world_from_body[at.known], truth.world_from_body[1::2][at.known])
+    sizes = np.stack([geometry.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1)], axis=1)
+    rad, m = 2.0 / np.sqrt(1.5) * np.median(np.maximum(sizes - at.error[at.known], 0.0), axis=0)
+    return float(rad), float(m)
 
 
 def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:

@@ -124,8 +124,15 @@ def pose_errors(
     return found
 
 
-def direction_errors(closures: Closures, query: TruthAt, match: TruthAt, bounds: PoseBounds, camera: Floats) -> Bools:
-    """(C,) whether turn and direction of a closure without metres are the truth's; `camera` is body_from_camera.
+def direction_errors(
+    closures: Closures,
+    query: TruthAt,
+    match: TruthAt,
+    bounds: PoseBounds,
+    query_camera: Floats,
+    match_camera: Floats,
+) -> Bools:
+    """(C,) whether turn and direction of a closure without metres are the truth's; cameras are body_from_camera.
 
     A direction may be off by the bound of a rotation and by what the bound of a translation is at the true distance.
     """
@@ -133,8 +140,8 @@ def direction_errors(closures: Closures, query: TruthAt, match: TruthAt, bounds:
     finite = np.isfinite(closures.match_from_query).all((1, 2))
     rows = np.flatnonzero(finite & query.known[closures.query] & match.known[closures.match])
     there, here = match.world_from_body[closures.match[rows]], query.world_from_body[closures.query[rows]]
-    seen = geometry.inverse(camera) @ closures.match_from_query[rows] @ camera
-    true = geometry.between(there @ camera, here @ camera)
+    seen = geometry.inverse(match_camera) @ closures.match_from_query[rows] @ query_camera
+    true = geometry.between(there @ match_camera, here @ query_camera)
     distance = np.linalg.norm(true[:, :3, 3], axis=1)
     cosine = (seen[:, :3, 3] * true[:, :3, 3]).sum(1) / np.maximum(
         distance * np.linalg.norm(seen[:, :3, 3], axis=1), 1e-12

@@ -120,20 +120,22 @@ def judge_closures(
     match: TruthAt,
     bounds: PoseBounds,
     place: PlaceCriterion,
-    camera: Floats | None = None,
+    cameras: tuple[Floats | None, Floats | None] = (None, None),
     oriented: bool = True,
 ) -> Judgement:
     """Compare a ledger with the truth at its queries' and its matches' keyframes, in one frame.
 
-    `camera` is body_from_camera; `oriented` whether the truth has orientations: without, places are within the
-    distance, and no pose is judged.
+    `cameras` are body_from_camera of queries and of matches; `oriented` whether the truth has orientations: without,
+    places are within the distance, and no pose is judged.
     """
     known = query.known[closures.query] & match.known[closures.match]
     rows = np.flatnonzero(known)
     here, there = query.world_from_body[closures.query[rows]], match.world_from_body[closures.match[rows]]
     distance = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
-    axis = optical_axis(camera, query.world_from_body[query.known])
-    heading = _heading_deg(here, there, axis) if oriented else np.zeros(len(rows))
+    axes = [
+        optical_axis(camera, at.world_from_body[at.known]) for camera, at in zip(cameras, (query, match), strict=True)
+    ]
+    heading = _heading_deg(here, there, *axes) if oriented else np.zeros(len(rows))
     at_place, opposite = np.zeros(len(closures), bool), np.zeros(len(closures), bool)
     at_place[rows] = (distance <= place.distance_m) & (heading <= place.heading_deg)
     opposite[rows] = (distance <= place.distance_m) & (heading > _OPPOSITE_DEG)
@@ -142,7 +144,8 @@ def judge_closures(
     directed = np.array([scale == "none" for scale in closures.scale], bool)
     directed &= np.isfinite(closures.match_from_query).all((1, 2))
     if oriented and directed.any():
-        right &= ~directed | direction_errors(closures, query, match, bounds, np.eye(4) if camera is None else camera)
+        known_cameras = [np.eye(4) if camera is None else camera for camera in cameras]
+        right &= ~directed | direction_errors(closures, query, match, bounds, *known_cameras)
     wrong = known & ~pose.posed & ~right
     return Judgement(bounds, pose, known, at_place, opposite, right | pose.right, wrong | pose.wrong)
 
@@ -168,7 +171,7 @@ def score_closures(
         )
     covered = np.flatnonzero(at.known)
     bounds = pose_bounds(at.world_from_body[covered][:, :3, 3])
-    judged = judge_closures(closures, at, at, bounds, place, camera, truth.oriented)
+    judged = judge_closures(closures, at, at, bounds, place, (camera, camera), truth.oriented)
     poses = at.world_from_body[covered]
     axis = optical_axis(camera, poses)
     older = np.searchsorted(covered, np.minimum(np.asarray(stop), np.arange(len(at.known)))[covered])
@@ -232,11 +235,11 @@ def _score(
     )
 
 
-def _heading_deg(a: Floats, b: Floats, axis: Floats | None) -> Floats:
+def _heading_deg(a: Floats, b: Floats, a_axis: Floats | None, b_axis: Floats | None) -> Floats:
     """(R,) degrees between the optical axes of poses (R, 4, 4), or of their whole rotation."""
-    if axis is None:
+    if a_axis is None or b_axis is None:
         return np.degrees(geometry.angle(geometry.between(a, b)))
-    return np.degrees(np.arccos(np.clip(((a[:, :3, :3] @ axis) * (b[:, :3, :3] @ axis)).sum(1), -1.0, 1.0)))
+    return np.degrees(np.arccos(np.clip(((a[:, :3, :3] @ a_axis) * (b[:, :3, :3] @ b_axis)).sum(1), -1.0, 1.0)))
 
 
 def _curves(closures: Closures, judged: Judgement, revisit: Bools) -> dict[str, Floats]:

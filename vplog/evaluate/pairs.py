@@ -171,6 +171,8 @@ def optical_axis(body_from_camera: Floats | None, poses: Floats) -> Floats | Non
     axis = body_from_camera[:3, 2]
     if not np.array_equal(body_from_camera, np.eye(4)):
         return axis
+    if not len(poses):
+        return None
     z = poses[:, :3, 2]
     step = np.diff(poses[:, :3, 3], axis=0)
     along = np.abs((step * z[:-1]).sum(1)) / np.maximum(np.linalg.norm(step, axis=1), 1e-12)
