@@ -130,20 +130,22 @@ def _closures(kind: str, poses: Floats, rng: np.random.Generator) -> tuple[Closu
     information = np.tile(np.diag(1.0 / sigma**2), (60, 1, 1))
     right = rng.random(60) < 0.5
     for row in np.flatnonzero(~right).tolist():
-        measured[row] = measured[row] @ _fault(kind, rng)
-        if rng.random() < 0.3:  # and claims to know next to nothing
+        name, fault = _fault(kind, rng)
+        measured[row] = measured[row] @ fault
+        if name != "road" and rng.random() < 0.3:  # and claims to know next to nothing
             information[row] = np.diag(1.0 / np.repeat([1.0, 100.0], 3) ** 2)
     return replace(ledger(query, match, measured), information=information), right
 
 
-def _fault(kind: str, rng: np.random.Generator) -> Floats:
-    """Of another aisle, or off by a twelfth of the way a room is wide, or by more than 8 degrees."""
+def _fault(kind: str, rng: np.random.Generator) -> tuple[str, Floats]:
+    """To another aisle, or off by 1.1 m and 8 degrees, or far more in either."""
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     faults = {
         "aisle": np.concatenate([np.zeros(3), 8.0 * axis]),
-        "road": np.concatenate([np.radians(rng.uniform(8.5, 40)) * axis, 1.1 * axis]),
-        "turn": np.concatenate([np.radians(rng.uniform(9, 170)) * axis, np.zeros(3)]),
+        "road": np.concatenate([np.radians(rng.uniform(8.0, 40)) * axis, 1.1 * axis]),
+        "turn": np.concatenate([np.radians(rng.uniform(15, 170)) * axis, np.zeros(3)]),
         "far": np.concatenate([np.zeros(3), axis * METRES[kind] * rng.uniform(0.1, 0.5)]),
     }
-    return geometry.exp(faults[str(rng.choice(sorted(faults)))])
+    name = str(rng.choice(sorted(faults)))
+    return name, geometry.exp(faults[name])

@@ -152,6 +152,9 @@ def test_the_bounds_follow_the_drive_and_the_claim() -> None:
     assert outcome(off(1.1, 8.0), (0.01, 0.05), 1000.0) == "wrong"
     assert outcome(off(0.13, 1.0), (0.01, 0.01), 7.0) == "wrong"
     assert outcome(off(0.13, 1.0), (0.01, 0.04), 7.0) == "right"
+    assert outcome(off(0.06, 9.0), (0.04, 0.01), 7.0) == "right"
+    assert outcome(off(0.06, 11.0), (1.0, 1.0), 7.0) == "wrong"
+    assert outcome(off(0.35, 1.0), (1.0, 1.0), 7.0) == "wrong"
     for metres in (1.0, 7.0, 100.0, 1e3, 1e5, 1e7):
         for claimed in (0.01, 1.0, 1e4):
             assert outcome(off(8.0, 0.0), (0.01, claimed), metres) == "wrong"

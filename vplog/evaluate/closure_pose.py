@@ -3,7 +3,7 @@
 A closure tells match_from_query with an information matrix. Its error is E = truth^-1 closure, in the query's frame: a
 rotation vector r and a translation t, each with the block C of the claimed covariance. It is right where, for both,
 
-    e' (b^2 I + k^2 C)^-1 e <= 1   and   |e| <= 1.5 b
+    e' (b^2 I + k^2 C)^-1 e <= 1   and   |e| <= 2 b
 
 * b of a translation is .04 m sqrt(L / 1 m), 2 m at most, with L the length of the drive. What integrates motion,
   odometry or the truth itself, is off by a random walk, so by a root of what was travelled, and two visits of a place
@@ -13,7 +13,8 @@ rotation vector r and a translation t, each with the block C of the claimed cova
   diagonal): who goes round and round in a room stays in the room.
 * b of a rotation is 5 degrees whatever the drive: half of the turn that makes another keyframe.
 * k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain.
-* 1.5 b bounds that in turn: a claim to know nothing does not make a wrong closure right.
+* 2 b bounds that in turn: a claim to know nothing does not make a wrong closure right. It is 4 m at most, on a drive of
+  kilometres: less than to the next lane but one, or to the next aisle.
 * Where the truth is interpolated it is uncertain by `TruthAt.error`. A closure that is out of bounds by less than this
   is not judged, for it may be either; nor is one with an end that the truth does not cover.
 
@@ -42,7 +43,7 @@ _WALK_M = 0.04
 _MOST_M = 2.0
 """m: see above."""
 _ROTATION_DEG = 5.0
-_MOST_CLAIMED = 1.5
+_MOST_CLAIMED = 2.0
 """Times the bound that a claimed covariance may widen it to."""
 _CHI = 4.033
 """sqrt of the 99.9 % quantile of chi-square with three degrees of freedom, 16.27."""
