@@ -93,6 +93,8 @@ def print_evaluation(found: dict[str, Any]) -> None:
         if pair["accepted"] or pair["not_judged"]:
             print(f"  {pair['query_drive']} to {pair['match_drive']}:")
             _print_closures(pair, "    ")
+    for drive, why in found.get("uncovered", {}).items():
+        say(f"warning: {drive} is left out: {why}")
     if "maps" in found:
         return
     for line in _truth_notes(found):

@@ -25,10 +25,15 @@ _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """A run against ground truth."""
+    """A run, of one or several drives, or a map against ground truth."""
     from vplog.evaluation import evaluate as evaluate_run
+    from vplog.maps.evaluate import evaluate_map
 
-    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), _truth_options(arguments))
+    options = _truth_options(arguments)
+    if (arguments.run / "map.json").exists():
+        found = evaluate_map(arguments.run, arguments.truth, options)
+    else:
+        found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), options)
     if arguments.json:
         print_json(found)
     else:

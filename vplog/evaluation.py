@@ -60,7 +60,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file or `gps`.
 
-    Of several drives in one folder each by itself, each map as one trajectory, and the closures between drives.
+    Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
 
     Raises TruthError or ResultError with one line.
     """
@@ -137,39 +137,68 @@ def _camera(folder: Path) -> Floats | None:
 
 
 def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
-    """Each drive by itself, each map of several as one trajectory, and the closures between drives."""
-    if truth == "gps":
-        raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
-    known = _read_truth(truth, options)
-    maps, drives = [], {}
+    """A joint run."""
+    members = []
     for found in _recorded(record, folder, list, "maps"):
-        names = _recorded(found, folder, list, "drives")
-        joined = found.get("reason") is not None
-        file = "joint_trajectory.parquet" if joined else "trajectory.parquet"
-        for name in names:
-            own = folder / name
-            drives[name] = evaluate_poses(own, run_record.read_finished_run(own), truth, options, known)
-        parts = [tables.read_trajectory(folder / name / file)[0] for name in names]
-        stamps, rows = np.unique(np.concatenate([part.stamp_ns for part in parts]), return_index=True)
-        whole = Trajectory(stamps, np.concatenate([part.world_from_body for part in parts])[rows])
-        whole, _ = trajectory.at_truth(whole, known)
-        own = [{"drive": name, **drives[name].record} for name in names]
-        maps.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known, alignment=options.align))})
-    return {"truth": truth, "maps": maps, "joins": _joins(folder, drives, options.place)}
+        file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
+        members.append({name: folder / name / file for name in _recorded(found, folder, list, "drives")})
+    folders = {name: folder / name for drives in members for name in drives}
+    return evaluate_together(folder, folders, members, [folder / "joins.parquet"], truth, options)
 
 
-def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
-    """The closures between each two drives, as those of one are judged."""
+def evaluate_together(
+    whose: Path,
+    folders: dict[str, Path],
+    maps: list[dict[str, Path]],
+    joins: list[Path],
+    truth: str,
+    options: TruthOptions,
+) -> dict[str, Any]:
+    """Drives by themselves, each map of several as one trajectory, and the closures between drives.
+
+    `folders` are the run folders by drive, `maps` the tables of trajectories in one frame, `joins` those of closures.
+    Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
+    """
+    if truth == "gps":
+        raise TruthError(f"{whose} holds several drives; hold each against its own GPS: vplog evaluate {whose}/DRIVE")
+    known = _read_truth(truth, options)
+    drives: dict[str, Evaluation] = {}
+    uncovered: dict[str, str] = {}
+    for name, folder in folders.items():
+        try:
+            drives[name] = evaluate_poses(folder, run_record.read_finished_run(folder), truth, options, known)
+        except TruthError as error:
+            uncovered[name] = str(error)
+    if not drives:
+        raise TruthError(next(iter(uncovered.values()), f"{whose} holds no drive."))
     found = []
-    for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():
-        query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
-        bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
-        cameras = _camera(folder / later), _camera(folder / earlier)
-        oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
-        judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
-        counts = closures.count_closures(ledger, judged)
-        criterion = closures.criterion_of(bounds, place)
-        found.append({"query_drive": later, "match_drive": earlier, **counts, "criterion": criterion})
+    for members in maps:
+        parts = [tables.read_trajectory(path)[0] for name, path in members.items() if name in drives]
+        if parts:
+            stamps, rows = np.unique(np.concatenate([part.stamp_ns for part in parts]), return_index=True)
+            whole = Trajectory(stamps, np.concatenate([part.world_from_body for part in parts])[rows])
+            whole, _ = trajectory.at_truth(whole, known)
+            own = [{"drive": name, **drives[name].record} for name in members if name in drives]
+            found.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known, alignment=options.align))})
+    between = [pair for path in joins for pair in _joins(path, folders, drives, options.place)]
+    return {"truth": truth, "maps": found, "joins": between, "uncovered": uncovered}
+
+
+def _joins(
+    path: Path, folders: dict[str, Path], drives: dict[str, Evaluation], place: closures.PlaceCriterion
+) -> list[dict[str, Any]]:
+    """The closures between each two drives of a table, as those of one are judged."""
+    found = []
+    for (later, earlier), ledger in tables.read_joins(path).items():
+        if later in drives and earlier in drives:
+            query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
+            bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
+            oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
+            cameras = _camera(folders[later]), _camera(folders[earlier])
+            judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
+            counts = closures.count_closures(ledger, judged)
+            criterion = closures.criterion_of(bounds, place)
+            found.append({"query_drive": later, "match_drive": earlier, **counts, "criterion": criterion})
     return found
 
 

@@ -207,7 +207,7 @@ def along_x(metres: float, count: int = 2001, longer: float = 1.0, turn_deg_per_
     """Straight on, or bent, with a pose every `metres` / (`count` - 1)."""
     step_m = longer * metres / (count - 1)
     step = np.array([0, 0, np.radians(turn_deg_per_100_m) * metres / (count - 1) / 100.0, step_m, 0, 0])
-    poses = geometry.exp(np.arange(count)[:, None] * step)
+    poses = geometry.exp(np.arange(count, dtype=np.float64)[:, None] * step)
     return Trajectory(NOW_NS + 50_000_000 * np.arange(count), poses)
 
 
