@@ -138,6 +138,7 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     narrow = ("--distance-m", 0.01, "--heading-deg", 3)
     assert verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "n.html", *narrow).code == 0
     assert "within 0.0 m and 3.0 degrees" in (tmp_path / "n.html").read_text()
+    assert "give --truth" in verb("report", finished, "-o", tmp_path / "n.html", *narrow).error
     gps = verb("report", finished, "--truth", "gps", "-o", tmp_path / "g.html")
     assert gps.code == 0
     assert "ATE rmse" in (tmp_path / "g.html").read_text()

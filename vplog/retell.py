@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import geometry, logs
-from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
 from vplog.evaluation import TruthOptions, evaluate, evaluate_poses
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
@@ -40,6 +40,10 @@ def report(
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
+    if truth is None and options not in (None, TruthOptions()):
+        raise TruthError(
+            "--distance-m, --heading-deg, --align and --truth-offset-s say how a truth is used: give --truth."
+        )
     judged = judge(folder, record, truth, topics, options) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:

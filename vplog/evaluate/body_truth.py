@@ -207,8 +207,8 @@ def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tupl
         return "body", None
     a = geometry.between(true[first], true[last])
     b = geometry.between(moved[first], moved[last])
-    path = np.maximum(np.linalg.norm(b[:, :3, 3], axis=1), 1e-9)
-    weight = np.minimum(1.0 / path, 1.0 / np.median(path))
+    path = np.linalg.norm(b[:, :3, 3], axis=1)
+    weight = 1.0 / np.maximum(path, max(float(path.mean()), 1e-6))  # turns on the spot tell no share of a shift
     same = _disagreement(a, b, np.eye(4), weight)
     camera = np.inf if body_from_camera is None else _disagreement(a, b, geometry.inverse(body_from_camera), weight)
     truth_from_body = _hand_eye(a, b, weight)
@@ -241,7 +241,7 @@ def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
     turns about, stays zero.
     """
     turn_a, turn_b = geometry.so3_log(a[:, :3, :3]), geometry.so3_log(b[:, :3, :3])
-    size = float(np.median(np.linalg.norm(b[:, :3, 3], axis=1)))  # the lever in units of a motion, as the scale is
+    size = float(np.linalg.norm(b[:, :3, 3], axis=1).mean())  # the lever in units of a motion, as the scale is
     shift, rotation = np.zeros(3), np.eye(3)
     for _ in range(_STEPS):
         # by turns and by shifts, both rotated by X; the lever's share of a shift is taken off first
