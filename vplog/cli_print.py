@@ -157,9 +157,11 @@ def _print_closures(closures: dict[str, Any], indent: str = "") -> None:
     bounds, blank = closures["criterion"], f"{indent}{'':9} "
     print(
         f"{indent}closures  {closures['accepted']} accepted, {closures['accepted_true']} of them true, "
-        f"{closures['accepted_false']} false (precision {share['precision']}), {closures['not_judged']} not judged: "
-        f"no truth, or one too coarse; {closures['opposite']} in the opposite direction"
+        f"{closures['accepted_false']} false (precision {share['precision']}); {closures['opposite']} in the opposite "
+        "direction"
     )
+    if closures["not_judged"]:
+        print(f"{blank}{closures['not_judged']} are not judged: the truth has a gap there, or is too coarse to tell")
     print(
         f"{blank}true by pose: within {bounds['translation_m']:.2f} m and {bounds['rotation_deg']:g} deg of the truth, "
         f"or the claimed covariance, at most {bounds['most']:g} times that: {bounds['length_m']:.0f} m of drive"
