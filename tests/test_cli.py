@@ -164,6 +164,52 @@ def test_json_of_evaluate_config_and_schemas(verb: Verb, drive: Drive, finished:
     assert verb("schemas", "-o", tmp_path / "schemas", "--json").json["written"]
 
 
+def test_evaluate_says_by_which_criteria(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+    found = verb("evaluate", finished, "--truth", drive.truth, "--json").json
+    closures = found["closures"]
+    assert closures["accepted_true"] + closures["accepted_false"] + closures["not_judged"] == closures["accepted"] > 0
+    said = verb("evaluate", finished, "--truth", drive.truth).out
+    for text in (
+        f"{closures['accepted_true']} of them true", f"within {closures['criterion']['translation_m']:.2f} m and 5 deg",
+        "within 6 m and 45 deg between optical axes", "(SE(3))", "per 100 m", "segments of",
+    ):  # fmt: skip
+        assert text in said
+    narrow = ("evaluate", finished, "--truth", drive.truth, "--distance-m", 0.02, "--heading-deg", 2, "--align", "sim3")
+    other = verb(*narrow, "--json").json
+    assert other["closures"]["accepted_true"] == closures["accepted_true"]  # the pose's bounds are others
+    assert other["closures"]["same_place"] < closures["same_place"]
+    assert other["ate_after"]["alignment"] == "Sim(3)"
+    assert "within 0.02 m and 2 deg between optical axes" in verb(*narrow).out
+    for option in (("--distance-m", 3), ("--heading-deg", 9), ("--truth-offset-s", 1), ("--align", "origin")):
+        assert f"takes no {option[0]}" in verb("evaluate", finished, "--truth", "gps", *option).error
+
+
+def test_evaluate_with_a_clock_that_is_off_and_a_truth_of_the_camera(
+    verb: Verb, drive: Drive, finished: Path, tmp_path: Path
+) -> None:
+    from vplog import geometry
+    from vplog.data import Trajectory
+    from vplog.evaluate.truth import read_truth
+    from vplog.results.mcap_read import read_camera_pose
+    from vplog.results.tum import write_tum
+
+    true, camera = read_truth(drive.truth), read_camera_pose(finished / "result.mcap")
+    assert camera is not None
+    plain = verb("evaluate", finished, "--truth", drive.truth, "--json").json
+    late, of_camera = tmp_path / "late.tum", tmp_path / "camera.tum"
+    write_tum(late, Trajectory(true.stamp_ns - 400_000_000, true.world_from_body))
+    write_tum(of_camera, Trajectory(true.stamp_ns, true.world_from_body @ camera))
+    found = verb("evaluate", finished, "--truth", late)
+    assert "--truth-offset-s 0.4" in found.err
+    assert f"{plain['closures']['accepted_true']} of them true" in found.out
+    given = verb("evaluate", finished, "--truth", late, "--truth-offset-s", 0.4, "--json").json
+    assert given["ate_after"]["rmse_m"] == pytest.approx(plain["ate_after"]["rmse_m"], abs=1e-6)
+    found = verb("evaluate", finished, "--truth", of_camera)
+    assert "The truth is that of the camera" in found.err
+    assert f"{plain['closures']['accepted_true']} of them true" in found.out
+    assert not np.array_equal(geometry.inverse(camera), camera)
+
+
 def test_evaluate_and_config_in_words(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
     assert "ATE rmse" in verb("evaluate", finished, "--truth", drive.truth).out
     assert "ATE rmse" in verb("evaluate", finished, "--truth", "gps").out

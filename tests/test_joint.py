@@ -95,7 +95,19 @@ def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Ca
     found = evaluate(joint, str(drive.truth))
     assert [len(one["drives"]) for one in found["maps"]] == [2, 1]
     assert found["maps"][0]["ate_after"]["rmse_m"] < 1.5
-    assert "as one trajectory" in verb("evaluate", joint, "--truth", drive.truth).out
+    pairs = {(pair["query_drive"], pair["match_drive"]): pair for pair in found["joins"]}
+    joined = pairs["after", "before"]
+    record = json.loads((joint / "run.json").read_text())
+    kept = {(tie["query_drive"], tie["match_drive"]): tie["kept"] for tie in record["joins"]}
+    assert joined["accepted"] + joined["not_judged"] == kept["after", "before"]
+    assert joined["precision"] == 1.0
+    assert joined["criterion"]["distance_m"] == 6.0
+    for one in found["maps"][0]["drives"]:
+        assert one["closures"]["accepted_false"] == 0
+        assert one["ate_after"]["alignment"] == "SE(3)"
+    said = verb("evaluate", joint, "--truth", drive.truth).out
+    assert "as one trajectory" in said
+    assert "after to before:" in said
     assert "several drives" in verb("evaluate", joint, "--truth", "gps").error
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from vplog.data import Closures, Verdict
-from vplog.evaluate.closure_curve import closure_curves
+from vplog.evaluate.body_truth import BodyTruth
 from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
@@ -127,9 +127,18 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     text = (tmp_path / "r.html").read_text()
     assert found["bytes"] == (tmp_path / "r.html").stat().st_size
     assert "Precision and recall" in text
-    assert "true" in ledger(text)["columns"]
+    told = ledger(text)
     evaluation = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     assert f"{evaluation['ate_after']['rmse_m']:.3f}" in text
+    accepted = [row for row in (dict(zip(told["columns"], r, strict=True)) for r in told["rows"])
+                if row["verdict"] == "accepted"]  # fmt: skip
+    for name, count in (("true", "accepted_true"), ("same place", "same_place")):
+        assert sum(row[name] == "yes" for row in accepted) == evaluation["closures"][count] > 0
+    assert f"within {evaluation['closures']['criterion']['translation_m']:.2f} m and 5.0 degrees" in text
+    narrow = ("--distance-m", 0.01, "--heading-deg", 3)
+    assert verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "n.html", *narrow).code == 0
+    assert "within 0.0 m and 3.0 degrees" in (tmp_path / "n.html").read_text()
+    assert "give --truth" in verb("report", finished, "-o", tmp_path / "n.html", *narrow).error
     gps = verb("report", finished, "--truth", "gps", "-o", tmp_path / "g.html")
     assert gps.code == 0
     assert "ATE rmse" in (tmp_path / "g.html").read_text()
@@ -139,8 +148,7 @@ def test_the_curves_enclose_the_average_precision(finished: Path, drive: Drive) 
     keyframes, _ = tables.read_keyframes(finished / "keyframes.parquet")
     closures, truth = tables.read_closures(finished / "closures.parquet"), read_truth(drive.truth)
     stop = candidate_stops(keyframes, ProposeSettings())
-    found = closure_curves(keyframes, closures, truth, stop)
-    score = score_closures(keyframes, closures, truth, stop)
+    score, found = score_closures(keyframes, closures, BodyTruth(truth), stop)
     for name, expected in (
         ("score", score.average_precision),
         ("inliers", score.average_precision_by_inliers),

@@ -6,23 +6,34 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import local_file, place, topics_of
+from vplog.cli_options import local_file, place, positive, topics_of
 from vplog.cli_print import print_evaluation, print_explanation, print_json, print_optimised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from vplog.evaluation import TruthOptions
+
 _SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
 """The kinds of graph/solve.py, here too since that imports numpy."""
+_ALIGNMENTS = ("se3", "sim3", "origin")
+"""Those of evaluate/trajectory.py, here too since that imports numpy."""
+_MOST_OFFSET_S = 1e9
+"""s; thirty years, from any clock that starts at zero to one of today."""
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
 """Those of export.py, here too since that imports numpy."""
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """A run against ground truth."""
+    """A run, of one or several drives, or a map against ground truth."""
     from vplog.evaluation import evaluate as evaluate_run
+    from vplog.maps.evaluate import evaluate_map
 
-    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments))
+    options = _truth_options(arguments)
+    if (arguments.run / "map.json").exists():
+        found = evaluate_map(arguments.run, arguments.truth, options)
+    else:
+        found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), options)
     if arguments.json:
         print_json(found)
     else:
@@ -61,8 +72,9 @@ def report(arguments: argparse.Namespace) -> None:
     from vplog.retell import report as write_report
 
     found = write_report(
-        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads
-    )
+        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads,
+        _truth_options(arguments),
+    )  # fmt: skip
     if arguments.json:
         print_json(found)
     else:
@@ -80,16 +92,38 @@ def export(arguments: argparse.Namespace) -> None:
         print("\n".join(found["written"]))
 
 
+def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
+    from vplog.evaluation import TruthOptions
+
+    return TruthOptions(arguments.distance_m, arguments.heading_deg, arguments.align, arguments.truth_offset_s)
+
+
+def _add_truth_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--distance-m", type=positive, metavar="M", help="frames of one place are within (default: 6)")
+    sub.add_argument(
+        "--heading-deg", type=positive, metavar="DEG", help="and their optical axes turned by less (default: 45)"
+    )
+    sub.add_argument("--align", choices=_ALIGNMENTS, default="se3", help="alignment of the ATE (default: se3)")
+    sub.add_argument(
+        "--truth-offset-s",
+        type=_seconds,
+        metavar="S",
+        help="add to the truth's stamps (default: found, for closures alone)",
+    )
+
+
 def add_results(
     add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
 ) -> None:
     sub = add("evaluate", evaluate, topics)
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    _add_truth_options(sub)
     _add_explain(add("explain", explain))
     sub = add("report", report, topics, threads)
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    _add_truth_options(sub)
     sub.add_argument("--log", type=place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
     sub.add_argument("-o", "--output", type=local_file, metavar="FILE.html", help="page (default: RUN/report.html)")
     sub = add("export", export)
@@ -116,6 +150,13 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-o", "--output", type=local_file, metavar="PICTURE.png", help=text)
     sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
     sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= _MOST_OFFSET_S:
+        raise argparse.ArgumentTypeError(f"must be seconds between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
+    return value
 
 
 def _closure(text: str) -> tuple[int, ...]:

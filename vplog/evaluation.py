@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,71 +10,197 @@ import numpy as np
 from vplog.data import Trajectory
 from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, gps, residuals, trajectory
+from vplog.evaluate.body_truth import body_truth
+from vplog.evaluate.closure_pose import pose_bounds
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.record import reopened
-from vplog.results import run_record, tables
+from vplog.results import mcap_read, run_record, tables
 from vplog.urls import without_secrets
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog import logs
+    from vplog.data import Floats, Keyframes
+    from vplog.evaluate.body_truth import BodyTruth
 
 
-def evaluate(folder: Path, truth: str, topics: logs.TopicChoice | None = None) -> dict[str, Any]:
-    """ATE and RPE of odometry and result, and the closures' precision and recall. `truth` is a TUM file or `gps`.
+@dataclass(frozen=True)
+class TruthOptions:
+    """How a run is held against the truth; None takes the default."""
 
-    Of several drives in one folder the ATE of each by itself, and of each map as one trajectory.
+    distance_m: float | None = None
+    """m between frames of one place (6)."""
+    heading_deg: float | None = None
+    """Degrees between their optical axes (45)."""
+    align: str = "se3"
+    """Of the ATE: a name of `trajectory.ALIGNMENTS`."""
+    truth_offset_s: float | None = None
+    """s added to the stamps of the truth, for every figure; None finds it for the closures alone."""
+
+    @property
+    def place(self) -> closures.PlaceCriterion:
+        given = {"distance_m": self.distance_m, "heading_deg": self.heading_deg}
+        return closures.PlaceCriterion(**{name: value for name, value in given.items() if value is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A run of one drive against a file of poses."""
+
+    record: dict[str, Any]
+    """As `evaluate` gives it."""
+    keyframes: Keyframes
+    truth: BodyTruth
+    judged: closures.Judgement
+
+
+def evaluate(
+    folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None
+) -> dict[str, Any]:
+    """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file or `gps`.
+
+    Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
 
     Raises TruthError or ResultError with one line.
     """
+    options = options or TruthOptions()
     record = run_record.read_finished_run(folder)
     if "maps" in record:
-        return _joint(folder, record, truth)
+        return _joint(folder, record, truth, options)
+    if truth == "gps":
+        return {"truth": "gps", **_against_gps(folder, record, topics, options)}
+    return evaluate_poses(folder, record, truth, options).record
+
+
+def evaluate_poses(
+    folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None
+) -> Evaluation:
+    """A run of one drive against a TUM file, or the poses `known` that were read from it. Raises as `evaluate`."""
+    known = _read_truth(truth, options) if known is None else known
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
-    if truth == "gps":
-        return {"truth": "gps", **_against_gps(record, before, after, topics)}
-    known = read_truth(truth)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = _recorded(record, folder, dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
-    return {
+    camera = _camera(folder)
+    of_body = body_truth(known, before, camera, options.truth_offset_s is None)
+    figures = _trajectories(before, after, known, of_body, options)
+    score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
+    found = {
         "truth": without_secrets(truth),
-        "ate_before": asdict(trajectory.ate(before, known)),
-        "ate_after": asdict(trajectory.ate(after, known)),
-        "rpe_before": asdict(trajectory.rpe(before, known)),
-        "rpe_after": asdict(trajectory.rpe(after, known)),
-        "closures": asdict(closures.score_closures(keyframes, ledger, known, stops)),
-        "residuals": asdict(residuals.score_residuals(keyframes, ledger, known)),
+        "truth_is": _about(of_body, options),
+        **figures,
+        "closures": asdict(score),
+        "residuals": asdict(residuals.score_residuals(keyframes, ledger, of_body)),
+    }
+    return Evaluation(found, keyframes, of_body, judged)
+
+
+def _read_truth(truth: str, options: TruthOptions) -> Trajectory:
+    known = read_truth(truth)
+    return Trajectory(known.stamp_ns + round((options.truth_offset_s or 0.0) * 1e9), known.world_from_body)
+
+
+def _trajectories(
+    before: Trajectory, after: Trajectory, known: Trajectory, of_body: BodyTruth, options: TruthOptions
+) -> dict[str, Any]:
+    """ATE and RPE against the truth as it is given, as evo has them, and the drift against that of the body."""
+    found: dict[str, Any] = {"ate": {}, "rpe": {}, "drift": {}}
+    interpolated = False
+    for when, one in (("before", before), ("after", after)):
+        compared, interpolated = trajectory.at_truth(one, known)
+        shifted, _ = trajectory.at_truth(one, of_body.trajectory)
+        found["ate"][when] = asdict(trajectory.ate(compared, known, alignment=options.align))
+        found["rpe"][when] = asdict(trajectory.rpe(compared, known))
+        found["drift"][when] = asdict(trajectory.drift(shifted, of_body.trajectory))
+    named = {f"{name}_{when}": value for name, both in found.items() for when, value in both.items()}
+    return {**named, "interpolated": interpolated}
+
+
+def _about(truth: BodyTruth, options: TruthOptions) -> dict[str, Any]:
+    """What the truth was found to be, as plain values."""
+    return {
+        "frame": truth.frame,
+        "body_from_truth": None if truth.body_from_truth is None else truth.body_from_truth.tolist(),
+        "offset_s": truth.offset_s if options.truth_offset_s is None else options.truth_offset_s,
+        "offset_found": options.truth_offset_s is None and truth.offset_s != 0.0,
+        "oriented": truth.oriented,
     }
 
 
-def _joint(folder: Path, record: dict[str, Any], truth: str) -> dict[str, Any]:
-    """Each drive by itself, and each map of several as one trajectory, all against a truth in the drives' clock."""
-    if truth == "gps":
-        raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
-    known = read_truth(truth)
-    maps = []
+def _camera(folder: Path) -> Floats | None:
+    """body_from_camera (4, 4), None where the run was written without."""
+    path = folder / "result.mcap"
+    return mcap_read.read_camera_pose(path) if path.exists() else None
+
+
+def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
+    """A joint run."""
+    members = []
     for found in _recorded(record, folder, list, "maps"):
-        names = _recorded(found, folder, list, "drives")
-        joined = found.get("reason") is not None
-        file = "joint_trajectory.parquet" if joined else "trajectory.parquet"
-        parts = [tables.read_trajectory(folder / name / file) for name in names]
-        stamps, rows = np.unique(np.concatenate([after.stamp_ns for after, _ in parts]), return_index=True)
-        whole = Trajectory(stamps, np.concatenate([after.world_from_body for after, _ in parts])[rows])
-        own = [
-            {
-                "drive": name,
-                "ate_before": asdict(trajectory.ate(Trajectory(odometry.stamp_ns, odometry.odom_from_body), known)),
-                "ate_after": asdict(trajectory.ate(after, known)),
-            }
-            for name, (after, odometry) in zip(names, parts, strict=True)
-        ]
-        maps.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known))})
-    return {"truth": without_secrets(truth), "maps": maps}
+        file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
+        members.append({name: folder / name / file for name in _recorded(found, folder, list, "drives")})
+    folders = {name: folder / name for drives in members for name in drives}
+    return evaluate_together(folder, folders, members, [folder / "joins.parquet"], truth, options)
+
+
+def evaluate_together(
+    whose: Path,
+    folders: dict[str, Path],
+    maps: list[dict[str, Path]],
+    joins: list[Path],
+    truth: str,
+    options: TruthOptions,
+) -> dict[str, Any]:
+    """Drives by themselves, each map of several as one trajectory, and the closures between drives.
+
+    `folders` are the run folders by drive, `maps` the tables of trajectories in one frame, `joins` those of closures.
+    Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
+    """
+    if truth == "gps":
+        raise TruthError(f"{whose} holds several drives; hold each against its own GPS: vplog evaluate {whose}/DRIVE")
+    known = _read_truth(truth, options)
+    drives: dict[str, Evaluation] = {}
+    uncovered: dict[str, str] = {}
+    for name, folder in folders.items():
+        try:
+            drives[name] = evaluate_poses(folder, run_record.read_finished_run(folder), truth, options, known)
+        except TruthError as error:
+            uncovered[name] = str(error)
+    if not drives:
+        raise TruthError(next(iter(uncovered.values()), f"{whose} holds no drive."))
+    found = []
+    for members in maps:
+        parts = [tables.read_trajectory(path)[0] for name, path in members.items() if name in drives]
+        if parts:
+            stamps, rows = np.unique(np.concatenate([part.stamp_ns for part in parts]), return_index=True)
+            whole = Trajectory(stamps, np.concatenate([part.world_from_body for part in parts])[rows])
+            whole, _ = trajectory.at_truth(whole, known)
+            own = [{"drive": name, **drives[name].record} for name in members if name in drives]
+            found.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known, alignment=options.align))})
+    between = [pair for path in joins for pair in _joins(path, folders, drives, options.place)]
+    return {"truth": without_secrets(truth), "maps": found, "joins": between, "uncovered": uncovered}
+
+
+def _joins(
+    path: Path, folders: dict[str, Path], drives: dict[str, Evaluation], place: closures.PlaceCriterion
+) -> list[dict[str, Any]]:
+    """The closures between each two drives of a table, as those of one are judged."""
+    found = []
+    for (later, earlier), ledger in tables.read_joins(path).items():
+        if later in drives and earlier in drives:
+            query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
+            bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
+            oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
+            cameras = _camera(folders[later]), _camera(folders[earlier])
+            judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
+            counts = closures.count_closures(ledger, judged)
+            criterion = closures.criterion_of(bounds, place)
+            found.append({"query_drive": later, "match_drive": earlier, **counts, "criterion": criterion})
+    return found
 
 
 def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
@@ -87,12 +213,22 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
 
 
 def _against_gps(
-    record: dict[str, Any], before: Trajectory, after: Trajectory, topics: logs.TopicChoice | None
+    folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions
 ) -> dict[str, Any]:
+    for option in ("distance_m", "heading_deg", "truth_offset_s"):
+        if getattr(options, option) is not None:
+            name = option.replace("_", "-")
+            raise TruthError(
+                f"--truth gps takes no --{name}: fixes judge no closure. Give a TUM file, or leave it out."
+            )
+    if options.align == "origin":
+        raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     fixes = reopened(record, None, topics, "Put it back there, or give a truth file: --truth FILE.tum.").gps()
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
+    before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     return {
-        "ate_before": asdict(gps.ate_to_gps(before, fixes)),
-        "ate_after": asdict(gps.ate_to_gps(after, fixes)),
+        "ate_before": asdict(gps.ate_to_gps(before, fixes, options.align)),
+        "ate_after": asdict(gps.ate_to_gps(after, fixes, options.align)),
     }

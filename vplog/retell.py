@@ -8,13 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import geometry, logs
-from vplog.errors import LibraryError, ResultError, SettingsError
-from vplog.evaluate.closure_curve import closure_curves
-from vplog.evaluate.pairs import poses_at
-from vplog.evaluate.truth import read_truth
-from vplog.evaluation import evaluate
+from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
+from vplog.evaluation import TruthOptions, evaluate, evaluate_poses
 from vplog.extract import extract_frames
-from vplog.loops.propose import candidate_stops
 from vplog.pipeline import Pipeline
 from vplog.record import library_at
 from vplog.remote import original
@@ -36,14 +32,20 @@ def report(
     log: Path | None = None,
     topics: logs.TopicChoice | None = None,
     threads: int = 1,
+    options: TruthOptions | None = None,
 ) -> dict[str, Any]:
     """Write report.html of the run in `folder`, to `path` where given; what was written.
 
-    `truth` is a TUM file or `gps`; `log` the drive, read again where result.mcap has no pictures of closures.
+    `truth` is a TUM file or `gps`, and `options` how it is used, as in `evaluate`; `log` the drive, read again where
+    result.mcap has no pictures of closures.
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
-    judged = judge(folder, record, truth, topics) if truth is not None else None
+    if truth is None and options not in (None, TruthOptions()):
+        raise TruthError(
+            "--distance-m, --heading-deg, --align and --truth-offset-s say how a truth is used: give --truth."
+        )
+    judged = judge(folder, record, truth, topics, options) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
         pictures = pictures_from(log, folder, record, threads)
@@ -51,22 +53,33 @@ def report(
     return {"report": str(written), "bytes": written.stat().st_size, "truth": truth and shown(truth)}
 
 
-def judge(folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None = None) -> Judged:
+def judge(
+    folder: Path,
+    record: dict[str, Any],
+    truth: str,
+    topics: logs.TopicChoice | None = None,
+    options: TruthOptions | None = None,
+) -> Judged:
     """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
-    scores = evaluate(folder, truth, topics)
     if truth == "gps":
-        return Judged(truth, scores)
-    known = read_truth(truth)
+        return Judged(truth, evaluate(folder, truth, topics, options))
+    found = evaluate_poses(folder, record, truth, options or TruthOptions())
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-    closures = tables.read_closures(folder / "closures.parquet")
-    stops = candidate_stops(keyframes, _pipeline(folder, record).propose)
-    found = closure_curves(keyframes, closures, known, stops)
-    at, inside = poses_at(known, keyframes.stamp_ns)
-    world_from_truth, _ = geometry.umeyama(at[inside][:, :3, 3], world_from_body[inside][:, :3, 3])
+    at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
+    true, solved = at.world_from_body[at.known][:, :3, 3], world_from_body[at.known][:, :3, 3]
+    world_from_truth, _ = geometry.umeyama(true, solved)
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
     path = geometry.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
-    return Judged(Path(shown(truth)).name, scores, path, found.true, found.known, found.curves)
+    return Judged(
+        Path(shown(truth)).name,
+        found.record,
+        path,
+        judged.right,
+        judged.right | judged.wrong,
+        judged.curves,
+        judged.at_place,
+    )
 
 
 def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int) -> dict[int, bytes]:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from vplog import geometry
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
 from vplog.errors import TruthError
-from vplog.evaluate.closures import ClosureScore, score_closures
+from vplog.evaluate.body_truth import BodyTruth
+from vplog.evaluate.closures import ClosureScore, PlaceCriterion, score_closures
 from vplog.evaluate.truth import read_truth
 
 from .data import data
@@ -32,7 +33,7 @@ def planar(x: Sequence[float], y: Sequence[float], yaw_deg: Sequence[float]) -> 
 
 
 def ledger(pairs: Sequence[tuple[int, int, float, bool]]) -> Closures:
-    """Rows of query, match, score and whether accepted; inliers fall as the score rises."""
+    """Rows of query, match, score and whether accepted, without a pose; inliers fall as the score rises."""
     count = len(pairs)
     query, match, score, accepted = (list(column) for column in zip(*pairs, strict=True)) if pairs else ([], [], [], [])
     zeros, nan = np.zeros(count, np.int32), np.full(count, np.nan)
@@ -63,7 +64,13 @@ def score(poses: Floats, closures: Closures, stop: Ints | None = None) -> Closur
     stamps = SECOND * np.arange(len(poses))
     keyframes = Keyframes("d", stamps, poses)
     stop = np.maximum(np.arange(len(poses)) - 2, 0) if stop is None else stop
-    return score_closures(keyframes, closures, Trajectory(stamps, poses), stop)
+    return scored(keyframes, closures, Trajectory(stamps, poses), stop)
+
+
+def scored(
+    keyframes: Keyframes, closures: Closures, truth: Trajectory, stop: Ints, place: PlaceCriterion | None = None
+) -> ClosureScore:
+    return score_closures(keyframes, closures, BodyTruth(truth), stop, place)[0]
 
 
 # There and back: 0..3 go east, 4 and 5 are far off, 6..8 pass 0..2 again the same way, 9 stands at 3 and looks west.
@@ -105,7 +112,7 @@ def test_keyframes_outside_the_truth_do_not_count() -> None:
     stop = np.maximum(np.arange(10) - 2, 0)
     truth = Trajectory(stamps[1:8], ROUTE[1:8])
     closures = ledger([(6, 0, 0.9, True), (7, 1, 0.8, True), (9, 3, 0.7, True)])
-    found = score_closures(keyframes, closures, truth, stop)
+    found = scored(keyframes, closures, truth, stop)
     assert (found.keyframes, found.outside, found.candidates) == (7, 3, 1)
     assert (found.precision, found.recall, found.revisits) == (1.0, 1.0, 1)
 
@@ -116,11 +123,11 @@ def test_truth_is_interpolated_but_not_over_long_gaps() -> None:
     close = Trajectory(SECOND * np.array([0, 1, 3]), poses[[0, 1, 3]])
     wide = Trajectory(SECOND * np.array([0, 3]), poses[[0, 3]])
     stop = np.array([0, 1, 2, 3])
-    assert score_closures(keyframes, ledger([]), close, stop).outside == 0
-    assert score_closures(keyframes, ledger([]), wide, stop).outside == 2
-    found = score_closures(keyframes, ledger([(2, 1, 0.5, True)]), close, stop, radius_m=1.001)
+    assert scored(keyframes, ledger([]), close, stop).outside == 0
+    assert scored(keyframes, ledger([]), wide, stop).outside == 2
+    found = scored(keyframes, ledger([(2, 1, 0.5, True)]), close, stop, PlaceCriterion(1.001))
     assert found.precision == 1.0
-    assert score_closures(keyframes, ledger([(2, 1, 0.5, True)]), close, stop, radius_m=0.999).precision == 0.0
+    assert scored(keyframes, ledger([(2, 1, 0.5, True)]), close, stop, PlaceCriterion(0.999)).precision == 0.0
 
 
 def test_nothing_accepted_and_nothing_to_find() -> None:
@@ -137,7 +144,7 @@ def test_truth_of_another_drive_is_one_line() -> None:
     nothing = Trajectory(np.zeros(0, np.int64), ROUTE[:0])
     for truth in (other, nothing):
         with pytest.raises(TruthError, match="none of the 10 keyframes"):
-            score_closures(keyframes, ledger([]), truth, np.arange(10))
+            scored(keyframes, ledger([]), truth, np.arange(10))
 
 
 @settings(max_examples=15, deadline=None)
@@ -189,7 +196,7 @@ def test_loops_of_a_real_drive() -> None:
         (row, nearest(row, 40, 120), 0.9, True) for row in range(783, 820)
     ]  # before, it is still turning into the street
     opposite = [(row, nearest(row, 280, 300), 0.5, True) for row in range(694, 709)]
-    found = score_closures(keyframes, ledger([*same, *opposite]), truth, np.maximum(rows - 100, 0), radius_m=10.0)
+    found = scored(keyframes, ledger([*same, *opposite]), truth, np.maximum(rows - 100, 0), PlaceCriterion(10.0))
     assert found.outside == 0
     assert (found.accepted, found.accepted_true, found.opposite) == (
         len(same) + len(opposite),

@@ -79,6 +79,34 @@ def test_by_pose(seed: int, distance_m: float, heading_deg: float) -> None:
     np.testing.assert_array_equal(table_of(found, 17), (apart <= distance_m) & (turned <= heading_deg))
 
 
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.floats(1, 179))
+def test_the_heading_is_between_the_axes_whatever_the_roll(seed: int, heading_deg: float) -> None:
+    rng = np.random.default_rng(seed)
+    query, match = poses(rng, 12), poses(rng, 17)
+    axes = [axis / np.linalg.norm(axis) for axis in rng.normal(size=(2, 3))]
+    found = table_of(pairs.pose_pairs(query, match, 20.0, heading_deg, *axes), 17)
+    looks, sees = (one[:, :3, :3] @ axis for one, axis in zip((query, match), axes, strict=True))
+    apart = np.linalg.norm(query[:, None, :3, 3] - match[None, :, :3, 3], axis=-1)
+    np.testing.assert_array_equal(found, (apart <= 20.0) & (np.degrees(np.arccos(looks @ sees.T)) <= heading_deg))
+    rolled = geometry.pose(geometry.so3_exp(rng.uniform(-3, 3, (12, 1)) * axes[0]), np.zeros((12, 3)))
+    np.testing.assert_array_equal(
+        found, table_of(pairs.pose_pairs(query @ rolled, match, 20.0, heading_deg, *axes), 17)
+    )
+
+
+def test_an_axis_is_that_of_the_mount_or_none_where_a_vehicle_has_no_mount() -> None:
+    phase = np.linspace(0.0, 6.0, 50)
+    turn = np.stack([0 * phase, 0 * phase, phase + np.pi / 2], axis=1)
+    car = geometry.pose(geometry.so3_exp(turn), np.stack([np.cos(phase), np.sin(phase), 0 * phase], axis=1))
+    forward = geometry.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.ones(3))
+    np.testing.assert_array_equal(pairs.optical_axis(forward, car), [1.0, 0.0, 0.0])
+    assert pairs.optical_axis(np.eye(4), car) is None  # its z points up
+    np.testing.assert_array_equal(pairs.optical_axis(np.eye(4), car @ forward), [0.0, 0.0, 1.0])  # poses of the camera
+    assert pairs.optical_axis(None, car) is None
+    assert pairs.optical_axis(np.eye(4), car[:0]) is None
+
+
 def test_half_a_turn_allows_every_heading() -> None:
     rng = np.random.default_rng(5)
     query, match = poses(rng, 30), poses(rng, 30)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 
 from vplog import geometry, logs
-from vplog.data import Gps, Odometry, Trajectory
+from vplog.data import Camera, Gps, Odometry, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice, open_truth
 from vplog.results.tum import write_tum
@@ -36,8 +36,13 @@ class Recorded:
     fixes: Floats | None = None
     """(T, 2) m east and north of the equator at longitude 0, at the frames' stamps."""
 
+    body_from_camera: Floats = field(default_factory=lambda: np.eye(4))
+
     def stamps(self) -> Ints:
         return self.stamp_ns
+
+    def camera(self) -> Camera:
+        return Camera("camera", None, "none", np.zeros(0), 640, 480, self.body_from_camera)
 
     def odometry(self) -> Odometry | None:
         return None if self.poses is None else Odometry(self.stamp_ns, self.poses, None)
@@ -102,6 +107,16 @@ def test_the_defaults_are_6_m_and_45_degrees() -> None:
         turned = geometry.pose(geometry.so3_exp(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
         seen = found_rows(TruthChoice("poses"), query, Recorded("b", other.stamp_ns, cast("Any", other.poses) @ turned))
         assert any(seen) == some
+
+
+def test_a_camera_that_is_rolled_about_its_axis_sees_the_same_place() -> None:
+    """The mount is known: it looks along the body's x. Turned by as much about another axis it sees another place."""
+    query, other = straight("a", 0, 0), straight("b", 100, 6)
+    looks_along_x = geometry.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+    for axis, some in ((0, True), (1, False), (2, False)):
+        turned = geometry.pose(geometry.so3_exp(np.radians(120.0) * np.eye(3)[axis]), np.zeros(3))
+        rolled = replace(other, poses=cast("Any", other.poses) @ turned, body_from_camera=looks_along_x)
+        assert any(found_rows(TruthChoice("poses"), replace(query, body_from_camera=looks_along_x), rolled)) == some
 
 
 def test_a_heading_is_not_for_fixes() -> None:

@@ -10,13 +10,14 @@ import pytest
 from tests.graph.drive import ledger
 from vplog import geometry
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
+from vplog.evaluate.body_truth import BodyTruth
 from vplog.evaluate.residuals import score_residuals
 
 SIGMA = np.repeat([0.003, 0.05], 3)
 LAP = 200
 
 
-def drive(claimed: float = 1.0) -> tuple[Keyframes, Closures, Trajectory]:
+def drive(claimed: float = 1.0) -> tuple[Keyframes, Closures, BodyTruth]:
     """Two laps, the second 0.3 m beside the first, and a closure from every keyframe of it."""
     random = np.random.default_rng(0)
     turn = np.linspace(0, 2 * np.pi, LAP, endpoint=False)
@@ -29,7 +30,7 @@ def drive(claimed: float = 1.0) -> tuple[Keyframes, Closures, Trajectory]:
     z = geometry.between(poses[match], poses[query]) @ geometry.exp(random.normal(size=(LAP, 6)) * SIGMA)
     information = np.tile(np.diag(1.0 / (claimed * SIGMA) ** 2), (LAP, 1, 1))
     accepted = replace(ledger(query, match, z), information=information)
-    return Keyframes("laps", stamps, poses), accepted, Trajectory(stamps, poses)
+    return Keyframes("laps", stamps, poses), accepted, BodyTruth(Trajectory(stamps, poses))
 
 
 @pytest.mark.parametrize("claimed", [0.5, 1.0, 4.0])
@@ -43,9 +44,9 @@ def test_medians_are_the_errors_in_units_of_the_claim(claimed: float) -> None:
 
 def test_a_truth_that_is_off_between_the_laps_spoils_the_one_figure_and_not_the_other() -> None:
     keyframes, closures, truth = drive()
-    off = truth.world_from_body.copy()
+    off = truth.trajectory.world_from_body.copy()
     off[LAP:, 2, 3] += 1.0
-    found = score_residuals(keyframes, closures, replace(truth, world_from_body=off))
+    found = score_residuals(keyframes, closures, BodyTruth(Trajectory(keyframes.stamp_ns, off)))
     assert found.to_truth is not None
     assert found.to_truth > 5
     assert found.to_neighbours == pytest.approx(0.94, rel=0.08)

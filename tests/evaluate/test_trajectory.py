@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from vplog import geometry
 from vplog.data import Trajectory
 from vplog.errors import TruthError
-from vplog.evaluate.trajectory import associate, ate, rpe
+from vplog.evaluate.trajectory import associate, at_truth, ate, drift, rpe
 from vplog.evaluate.truth import read_truth
 
 from .data import data
@@ -51,10 +51,13 @@ def in_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     return PoseTrajectory3D(poses_se3=list(trajectory.world_from_body), timestamps=stamps)
 
 
-def evo_ate(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
+def evo_ate(estimate: Trajectory, truth: Trajectory, alignment: str = "se3") -> dict[str, Any]:
     reference, aligned = sync.associate_trajectories(in_evo(truth), in_evo(estimate))
     aligned = copy.deepcopy(aligned)
-    aligned.align(reference)
+    if alignment == "origin":
+        aligned.align_origin(reference)
+    else:
+        aligned.align(reference, correct_scale=alignment == "sim3")
     metric = metrics.APE(metrics.PoseRelation.translation_part)
     metric.process_data((reference, aligned))
     return {**metric.get_all_statistics(), "count": reference.num_poses}
@@ -183,3 +186,83 @@ def test_a_drive_shorter_than_the_step_has_no_rpe() -> None:
     truth = walk(0, 20)
     found = rpe(truth, truth, delta_m=1000.0)
     assert (found.delta, found.count, found.translation_rmse_m, found.rotation_max_deg) == ("1000 m", 0, None, None)
+
+
+@pytest.mark.parametrize(("alignment", "name"), [("se3", "SE(3)"), ("sim3", "Sim(3)"), ("origin", "origin")])
+def test_each_alignment_is_evos_and_named(alignment: str, name: str) -> None:
+    truth = walk(2, 90)
+    estimate = moved(walk(2, 90, noise=0.1), geometry.exp(np.full(6, 0.7)))
+    poses = estimate.world_from_body.copy()
+    poses[:, :3, 3] *= 1.3
+    longer = Trajectory(estimate.stamp_ns, poses)
+    found = ate(longer, truth, alignment=alignment)
+    theirs = evo_ate(longer, truth, alignment)
+    assert found.alignment == name
+    assert found.scale == pytest.approx(1 / 1.3, rel=0.02) if alignment == "sim3" else found.scale == 1.0
+    for figure in ("rmse", "mean", "median", "max"):
+        assert getattr(found, f"{figure}_m") == pytest.approx(theirs[figure], abs=1e-7), figure
+
+
+def along_x(metres: float, count: int = 2001, longer: float = 1.0, turn_deg_per_100_m: float = 0.0) -> Trajectory:
+    """Straight on, or bent, with a pose every `metres` / (`count` - 1)."""
+    step_m = longer * metres / (count - 1)
+    step = np.array([0, 0, np.radians(turn_deg_per_100_m) * metres / (count - 1) / 100.0, step_m, 0, 0])
+    poses = geometry.exp(np.arange(count, dtype=np.float64)[:, None] * step)
+    return Trajectory(NOW_NS + 50_000_000 * np.arange(count), poses)
+
+
+@pytest.mark.parametrize(
+    ("metres", "lengths"),
+    [(2000.0, [100, 200, 300, 400, 500, 600, 700, 800]), (350.0, [100, 200, 300]), (99.0, [10, 20, 30, 40, 50, 60, 70,
+     80]), (7.5, [1, 2, 3, 4, 5, 6, 7]), (0.35, [0.1, 0.2, 0.3])],
+)  # fmt: skip
+def test_drift_is_a_share_of_the_path_at_every_length(metres: float, lengths: list[float]) -> None:
+    truth = along_x(metres)
+    found = drift(along_x(metres, longer=1.02), truth)
+    assert found.lengths_m == pytest.approx(lengths)
+    # a segment ends at the first pose behind its length, which is up to one step more
+    assert found.translation_m == pytest.approx(2.0, rel=0.03)
+    assert found.rotation_deg == pytest.approx(0.0, abs=1e-6)
+    turned = drift(along_x(metres, turn_deg_per_100_m=3.0), truth)
+    assert turned.rotation_deg == pytest.approx(3.0, rel=0.03)
+    assert drift(truth, truth).translation_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_drift_is_the_mean_of_evos_relative_errors() -> None:
+    """One length, so that evo has the same segments: all pairs that are 100 m of path apart, from starts 10 m apart."""
+    truth, estimate = along_x(195.0, 1951), along_x(195.0, 1951, 1.01, 2.0)
+    errors = []
+    reference, measured = in_evo(truth), in_evo(estimate)
+    for start in range(0, 951, 100):
+        reference_step = [reference.poses_se3[start], reference.poses_se3[start + 1000]]
+        measured_step = [measured.poses_se3[start], measured.poses_se3[start + 1000]]
+        metric = metrics.RPE(metrics.PoseRelation.translation_part, delta=1, delta_unit=Unit.frames)
+        stamps = np.array([0.0, 1.0])
+        metric.process_data(
+            (
+                PoseTrajectory3D(poses_se3=reference_step, timestamps=stamps),
+                PoseTrajectory3D(poses_se3=measured_step, timestamps=stamps),
+            )
+        )
+        errors.append(metric.error[0])
+    found = drift(estimate, truth)
+    assert (found.lengths_m, found.segments) == ([100.0], len(errors))
+    assert found.translation_m == pytest.approx(np.mean(errors), rel=2e-3)
+
+
+def test_a_drive_that_stood_still_has_no_drift() -> None:
+    still = Trajectory(NOW_NS + 10**8 * np.arange(5), np.tile(np.eye(4), (5, 1, 1)))
+    assert (drift(still, still).translation_m, drift(still, still).segments) == (None, 0)
+
+
+def test_a_truth_of_1_hz_between_the_stamps_is_compared_at_its_own() -> None:
+    estimate = along_x(100.0)
+    at_ns = estimate.stamp_ns[10:-10:20] + 23_000_000
+    truth = Trajectory(at_ns, geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns))
+    with pytest.raises(TruthError):
+        ate(estimate, truth)
+    compared, interpolated = at_truth(estimate, truth)
+    assert interpolated
+    assert ate(compared, truth).count == len(at_ns)
+    assert ate(compared, truth).max_m < 1e-9
+    assert at_truth(estimate, estimate) == (estimate, False)

@@ -1,8 +1,13 @@
-"""Were the loop closures right, and were the revisits found?"""
+"""Were the loop closures right, and were the revisits found?
+
+Two questions, two criteria. Is the closure's pose right: that of `closure_pose`, for accepted closures. Do its two
+frames show one place: a distance and a heading between the true poses, as in `vplog compare`, for what place
+recognition is asked, candidates and revisits. A closure without metres is held to the second, and to its direction.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,21 +15,52 @@ import numpy as np
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import TruthError
-from vplog.evaluate.pairs import poses_at
+from vplog.evaluate.closure_pose import direction_errors, pose_bounds, pose_errors
+from vplog.evaluate.pairs import optical_axis, pose_pairs
+from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes, Trajectory
+    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes
+    from vplog.evaluate.body_truth import BodyTruth, TruthAt
+    from vplog.evaluate.closure_pose import PoseBounds, PoseErrors
 
     Bools = NDArray[np.bool_]
 
-RADIUS_M = 6.0
-"""m; two poses closer than this show the same place: a lane and a half, the radius of the field's KITTI protocols."""
-ANGLE_DEG = 45.0
-"""Degrees; a forward camera of 90 degrees still shares half its view."""
 _OPPOSITE_DEG = 90.0
 """Degrees; beyond it a forward camera looks the other way."""
+
+
+@dataclass(frozen=True)
+class PlaceCriterion:
+    """When two frames show one place."""
+
+    distance_m: float = DISTANCE_M
+    heading_deg: float = HEADING_DEG
+    """Between the optical axes, so that roll about them does not matter; of the whole rotation where the camera's mount
+    is not known, and of none where the truth has no orientation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """C closures against the truth."""
+
+    bounds: PoseBounds
+    pose: PoseErrors
+    known: Bools
+    """(C,) the truth covers both ends."""
+    at_place: Bools
+    """(C,) the two frames show one place."""
+    opposite: Bools
+    """(C,) the two frames are near each other and look in opposite directions (more than 90 degrees)."""
+    right: Bools
+    """(C,) by pose where there is one, else by place, and by direction where there is one."""
+    wrong: Bools
+    """(C,) neither right nor wrong: not judged, as the truth is missing or too coarse."""
+    curves: dict[str, Floats] = field(default_factory=dict)
+    """By what candidates are ranked, (P, 3): recall of the revisits, precision of the candidates, and the value from
+    which on; empty where nothing was revisited."""
 
 
 @dataclass(frozen=True)
@@ -37,120 +73,206 @@ class ClosureScore:
     """Keyframes without one; they and their closures are left out of everything else."""
     candidates: int
     accepted: int
+    """Accepted closures with a truth at both ends."""
     accepted_true: int
+    """Of these the ones whose pose is right."""
+    accepted_false: int
+    not_judged: int
+    """Accepted closures that the truth does not cover, or too coarsely to tell."""
     precision: float | None
-    """Accepted closures that are true."""
+    """Accepted closures that are right, of those that are right or wrong."""
+    by_place: int
+    """Accepted closures without a pose in metres, judged by the place criterion."""
+    overconfident: int
+    """Right ones that are further off than they claim (99.9 %)."""
+    same_place: int
+    """Accepted closures between frames of one place."""
+    place_precision: float | None
+    """These as a share of the accepted ones."""
     revisits: int
     """Keyframes that have an older keyframe at the same place."""
     revisits_found: int
     recall: float | None
-    """Revisits with at least one accepted, true closure."""
+    """Revisits with at least one accepted, right closure."""
     opposite: int
     """Accepted closures between poses at one place that look in opposite directions (more than 90 degrees)."""
+    directions: int
+    """Closures that the solve took without metres (`direction_only`)."""
+    directions_true: int
+    """Those of one place whose turn and direction are right."""
+    without_pose: int
+    """Candidates that agree by epipolar geometry alone (`no_calibration`)."""
+    without_pose_same_place: int
     average_precision: float | None
-    """Area below precision over recall of all candidates by falling score, whatever their verdict."""
+    """Area below precision over recall of all candidates by falling score, whatever their verdict, by place."""
     recall_at_full_precision: float | None
-    """Recall of the most candidates by falling score that are all true."""
+    """Recall of the most candidates by falling score that are all of one place."""
     average_precision_by_inliers: float | None
     recall_at_full_precision_by_inliers: float | None
+    criterion: dict[str, float] = field(default_factory=dict)
+    """The bounds: translation_m and rotation_deg, most (times these with the claimed covariance), length_m of the drive
+    they are for; distance_m and heading_deg of a place."""
+
+
+def judge_closures(
+    closures: Closures,
+    query: TruthAt,
+    match: TruthAt,
+    bounds: PoseBounds,
+    place: PlaceCriterion,
+    cameras: tuple[Floats | None, Floats | None] = (None, None),
+    oriented: bool = True,
+) -> Judgement:
+    """Compare a ledger with the truth at its queries' and its matches' keyframes, in one frame.
+
+    `cameras` are body_from_camera of queries and of matches; `oriented` whether the truth has orientations: without,
+    places are within the distance, and no pose is judged.
+    """
+    known = query.known[closures.query] & match.known[closures.match]
+    rows = np.flatnonzero(known)
+    here, there = query.world_from_body[closures.query[rows]], match.world_from_body[closures.match[rows]]
+    distance = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
+    axes = [
+        optical_axis(camera, at.world_from_body[at.known]) for camera, at in zip(cameras, (query, match), strict=True)
+    ]
+    heading = _heading_deg(here, there, *axes) if oriented else np.zeros(len(rows))
+    at_place, opposite = np.zeros(len(closures), bool), np.zeros(len(closures), bool)
+    at_place[rows] = (distance <= place.distance_m) & (heading <= place.heading_deg)
+    opposite[rows] = (distance <= place.distance_m) & (heading > _OPPOSITE_DEG)
+    pose = pose_errors(closures, query, match, bounds, oriented)
+    right = at_place & ~pose.posed
+    directed = np.array([scale == "none" for scale in closures.scale], bool)
+    directed &= np.isfinite(closures.match_from_query).all((1, 2))
+    if oriented and directed.any():
+        known_cameras = [np.eye(4) if camera is None else camera for camera in cameras]
+        right &= ~directed | direction_errors(closures, query, match, bounds, *known_cameras)
+    wrong = known & ~pose.posed & ~right
+    return Judgement(bounds, pose, known, at_place, opposite, right | pose.right, wrong | pose.wrong)
 
 
 def score_closures(
     keyframes: Keyframes,
     closures: Closures,
-    truth: Trajectory,
+    truth: BodyTruth,
     stop: Ints,
-    radius_m: float = RADIUS_M,
-    angle_deg: float = ANGLE_DEG,
-) -> ClosureScore:
-    """Compare a ledger with the truth.
+    place: PlaceCriterion | None = None,
+    camera: Floats | None = None,
+) -> tuple[ClosureScore, Judgement]:
+    """Compare a drive's ledger with the truth; `camera` is body_from_camera, None where it is not known.
 
-    A pair is true when its poses are within `radius_m` and `angle_deg` of each other in the truth. Keyframe i may
-    close a loop with the rows below `stop[i]`, (N,): it is a revisit when one of these is true to it.
+    Keyframe i may close a loop with the rows below `stop[i]`, (N,): it is a revisit when one of these is of its place.
     Raises TruthError where no keyframe has a truth.
     """
-    poses, known = poses_at(truth, keyframes.stamp_ns)
-    if not known.any():
+    place = place or PlaceCriterion()
+    at = truth.at(keyframes.stamp_ns)
+    if not at.known.any():
         raise TruthError(
-            f"The truth covers none of the {len(known)} keyframes. Give the truth of this drive, in the log's clock."
+            f"The truth covers none of the {len(at.known)} keyframes. Give the truth of this drive, in the log's clock."
         )
-    revisit = _revisits(poses, known, np.asarray(stop), radius_m, angle_deg)
-    rows = np.flatnonzero(known[closures.query] & known[closures.match])
-    query, match = closures.query[rows], closures.match[rows]
-    distance, angle = _apart(poses[query], poses[match])
-    near = distance <= radius_m
-    true = near & (angle <= angle_deg)
-    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)[rows]
-    found = np.unique(query[accepted & true & revisit[query]])
-    by_score = _ranked(closures.score[rows], true, query, revisit)
-    by_inliers = _ranked(closures.inliers[rows], true, query, revisit)
+    covered = np.flatnonzero(at.known)
+    bounds = pose_bounds(at.world_from_body[covered][:, :3, 3])
+    judged = judge_closures(closures, at, at, bounds, place, (camera, camera), truth.oriented)
+    poses = at.world_from_body[covered]
+    axis = optical_axis(camera, poses)
+    older = np.searchsorted(covered, np.minimum(np.asarray(stop), np.arange(len(at.known)))[covered])
+    heading_deg = place.heading_deg if truth.oriented else 180.0
+    revisit = np.zeros(len(at.known), bool)
+    revisit[covered] = pose_pairs(poses, poses, place.distance_m, heading_deg, axis, axis).below(older).positive
+    judged = replace(judged, curves=_curves(closures, judged, revisit))
+    return _score(closures, judged, at.known, revisit, place), judged
+
+
+def count_closures(closures: Closures, judged: Judgement) -> dict[str, Any]:
+    """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
+    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
+    right, wrong = accepted & judged.right, accepted & judged.wrong
+    here = accepted & judged.known
+    return {
+        "candidates": int(judged.known.sum()),
+        "accepted": int(here.sum()),
+        "accepted_true": int(right.sum()),
+        "accepted_false": int(wrong.sum()),
+        "not_judged": int((accepted & ~right & ~wrong).sum()),
+        "precision": _share(right.sum(), right.sum() + wrong.sum()),
+        "by_place": int((here & ~judged.pose.posed).sum()),
+        "overconfident": int((accepted & judged.pose.overconfident).sum()),
+        "same_place": int((accepted & judged.at_place).sum()),
+        "place_precision": _share((accepted & judged.at_place).sum(), here.sum()),
+        "opposite": int((accepted & judged.opposite).sum()),
+    }
+
+
+def criterion_of(bounds: PoseBounds, place: PlaceCriterion) -> dict[str, float]:
+    """The bounds as plain values."""
+    return {**asdict(bounds), **asdict(place)}
+
+
+def _score(
+    closures: Closures, judged: Judgement, covered: Bools, revisit: Bools, place: PlaceCriterion
+) -> ClosureScore:
+    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
+    direction = np.array([verdict == Verdict.DIRECTION_ONLY for verdict in closures.verdict], bool) & judged.known
+    unposed = np.array([verdict == Verdict.NO_CALIBRATION for verdict in closures.verdict], bool) & judged.known
+    found = np.unique(closures.query[accepted & judged.right])
+    found = found[revisit[found]]
+    by_score, by_inliers = (_area(judged.curves.get(name), bool(revisit.any())) for name in ("score", "inliers"))
     return ClosureScore(
-        keyframes=int(known.sum()),
-        outside=int((~known).sum()),
-        candidates=len(rows),
-        accepted=int(accepted.sum()),
-        accepted_true=int((accepted & true).sum()),
-        precision=_share((accepted & true).sum(), accepted.sum()),
+        keyframes=int(covered.sum()),
+        outside=int((~covered).sum()),
+        **count_closures(closures, judged),
         revisits=int(revisit.sum()),
         revisits_found=len(found),
         recall=_share(len(found), revisit.sum()),
-        opposite=int((accepted & near & (angle > _OPPOSITE_DEG)).sum()),
+        directions=int(direction.sum()),
+        directions_true=int((direction & judged.right).sum()),
+        without_pose=int(unposed.sum()),
+        without_pose_same_place=int((unposed & judged.at_place).sum()),
         average_precision=by_score[0],
         recall_at_full_precision=by_score[1],
         average_precision_by_inliers=by_inliers[0],
         recall_at_full_precision_by_inliers=by_inliers[1],
+        criterion=criterion_of(judged.bounds, place),
     )
 
 
-def _revisits(poses: Floats, known: Bools, stop: Ints, radius_m: float, angle_deg: float) -> Bools:
-    """(N,) keyframes with an earlier, allowed one at the same place; sorted along the longest axis, so not N^2."""
-    result = np.zeros(len(poses), bool)
-    rows = np.flatnonzero(known)
-    positions = poses[:, :3, 3]
-    axis = np.ptp(positions[rows], axis=0).argmax()
-    rows = rows[np.argsort(positions[rows, axis], kind="stable")]
-    along = positions[rows, axis]
-    first = np.searchsorted(along, along - radius_m, side="left")
-    last = np.searchsorted(along, along + radius_m, side="right")
-    for row, start, end in zip(rows.tolist(), first.tolist(), last.tolist(), strict=True):
-        others = rows[start:end]
-        others = others[others < min(stop[row], row)]
-        others = others[((positions[others] - positions[row]) ** 2).sum(1) <= radius_m**2]
-        if len(others):
-            distance, angle = _apart(poses[others], poses[row])
-            result[row] = bool(((distance <= radius_m) & (angle <= angle_deg)).any())
-    return result
+def _heading_deg(a: Floats, b: Floats, a_axis: Floats | None, b_axis: Floats | None) -> Floats:
+    """(R,) degrees between the optical axes of poses (R, 4, 4), or of their whole rotation."""
+    if a_axis is None or b_axis is None:
+        return np.degrees(geometry.angle(geometry.between(a, b)))
+    return np.degrees(np.arccos(np.clip(((a[:, :3, :3] @ a_axis) * (b[:, :3, :3] @ b_axis)).sum(1), -1.0, 1.0)))
 
 
-def _apart(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Distance in m and angle in degrees between poses (..., 4, 4)."""
-    relative = geometry.between(a, b)
-    return np.linalg.norm(relative[..., :3, 3], axis=-1), np.degrees(geometry.angle(relative))
+def _curves(closures: Closures, judged: Judgement, revisit: Bools) -> dict[str, Floats]:
+    rows = np.flatnonzero(judged.known)
+    if not revisit.any() or not len(rows):
+        return {}
+    query, true = closures.query[rows], judged.at_place[rows]
+    return {
+        name: _curve(value[rows].astype(np.float64), true, query, revisit)
+        for name, value in (("score", closures.score), ("inliers", closures.inliers))
+    }
 
 
-def _ranked(value: NDArray[Any], true: Bools, query: Int32s, revisit: Bools) -> tuple[float | None, float | None]:
-    """Average precision and the highest recall at precision 1 over candidates by falling value; None without revisits.
-
-    Recall counts revisits with a true candidate so far, precision counts candidates. Equal values come together,
-    as no threshold can tell them apart.
-    """
-    revisits = int(revisit.sum())
-    if not revisits:
-        return None, None
-    if not len(value):
-        return 0.0, 0.0
-    order = np.argsort(-value.astype(np.float64), kind="stable")
+def _curve(value: Floats, true: Bools, query: Int32s, revisit: Bools) -> Floats:
+    """(P, 3) by falling value; equal values come together, as no threshold can tell them apart."""
+    order = np.argsort(-value, kind="stable")
     value, true, query = value[order], true[order], query[order]
     useful = np.flatnonzero(true & revisit[query])
-    first = useful[np.unique(query[useful], return_index=True)[1]]
-    found = np.zeros(len(value), np.int64)
-    found[first] = 1
+    found = np.zeros(len(value))
+    found[useful[np.unique(query[useful], return_index=True)[1]]] = 1.0
     last_of_equal = np.append(np.flatnonzero(value[1:] != value[:-1]), len(value) - 1)
-    precision = (np.cumsum(true) / np.arange(1, len(value) + 1))[last_of_equal]
-    recall = (np.cumsum(found) / revisits)[last_of_equal]
-    average = float((np.diff(recall, prepend=0.0) * precision).sum())
+    precision = np.cumsum(true) / np.arange(1, len(value) + 1)
+    recall = np.cumsum(found) / revisit.sum()
+    return np.stack([recall, precision, value], axis=1)[last_of_equal]
+
+
+def _area(curve: Floats | None, revisits: bool) -> tuple[float | None, float | None]:
+    """Average precision and the highest recall at precision 1; None without revisits, 0 without candidates."""
+    if curve is None:
+        return (0.0, 0.0) if revisits else (None, None)
+    recall, precision, _ = curve.T
     full = recall[precision == 1.0]
-    return average, float(full.max()) if len(full) else 0.0
+    return float((np.diff(recall, prepend=0.0) * precision).sum()), float(full.max()) if len(full) else 0.0
 
 
 def _share(part: Any, whole: Any) -> float | None:

@@ -25,8 +25,8 @@ def local_enu(gps: Gps) -> tuple[Ints, Floats]:
     return local.stamp_ns, local.enu_m
 
 
-def ate_to_gps(estimate: Trajectory, gps: Gps) -> Ate:
-    """ATE of the estimate, interpolated at the fixes, after a rigid alignment; the antenna's offset is not known.
+def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
+    """ATE of the estimate, interpolated at the fixes, after an alignment; the antenna's offset is not known.
 
     Raises TruthError where fewer than three fixes lie within the estimate.
     """
@@ -39,4 +39,4 @@ def ate_to_gps(estimate: Trajectory, gps: Gps) -> Ate:
     if inside.sum() < 3:
         raise TruthError(f"Only {inside.sum()} of {len(inside)} GPS fixes lie within the drive; 3 are needed.")
     poses = geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
-    return aligned_error(poses[:, :3, 3], positions[inside])
+    return aligned_error(poses[:, :3, 3], positions[inside], alignment)

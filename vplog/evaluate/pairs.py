@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _MAX_GAP_S = 2.0
 """s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""
+_UPRIGHT = 0.9
+"""Length of the mean of unit vectors: they are within some 25 degrees of each other."""
 _LINE_LIMIT = 256
 """Characters; two frame numbers take about 15, and a file without line ends is not read whole."""
 _CSV_FORMAT = "A truth table has the header line `query,match`, then one pair of frame numbers a line, counted from 0."
@@ -135,14 +137,47 @@ def listed_pairs(listed: Ints, query: Ints, match: Ints) -> Pairs:
     return _runs(rows[begin:end] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True))
 
 
-def pose_pairs(query: Floats, match: Floats, distance_m: float, heading_deg: float) -> Pairs:
-    """Poses (Q, 4, 4) and (M, 4, 4) in one frame that are within a distance and a rotation of each other."""
-    # the trace of a rotation is 1 + 2 cos(angle); the margin is for rounding at 180 degrees, which allows all
-    least_trace = 1.0 + 2.0 * np.cos(np.radians(min(heading_deg, 180.0))) - 1e-9
-    rotations = np.ascontiguousarray(match[:, :3, :3]).reshape(-1, 9)
+def pose_pairs(
+    query: Floats,
+    match: Floats,
+    distance_m: float,
+    heading_deg: float,
+    query_axis: Floats | None = None,
+    match_axis: Floats | None = None,
+) -> Pairs:
+    """Poses (Q, 4, 4) and (M, 4, 4) in one frame that are within a distance and a heading of each other.
+
+    The heading is the angle between the optical axes, unit vectors (3,) in either body's frame: a camera that is rolled
+    about its axis sees the same place. Where an axis is not known it is the angle of the whole rotation.
+    """
+    cosine = np.cos(np.radians(min(heading_deg, 180.0)))
+    if query_axis is not None and match_axis is not None:
+        least, looks, sees = cosine, query[:, :3, :3] @ query_axis, match[:, :3, :3] @ match_axis
+    else:  # the trace of a rotation is 1 + 2 cos(angle)
+        least, looks, sees = 1.0 + 2.0 * cosine, query[:, :3, :3].reshape(-1, 9), match[:, :3, :3].reshape(-1, 9)
     near = _near(query[:, :3, 3], match[:, :3, 3], distance_m)
-    turned = np.ascontiguousarray(query[:, :3, :3]).reshape(-1, 9)
-    return _runs(rows[rotations[rows] @ turned[q] >= least_trace] for q, rows in enumerate(near))
+    # the margin is for rounding at 180 degrees, which allows all
+    return _runs(rows[sees[rows] @ looks[q] >= least - 1e-9] for q, rows in enumerate(near))
+
+
+def optical_axis(body_from_camera: Floats | None, poses: Floats) -> Floats | None:
+    """(3,) the camera's axis in the body's frame, None where it is not known.
+
+    An identity may stand for a log without the camera's mount. Then z is the optical axis unless the body's poses
+    (N, 4, 4) move across a z that hardly turns, as a vehicle's whose z points up.
+    """
+    if body_from_camera is None:
+        return None
+    axis = body_from_camera[:3, 2]
+    if not np.array_equal(body_from_camera, np.eye(4)):
+        return axis
+    if not len(poses):
+        return None
+    z = poses[:, :3, 2]
+    step = np.diff(poses[:, :3, 3], axis=0)
+    along = np.abs((step * z[:-1]).sum(1)) / np.maximum(np.linalg.norm(step, axis=1), 1e-12)
+    upright = np.linalg.norm(z.mean(0)) > _UPRIGHT and (not len(along) or np.median(along) < 1.0 - _UPRIGHT)
+    return None if upright else axis
 
 
 def position_pairs(query: Floats, match: Floats, distance_m: float) -> Pairs:
@@ -152,7 +187,7 @@ def position_pairs(query: Floats, match: Floats, distance_m: float) -> Pairs:
 
 def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
     """The truth at the stamps, (N, 4, 4), and (N,) where it is known: at a pose of it, or between two near in time."""
-    left, right, known = _around(truth.stamp_ns, at_ns)
+    left, right, known = around(truth.stamp_ns, at_ns)
     poses = np.full((len(at_ns), 4, 4), np.nan)
     poses[known & (left == right)] = truth.world_from_body[right[known & (left == right)]]
     between = known & (left != right)
@@ -163,7 +198,7 @@ def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
 
 def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats, Bools]:
     """Positions (T, D) at increasing stamps (T,), seen at other stamps: (N, D), and (N,) where known, as `poses_at`."""
-    _, _, known = _around(stamp_ns, at_ns)
+    _, _, known = around(stamp_ns, at_ns)
     result = np.full((len(at_ns), positions.shape[1]), np.nan)
     if known.any():
         seconds = (stamp_ns - stamp_ns[0]) / 1e9  # float64 holds the ns of a drive, not those since 1970
@@ -172,7 +207,7 @@ def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats
     return result, known
 
 
-def _around(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
+def around(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
     """Rows of the samples before and after each stamp, one and the same where it is hit, and where that is known."""
     if not len(stamp_ns):
         nothing = np.zeros(len(at_ns), np.int64)

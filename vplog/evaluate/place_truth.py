@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 DISTANCE_M = 6.0
 """m; two poses closer than this show the same place: a lane and a half, the radius of the field's KITTI protocols."""
 HEADING_DEG = 45.0
-"""Degrees; a forward camera of 90 degrees still shares half its view."""
+"""Degrees between optical axes; a forward camera of 90 degrees still shares half its view."""
 _USES = {
     "index": ("tolerance",),
     "csv": (),
@@ -99,12 +99,16 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
             pairs.poses_at(trajectory, log.stamps())
             for trajectory, log in zip(trajectories, (query, other), strict=True)
         )
+        axes = (
+            pairs.optical_axis(query.camera().body_from_camera, here[here_known]),
+            pairs.optical_axis(other.camera().body_from_camera, there[there_known]),
+        )
         about = {"source": shown(choice.source), "distance_m": distance_m, "heading_deg": heading_deg}
         found = PlaceTruth(
             about,
             np.flatnonzero(here_known),
             np.flatnonzero(there_known),
-            lambda q, m: pairs.pose_pairs(here[q], there[m], distance_m, heading_deg),
+            lambda q, m: pairs.pose_pairs(here[q], there[m], distance_m, heading_deg, *axes),
         )
     for name, known, log in (("query", found.query_frames, query), ("map", found.map_frames, other)):
         if not len(known):

@@ -9,10 +9,10 @@ import numpy as np
 
 from vplog import geometry
 from vplog.data import Verdict
-from vplog.evaluate.pairs import poses_at
 
 if TYPE_CHECKING:
-    from vplog.data import Closures, Floats, Ints, Keyframes, Trajectory
+    from vplog.data import Closures, Floats, Ints, Keyframes
+    from vplog.evaluate.body_truth import BodyTruth
 
 _NEAR = 5
 """Keyframes that the ends of two closures may be apart to be neighbours; the truth between them is short, and good."""
@@ -33,9 +33,10 @@ class ResidualScore:
     truth is off between two visits cancels, and so does what neighbours share, so it may be less."""
 
 
-def score_residuals(keyframes: Keyframes, closures: Closures, truth: Trajectory) -> ResidualScore:
+def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) -> ResidualScore:
     """Of the accepted closures of a ledger."""
-    poses, known = poses_at(truth, keyframes.stamp_ns)
+    at = truth.at(keyframes.stamp_ns)
+    poses, known = at.world_from_body, at.known & truth.oriented
     accepted = np.array([verdict is Verdict.ACCEPTED for verdict in closures.verdict], bool)
     usable = accepted & known[closures.query] & known[closures.match] & np.isfinite(closures.information).all((1, 2))
     rows = np.flatnonzero(usable)

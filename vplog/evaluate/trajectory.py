@@ -1,6 +1,7 @@
-"""How far an estimated trajectory is from the truth: ATE and RPE, defined as evo computes them.
+"""How far an estimated trajectory is from the truth: ATE and RPE, defined as evo computes them, and KITTI's drift.
 
-Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, sections IV.A and IV.B.
+Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, sections IV.A and IV.B; Geiger et al.,
+"Are we ready for autonomous driving?", CVPR 2012, and the odometry development kit.
 """
 
 from __future__ import annotations
@@ -11,18 +12,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog import geometry
+from vplog.data import Trajectory
 from vplog.errors import TruthError
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, Trajectory
+    from vplog.data import Floats, Ints
 
 MAX_DIFFERENCE_S = 0.01
 """s; how far the stamps of two poses that are compared may be apart, evo's default."""
+ALIGNMENTS = {"se3": "SE(3)", "sim3": "Sim(3)", "origin": "origin"}
+"""By the name of the option: Umeyama without scale (evo's -a), with scale (-as), or the first poses made equal
+(--align_origin)."""
+
+_LEAST_PATH_M = 1e-3
+"""m; a drive that stood still has no drift."""
 
 
 @dataclass(frozen=True)
 class Ate:
-    """Absolute trajectory error: distances in m after a rigid alignment."""
+    """Absolute trajectory error: distances in m after an alignment."""
 
     rmse_m: float
     mean_m: float
@@ -30,6 +38,24 @@ class Ate:
     max_m: float
     count: int
     """Poses compared."""
+    alignment: str = "SE(3)"
+    """`SE(3)` (Umeyama, rigid), `Sim(3)` (with scale) or `origin` (first poses made equal)."""
+    scale: float = 1.0
+    """What the estimate was multiplied by; 1 but for Sim(3)."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Relative pose error per 100 m as KITTI has it; None where nothing fits."""
+
+    translation_m: float | None
+    """m per 100 m, which is %: mean over all segments."""
+    rotation_deg: float | None
+    """Degrees per 100 m."""
+    lengths_m: list[float]
+    """The lengths of path compared."""
+    segments: int
+    """Segments of all lengths."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +101,22 @@ def associate(estimate: Trajectory, truth: Trajectory, max_difference_s: float =
     return (there, here) if estimate_is_longer else (here, there)
 
 
+def at_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, bool]:
+    """The estimate as it is compared with the truth, and whether it was interpolated at the truth's stamps.
+
+    It is where most of the truth's poses within it have none of its stamps near: a truth of 1 Hz in a clock of its own.
+    """
+    inside = (truth.stamp_ns >= estimate.stamp_ns[0]) & (truth.stamp_ns <= estimate.stamp_ns[-1])
+    at_ns = truth.stamp_ns[inside]
+    rows = np.clip(np.searchsorted(estimate.stamp_ns, at_ns), 1, len(estimate.stamp_ns) - 1)
+    away_ns = np.minimum(np.abs(estimate.stamp_ns[rows] - at_ns), np.abs(estimate.stamp_ns[rows - 1] - at_ns))
+    sparser = len(truth.stamp_ns) < len(estimate.stamp_ns)
+    if not sparser or not len(at_ns) or np.mean(away_ns <= MAX_DIFFERENCE_S * 1e9) > 0.5:
+        return estimate, False
+    poses = geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns)
+    return Trajectory(at_ns, poses), True
+
+
 def _nearest(short: Floats, long: Floats, max_difference_s: float) -> tuple[Ints, Ints]:
     """Rows of both; the comparisons are those of evo.core.sync.matching_time_indices, ties included."""
     after = np.minimum(np.searchsorted(long, short, side="right"), len(long) - 1)
@@ -92,22 +134,66 @@ def _seconds(stamp_ns: Ints) -> Floats:
     return np.array([stamp / 1_000_000_000 for stamp in stamp_ns.tolist()])
 
 
-def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = MAX_DIFFERENCE_S) -> Ate:
-    """ATE after the best rigid alignment without scale (Umeyama 1991), as `evo_ape tum TRUTH ESTIMATE -a`.
+def ate(
+    estimate: Trajectory,
+    truth: Trajectory,
+    max_difference_s: float = MAX_DIFFERENCE_S,
+    alignment: str = "se3",
+) -> Ate:
+    """ATE after an alignment of ALIGNMENTS, by default as `evo_ape tum TRUTH ESTIMATE -a` (Umeyama 1991).
 
     Raises TruthError where fewer than three poses can be compared.
     """
     here, there = associate(estimate, truth, max_difference_s)
-    return aligned_error(estimate.world_from_body[here, :3, 3], truth.world_from_body[there, :3, 3])
+    estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
+    if alignment != "origin":
+        return aligned_error(estimated[:, :3, 3], true[:, :3, 3], alignment)
+    moved = true[0] @ geometry.inverse(estimated[0]) @ estimated
+    return _ate(moved[:, :3, 3] - true[:, :3, 3], alignment)
 
 
-def aligned_error(estimate: Floats, truth: Floats) -> Ate:
+def aligned_error(estimate: Floats, truth: Floats, alignment: str = "se3") -> Ate:
     """ATE of positions (T, 3) that belong together. Raises TruthError where T is less than three."""
     if len(estimate) < 3:
         raise TruthError(f"Only {len(estimate)} poses have a truth; an alignment needs 3 at least.")
-    truth_from_estimate, _ = geometry.umeyama(estimate, truth)
-    error = np.linalg.norm(geometry.transform(truth_from_estimate, estimate) - truth, axis=1)
-    return Ate(_rms(error), float(error.mean()), float(np.median(error)), float(error.max()), len(error))
+    truth_from_estimate, scale = geometry.umeyama(estimate, truth, alignment == "sim3")
+    return _ate(geometry.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)
+
+
+def _ate(difference: Floats, alignment: str, scale: float = 1.0) -> Ate:
+    error = np.linalg.norm(difference, axis=1)
+    figures = _rms(error), float(error.mean()), float(np.median(error)), float(error.max())
+    return Ate(*figures, len(error), ALIGNMENTS[alignment], scale)
+
+
+def drift(estimate: Trajectory, truth: Trajectory) -> Drift:
+    """Mean relative pose error over segments of the truth's path, per 100 m of it.
+
+    As KITTI's kit: segments of 100, 200, .. 800 m, all that fit, from starts 10 m apart, each weighs the same. A drive
+    shorter than 100 m has segments of 1 to 8 times the largest power of ten that fits, from starts at tenths of it.
+    """
+    here, there = associate(estimate, truth)
+    estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
+    path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))])
+    if not path_m[-1] > _LEAST_PATH_M:
+        return Drift(None, None, [], 0)
+    unit_m = min(100.0, 10.0 ** np.floor(np.log10(path_m[-1])))
+    starts = np.unique(np.searchsorted(path_m, np.arange(0.0, path_m[-1], unit_m / 10.0)))
+    errors, lengths = [], []
+    for length_m in unit_m * np.arange(1, 9):
+        last = np.searchsorted(path_m, path_m[starts] + length_m)
+        first, last = starts[last < len(path_m)], last[last < len(path_m)]
+        if len(first):
+            wrong = geometry.between(
+                geometry.between(true[first], true[last]), geometry.between(estimated[first], estimated[last])
+            )
+            metres = np.linalg.norm(wrong[:, :3, 3], axis=1)
+            errors.append(np.stack([metres, np.degrees(geometry.angle(wrong))], axis=1) * (100.0 / length_m))
+            lengths.append(float(length_m))
+    if not errors:
+        return Drift(None, None, [], 0)
+    every = np.concatenate(errors)
+    return Drift(float(every[:, 0].mean()), float(every[:, 1].mean()), lengths, len(every))
 
 
 def rpe(

@@ -23,11 +23,13 @@ class Judged:
     path: Floats | None = None
     """(T, 3) m, the truth in the frame of the trajectory; None where the truth is the log's own GPS."""
     true: NDArray[np.bool_] | None = None
-    """(C,) candidates that are true by the truth's poses."""
+    """(C,) candidates whose pose is that of the truth, and those without a pose whose frames show one place."""
     known: NDArray[np.bool_] | None = None
-    """(C,) candidates that the truth covers."""
+    """(C,) candidates that the truth can tell of."""
     curves: dict[str, Floats] = field(default_factory=dict)
     """By what candidates are ranked: (P, 3) recall, precision and the value there, by falling value."""
+    at_place: NDArray[np.bool_] | None = None
+    """(C,) candidates whose two frames show one place."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,8 @@ def ledger(content: Content, pictures: list[int]) -> str:
     if judged is not None and judged.true is not None and judged.known is not None:
         told = np.where(judged.known, np.where(judged.true, "yes", "no"), "")
         columns.append(("true", [one or None for one in told[rows].tolist()]))
+        if judged.at_place is not None:
+            columns.append(("same place", ["yes" if one else None for one in judged.at_place[rows].tolist()]))
     heads = "".join(f'<th scope="col"><button type="button">{name}</button></th>' for name, _ in columns)
     kinds = [verdict.value for verdict in Verdict if verdict in closures.verdict]
     options = "".join(f'<option value="{kind}">{kind}</option>' for kind in kinds)

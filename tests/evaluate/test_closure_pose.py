@@ -1,0 +1,192 @@
+"""Which closures are right, on drives drawn by chance whose closures are labelled, of every scale and kind of truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.evaluate.drawn import KINDS, Drawn, draw
+from tests.graph.drive import ledger
+from vplog import geometry
+from vplog.data import Trajectory
+from vplog.evaluate.body_truth import BodyTruth, TruthAt, body_truth
+from vplog.evaluate.closure_pose import direction_errors, pose_bounds, pose_errors
+from vplog.evaluate.closures import ClosureScore, Judgement, score_closures
+
+SEEDS = range(6)
+
+
+def judged(drive: Drawn, truth: Trajectory) -> tuple[ClosureScore, Judgement, BodyTruth]:
+    found = body_truth(truth, drive.odometry, drive.camera)
+    return *score_closures(drive.keyframes, drive.closures, found, drive.stop, camera=drive.camera), found
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_label_is_found(kind: str, seed: int) -> None:
+    drive = draw(kind, seed)
+    score, found, truth = judged(drive, drive.truth)
+    np.testing.assert_array_equal(found.right, drive.right)
+    np.testing.assert_array_equal(found.wrong, ~drive.right)
+    assert (truth.frame, truth.offset_s, truth.oriented) == ("body", 0.0, True)
+    assert score.precision == drive.right.mean()
+    assert (score.not_judged, score.by_place, score.overconfident) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truth_of_1_hz_calls_nothing_what_it_is_not(kind: str, seed: int) -> None:
+    drive = draw(kind, seed)
+    seconds = np.arange(7, len(drive.truth.stamp_ns), 20)
+    _, found, _ = judged(drive, Trajectory(drive.truth.stamp_ns[seconds] + 11_000_000, poses_between(drive, seconds)))
+    assert not (found.right & ~drive.right).any()
+    assert not (found.wrong & drive.right).any()
+    assert (found.right | found.wrong)[found.known].mean() > 0.95
+
+
+def poses_between(drive: Drawn, rows: np.ndarray) -> np.ndarray:
+    return geometry.interpolate_at(
+        drive.truth.stamp_ns, drive.truth.world_from_body, drive.truth.stamp_ns[rows] + 11_000_000
+    )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truth_of_the_camera_is_known_as_such(kind: str, seed: int) -> None:
+    drive = draw(kind, seed)
+    other = geometry.exp(np.array([0.3, -2.0, 1.0, 5.0, 6.0, 7.0]))  # and in another world
+    truth = Trajectory(drive.truth.stamp_ns, other @ drive.truth.world_from_body @ drive.camera)
+    _, found, of_body = judged(drive, truth)
+    assert of_body.frame == "camera"
+    np.testing.assert_array_equal(found.right, drive.right)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truth_of_another_point_is_estimated(kind: str, seed: int) -> None:
+    drive = draw(kind, seed)
+    size = {"room": 0.1, "road": 1.5, "drone": 0.5, "aisles": 0.5}[kind]
+    marker = geometry.exp(np.concatenate([np.random.default_rng(seed).normal(size=3), [size, -size / 2, size / 3]]))
+    truth = Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ marker)
+    _, found, of_body = judged(drive, truth)
+    assert of_body.frame == "estimated"
+    np.testing.assert_array_equal(found.right, drive.right)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_clock_that_is_off_is_found(kind: str, seed: int) -> None:
+    drive = draw(kind, seed)
+    truth = Trajectory(drive.truth.stamp_ns - 730_000_000, drive.truth.world_from_body)
+    _, found, of_body = judged(drive, truth)
+    assert of_body.offset_s == pytest.approx(0.73, abs=0.03)
+    assert not (found.right & ~drive.right).any()
+    assert not (found.wrong & drive.right).any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_noise_of_the_truth_makes_no_closure_false(kind: str, seed: int) -> None:
+    drive = draw(kind, seed)
+    metres = {"room": 0.005, "road": 0.3, "drone": 0.05, "aisles": 0.02}[kind]
+    noise = np.random.default_rng(seed).normal(size=(len(drive.truth.stamp_ns), 6)) * np.repeat([0.005, metres], 3)
+    truth = Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ geometry.exp(noise))
+    _, found, of_body = judged(drive, truth)
+    assert of_body.frame == "body"
+    assert not (found.right & ~drive.right).any()
+    assert not (found.wrong & drive.right).any()
+    assert (found.right | found.wrong).mean() > 0.95
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_gaps_of_the_truth_are_not_judged(seed: int) -> None:
+    drive = draw("drone", seed)
+    stamps = drive.keyframes.stamp_ns
+    gap = (stamps[len(stamps) // 2 + 10], stamps[len(stamps) // 2 + 60])
+    rows = (drive.truth.stamp_ns < gap[0]) | (drive.truth.stamp_ns > gap[1])
+    score, found, _ = judged(drive, Trajectory(drive.truth.stamp_ns[rows], drive.truth.world_from_body[rows]))
+    np.testing.assert_array_equal(found.right, drive.right & found.known)
+    assert score.not_judged == (~found.known).sum() > 0
+    assert score.accepted == found.known.sum()
+
+
+def test_positions_alone_judge_places() -> None:
+    drive = draw("road", 0)
+    flat = drive.truth.world_from_body.copy()
+    flat[:, :3, :3] = np.eye(3)
+    score, found, truth = judged(drive, Trajectory(drive.truth.stamp_ns, flat))
+    assert not truth.oriented
+    assert not found.pose.posed.any()
+    assert score.by_place == score.accepted
+    np.testing.assert_array_equal(found.right, found.at_place)
+
+
+def known(poses: np.ndarray, error: float = 0.0) -> TruthAt:
+    return TruthAt(poses, np.ones(len(poses), bool), np.tile([0.0, error], (len(poses), 1)))
+
+
+def outcome(error: np.ndarray, sigma: tuple[float, float], metres: float, unsure_m: float = 0.0) -> str:
+    """Of a closure that is off by `error` (6,) and claims `sigma` rad and m, on a drive `metres` long."""
+    poses = np.stack([np.eye(4), geometry.exp(np.array([0.1, 0.2, 0.3, 0.4, 0.1, 0.2]))])
+    measured = (geometry.between(poses[0], poses[1]) @ geometry.exp(error))[None]
+    found = replace(
+        ledger(np.array([1]), np.array([0]), measured),
+        information=np.diag(1.0 / np.repeat(sigma, 3) ** 2)[None],
+    )
+    line = np.linspace([0.0, 0.0, 0.0], [metres, 0.0, 0.0], 10)
+    at = known(poses, unsure_m)
+    errors = pose_errors(found, at, at, pose_bounds(line))
+    return "right" if errors.right[0] else "wrong" if errors.wrong[0] else "not judged"
+
+
+def off(metres: float, degrees: float) -> np.ndarray:
+    return np.array([0.0, 0.0, np.radians(degrees), metres, 0.0, 0.0])
+
+
+def test_the_bounds_follow_the_drive_and_the_claim() -> None:
+    assert outcome(off(0.06, 2.0), (0.01, 0.01), 7.0) == "right"
+    assert outcome(off(0.4, 2.0), (0.01, 0.01), 7.0) == "wrong"
+    assert outcome(off(0.4, 2.0), (0.01, 0.01), 1000.0) == "right"
+    assert outcome(off(1.1, 8.0), (0.01, 0.05), 1000.0) == "wrong"
+    assert outcome(off(0.13, 1.0), (0.01, 0.01), 7.0) == "wrong"
+    assert outcome(off(0.13, 1.0), (0.01, 0.04), 7.0) == "right"
+    assert outcome(off(0.06, 9.0), (0.04, 0.01), 7.0) == "right"
+    assert outcome(off(0.06, 11.0), (1.0, 1.0), 7.0) == "wrong"
+    assert outcome(off(0.35, 1.0), (1.0, 1.0), 7.0) == "wrong"
+    for metres in (1.0, 7.0, 100.0, 1e3, 1e5, 1e7):
+        for claimed in (0.01, 1.0, 1e4):
+            assert outcome(off(8.0, 0.0), (0.01, claimed), metres) == "wrong"
+
+
+def test_what_the_truth_cannot_tell_is_not_judged() -> None:
+    assert outcome(off(0.2, 1.0), (0.01, 0.01), 7.0, unsure_m=0.1) == "not judged"
+    assert outcome(off(0.05, 1.0), (0.01, 0.01), 7.0, unsure_m=0.1) == "right"
+    assert outcome(off(8.0, 1.0), (0.01, 0.01), 7.0, unsure_m=0.1) == "wrong"
+
+
+def test_rounds_in_a_room_do_not_widen_the_bound() -> None:
+    turn = np.linspace(0, 200 * np.pi, 20_000)
+    room = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    assert pose_bounds(room).length_m < 10
+    assert pose_bounds(np.zeros((0, 3))).translation_m == 0
+    assert pose_bounds(room, room).length_m == pytest.approx(2 * pose_bounds(room).length_m)
+
+
+def test_closures_without_metres_are_held_to_their_direction() -> None:
+    drive = draw("road", 1)
+    closures, camera = drive.closures, drive.camera
+    at = known(drive.truth.world_from_body[np.searchsorted(drive.truth.stamp_ns, drive.keyframes.stamp_ns)])
+    there, here = (at.world_from_body[rows] @ camera for rows in (closures.match, closures.query))
+    true = geometry.between(there, here)
+    length = np.linalg.norm(true[:, :3, 3], axis=1)
+    unit = true.copy()
+    unit[:, :3, 3] /= length[:, None]
+    turned = unit @ geometry.exp(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]))
+    reverse = unit.copy()
+    reverse[:, :3, 3] *= -1.0
+    bounds = replace(pose_bounds(drive.truth.world_from_body[:, :3, 3]), translation_m=0.5 * float(length.min()))
+    for measured, right in ((unit, True), (turned, False), (reverse, False)):
+        told = replace(closures, match_from_query=camera @ measured @ geometry.inverse(camera))
+        assert (direction_errors(told, at, at, bounds, camera, camera) == right).all()

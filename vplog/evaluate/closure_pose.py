@@ -1,0 +1,177 @@
+"""Is a closure's pose that of the truth? The criterion of `vplog evaluate`.
+
+A closure tells match_from_query with an information matrix. Its error is E = truth^-1 closure, in the query's frame: a
+rotation vector r and a translation t, each with the block C of the claimed covariance. It is right where, for both,
+
+    e' (b^2 I + k^2 C)^-1 e <= 1   and   |e| <= 2 b
+
+* b of a translation is .04 m sqrt(L / 1 m), 2 m at most, with L the length of the drive. What integrates motion,
+  odometry or the truth itself, is off by a random walk, so by a root of what was travelled, and two visits of a place
+  are known no better: KITTI's own poses differ by .9 m between two passes of a street over a loop of 1 km, hand-held
+  ones by some cm over some metres. .04 m is .4 % after 100 m, the best odometries of KITTI's table. Satellites bound
+  the truth of long drives to metres: the 2 m. L is the path, but no more than once around the drive (pi times its
+  diagonal): who goes round and round in a room stays in the room.
+* b of a rotation is 5 degrees whatever the drive: half of the turn that makes another keyframe.
+* k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain.
+* 2 b bounds that in turn: a claim to know nothing does not make a wrong closure right. It is 4 m at most, on a drive of
+  kilometres: less than to the next lane but one, or to the next aisle.
+* Where the truth is interpolated it is uncertain by `TruthAt.error`. A closure that is out of bounds by less than this
+  is not judged, for it may be either; nor is one with an end that the truth does not cover.
+
+A closure that is good in metres and claims to be better is over-confident, not false: it is counted beside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog import geometry
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Closures, Floats
+    from vplog.evaluate.body_truth import TruthAt
+
+    Bools = NDArray[np.bool_]
+
+_WALK_M = 0.04
+"""m after 1 m: see above."""
+_MOST_M = 2.0
+"""m: see above."""
+_ROTATION_DEG = 5.0
+_MOST_CLAIMED = 2.0
+"""Times the bound that a claimed covariance may widen it to."""
+_CHI = 4.033
+"""sqrt of the 99.9 % quantile of chi-square with three degrees of freedom, 16.27."""
+_OPEN = 1e-12
+"""Of the largest eigenvalue of an information: below it nothing is claimed along that direction."""
+
+
+@dataclass(frozen=True)
+class PoseBounds:
+    """How far a closure's pose may be from the truth's."""
+
+    translation_m: float
+    rotation_deg: float = _ROTATION_DEG
+    most: float = _MOST_CLAIMED
+    """Times these, that the claimed covariance may widen them to."""
+    length_m: float = 0.0
+    """Of the drive they are for."""
+
+    @property
+    def b(self) -> Floats:
+        """(2,) rad and m."""
+        return np.array([np.radians(self.rotation_deg), self.translation_m])
+
+
+def pose_bounds(*drives: Floats) -> PoseBounds:
+    """The bounds for closures within a drive, or between drives, of true positions (N, 3) in m in one frame each."""
+    length_m = 0.0
+    for positions in drives:
+        if len(positions):
+            path_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+            length_m += min(path_m, float(np.pi * np.linalg.norm(np.ptp(positions, axis=0))))
+    return PoseBounds(min(_WALK_M * float(np.sqrt(length_m)), _MOST_M), length_m=length_m)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """C closures against the truth."""
+
+    posed: Bools
+    """(C,) with a pose in metres and a truth at both ends."""
+    error: Floats
+    """(C, 2) rad and m; NaN where not posed."""
+    right: Bools
+    wrong: Bools
+    """Posed ones that are neither right nor wrong are not judged."""
+    overconfident: Bools
+    """(C,) right ones whose error is beyond the claimed covariance (99.9 %), what the truth may be off left out."""
+
+
+def pose_errors(
+    closures: Closures, query: TruthAt, match: TruthAt, bounds: PoseBounds, oriented: bool = True
+) -> PoseErrors:
+    """Judge the closures by the truth at the keyframes of their queries and of their matches; none where the truth is
+    not `oriented`."""
+    finite = np.isfinite(closures.match_from_query).all((1, 2)) & oriented
+    metric = np.array([scale != "none" for scale in closures.scale], bool)
+    posed = finite & metric & query.known[closures.query] & match.known[closures.match]
+    rows = np.flatnonzero(posed)
+    there, here = closures.match[rows], closures.query[rows]
+    true = geometry.between(match.world_from_body[there], query.world_from_body[here])
+    apart = geometry.between(true, closures.match_from_query[rows])
+    errors = [geometry.so3_log(apart[:, :3, :3]), apart[:, :3, 3]]
+    claimed = _covariance(closures.information[rows])
+    # a truth that is turned at the match moves the query by as much at its distance
+    lever = match.error[there, 0] * np.linalg.norm(true[:, :3, 3], axis=1)
+    unsure = np.hypot(query.error[here], match.error[there])
+    unsure[:, 1] = np.hypot(unsure[:, 1], lever)
+    size = np.stack([np.linalg.norm(error, axis=1) for error in errors], axis=1)
+    inside, maybe, honest = (np.ones(len(rows), bool) for _ in range(3))
+    for part, (error, b) in enumerate(zip(errors, bounds.b.tolist(), strict=True)):
+        covariance = claimed[:, 3 * part : 3 * part + 3, 3 * part : 3 * part + 3]
+        inside &= _within(error, covariance, b)
+        left = np.maximum(1.0 - unsure[:, part] / np.maximum(size[:, part], 1e-12), 0.0)
+        maybe &= _within(error * left[:, None], covariance, b)
+        honest &= _normalised(error * left[:, None], covariance) <= _CHI
+    found = PoseErrors(posed, np.full((len(closures), 2), np.nan), *(np.zeros(len(closures), bool) for _ in range(3)))
+    found.error[rows], found.right[rows], found.wrong[rows] = size, inside, ~maybe
+    found.overconfident[rows] = inside & ~honest
+    return found
+
+
+def direction_errors(
+    closures: Closures,
+    query: TruthAt,
+    match: TruthAt,
+    bounds: PoseBounds,
+    query_camera: Floats,
+    match_camera: Floats,
+) -> Bools:
+    """(C,) whether turn and direction of a closure without metres are the truth's; cameras are body_from_camera.
+
+    A direction may be off by the bound of a rotation and by what the bound of a translation is at the true distance.
+    """
+    right = np.zeros(len(closures), bool)
+    finite = np.isfinite(closures.match_from_query).all((1, 2))
+    rows = np.flatnonzero(finite & query.known[closures.query] & match.known[closures.match])
+    there, here = match.world_from_body[closures.match[rows]], query.world_from_body[closures.query[rows]]
+    seen = geometry.inverse(match_camera) @ closures.match_from_query[rows] @ query_camera
+    true = geometry.between(there @ match_camera, here @ query_camera)
+    distance = np.linalg.norm(true[:, :3, 3], axis=1)
+    cosine = (seen[:, :3, 3] * true[:, :3, 3]).sum(1) / np.maximum(
+        distance * np.linalg.norm(seen[:, :3, 3], axis=1), 1e-12
+    )
+    allowed = bounds.b[0] + np.arctan2(bounds.b[1], distance)
+    turned = geometry.angle(geometry.between(true, seen))
+    right[rows] = (turned <= bounds.b[0]) & (np.arccos(np.clip(cosine, -1.0, 1.0)) <= allowed)
+    return right
+
+
+def _within(error: Floats, covariance: Floats, b: float) -> Bools:
+    """(R,) the criterion above."""
+    if not b > 0:
+        return np.linalg.norm(error, axis=1) <= 0.0
+    widened = b**2 * np.eye(3) + _CHI**2 * covariance
+    return (_normalised(error, widened) <= 1.0) & (np.linalg.norm(error, axis=1) <= _MOST_CLAIMED * b)
+
+
+def _normalised(error: Floats, covariance: Floats) -> Floats:
+    """(R,) sqrt(e' C^-1 e); where nothing is claimed, C = 0, it is 0 for an error of 0 alone."""
+    sound = covariance + 1e-18 * np.eye(3)
+    return np.sqrt(np.maximum((error * np.linalg.solve(sound, error[:, :, None])[:, :, 0]).sum(1), 0.0))
+
+
+def _covariance(information: Floats) -> Floats:
+    """(R, 6, 6) of what closures claim; zero where they claim nothing, very large along what they leave open."""
+    covariance = np.zeros_like(information)
+    known = np.isfinite(information).all((1, 2))
+    values, vectors = np.linalg.eigh(information[known])
+    largest = np.maximum(values[:, -1:], 1e-300)
+    covariance[known] = (vectors / np.maximum(values, _OPEN * largest)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return covariance
