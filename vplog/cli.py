@@ -25,6 +25,7 @@ from vplog.cli_options import (
     topic_options,
     topics_of,
 )
+from vplog.cli_parser import Parser
 from vplog.cli_print import Progress, print_evaluation, print_info, print_joint, print_json, print_run, say
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
-    arguments = _parser().parse_args(argv)
+    arguments = _parser().parse_args(sys.argv[1:] if argv is None else argv)
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
@@ -291,8 +292,8 @@ def demo(arguments: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="vplog", description=vplog.__doc__)
-    parser.add_argument("--version", action="version", version=f"vplog {vplog.__version__}")
+    parser = Parser(prog="vplog", description=vplog.__doc__)
+    parser.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print one JSON object")
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -333,6 +334,9 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
     )
     add("config", config, settings)
+    sub = group("help", "What a verb does, and all its options.")
+    sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
+    sub.set_defaults(verb=lambda arguments: parser.parse_args([*arguments.words, "--help"]), debug=False)
     return parser
 
 

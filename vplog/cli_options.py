@@ -94,11 +94,12 @@ def resolved(text: str) -> Path:
 
 def at_least(least: int) -> Callable[[str], int]:
     def whole_number(text: str) -> int:
-        value = int(text)
-        if value < least:
-            raise argparse.ArgumentTypeError(f"must be {least} or more")
-        if value > _MOST:
-            raise argparse.ArgumentTypeError(f"must be {_MOST} or less")
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= _MOST:
+            raise argparse.ArgumentTypeError(f"must be a whole number from {least} to {_MOST}, not {text!r}")
         return value
 
     return whole_number
@@ -109,14 +110,22 @@ def at_least_one(text: str) -> int:
 
 
 def not_negative(text: str) -> float:
-    value = float(text)
+    value = _number(text)
     if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError("must be 0 or more")
+        raise argparse.ArgumentTypeError(f"must be a number of 0 or more, not {text!r}")
     return value
 
 
 def positive(text: str) -> float:
-    value = float(text)
+    value = _number(text)
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError("must be more than 0")
+        raise argparse.ArgumentTypeError(f"must be a number above 0, not {text!r}")
     return value
+
+
+def _number(text: str) -> float:
+    """NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -120,6 +120,7 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
 
 def _closure(text: str) -> tuple[int, ...]:
     parts = text.split(":")
-    if len(parts) > 2:
-        raise argparse.ArgumentTypeError("must be K or QUERY:MATCH")
+    if len(parts) > 2 or not all(part.isascii() and part.isdecimal() for part in parts):
+        what = "must be a row of closures.parquet (K), or two keyframes by row or stamp in ns (QUERY:MATCH)"
+        raise argparse.ArgumentTypeError(f"{what}, not {text!r}")
     return tuple(int(part) for part in parts)
