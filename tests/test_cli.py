@@ -188,10 +188,10 @@ def test_logs_may_stand_anywhere_among_the_options(arguments: str) -> None:
     found = cli._parser().parse_args(["run", *arguments.split()])
     assert found.logs == [Path("A"), Path("B")]
     assert found.output == Path("OUT")
-    two = cli._parser().parse_args("compare --truth index A --methods bobb B --sequence 3".split())
+    two = cli._parser().parse_args(["compare", "--truth", "index", "A", "--methods", "bobb", "B", "--sequence", "3"])
     assert (two.query, two.map, two.sequence) == (Path("A"), Path("B"), 3)
     assert cli._parser().parse_args(["compare", "--truth", "index", "--methods", "bobb", "A"]).map is None
-    box = cli._parser().parse_args("map export M --box=-33.9,18,-33,19 -o F R".split())
+    box = cli._parser().parse_args(["map", "export", "M", "--box=-33.9,18,-33,19", "-o", "F", "R"])
     assert (box.sources, box.box) == ([Path("M"), Path("R")], (-33.9, 18.0, -33.0, 19.0))
 
 

@@ -25,7 +25,8 @@ class Parser(argparse.ArgumentParser):
         self._intermixing, self._brief_usage = False, ""
 
     def add_subparsers(self, **options: Any) -> Any:
-        return super().add_subparsers(parser_class=partial(Parser, family=self._family), **options)
+        made_by: Any = partial(Parser, family=self._family)
+        return super().add_subparsers(parser_class=made_by, **options)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A verb takes its arguments before, between and behind its options."""
