@@ -177,8 +177,8 @@ def test_every_unknown_option_of_every_verb_is_named_before_anything_else(verb: 
 
 @pytest.mark.parametrize(
     "arguments",
-    ["A B -o OUT --threads 2", "-o OUT A --threads 2 B", "A -o OUT B --threads 2", "--threads 2 -o OUT A B", "-oOUT A B",
-     "A --output=OUT B", "-o OUT -- A B"],
+    ["A B -o OUT --threads 2", "-o OUT A --threads 2 B", "A -o OUT B --threads 2", "--threads 2 -o OUT A B",
+     "-oOUT A B", "A --output=OUT B", "-o OUT -- A B"],
 )  # fmt: skip
 def test_logs_may_stand_anywhere_among_the_options(arguments: str) -> None:
     from pathlib import Path

@@ -30,7 +30,7 @@ from vplog.cli_print import Progress, print_evaluation, print_info, print_joint,
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
 from vplog.cores import available, limited
-from vplog.errors import VplogError, was_interrupted
+from vplog.errors import LogError, VplogError, was_interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -150,12 +150,18 @@ def info(arguments: argparse.Namespace) -> None:
         from vplog.info_page import write_page
 
         write_page(arguments.html, found)
+    record = found.record
     if arguments.json:
-        print_json(found.record)
-    else:
-        print_info(found.record)
+        print_json(record)
+    elif not arguments.check:
+        print_info(record)
         if arguments.html is not None:
             print(f"page      {arguments.html}")
+    elif record["ready"]:
+        print(f"{arguments.log} can be run: {record['command']}")
+    if arguments.check and not record["ready"]:
+        instead = f" This works: {record['command']}" if record["command"] else ""
+        raise LogError(f"{arguments.log} cannot be run. {' '.join(record['problems'])}{instead}")
 
 
 def library(arguments: argparse.Namespace) -> None:
@@ -342,6 +348,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=place, metavar="LOG")
+    text = "one line alone, and exit status 1 where a run cannot work"
+    sub.add_argument("--check", action="store_true", help=text)
     text = "also write a page with pictures of the drive"
     sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 

@@ -47,7 +47,8 @@ def print_info(found: dict[str, Any]) -> None:
         print(f"warning   {warning}")
     for problem in found["problems"]:
         print(f"problem   {problem}")
-    print(f"run       {found['command']}")
+    if found["command"]:
+        print(f"{'run' if found['ready'] else 'this works':10} {found['command']}")
 
 
 def print_run(out: Path, record: dict[str, Any]) -> None:
