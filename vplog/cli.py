@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -26,7 +27,16 @@ from vplog.cli_options import (
     topics_of,
 )
 from vplog.cli_parser import Parser
-from vplog.cli_print import Progress, print_evaluation, print_info, print_joint, print_json, print_run, say
+from vplog.cli_print import (
+    Progress,
+    print_evaluation,
+    print_info,
+    print_joint,
+    print_json,
+    print_line,
+    print_run,
+    say,
+)
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
 from vplog.cores import available, limited
@@ -39,11 +49,6 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
     Verb = Callable[[argparse.Namespace], None]
-
-_DEMO_NEXT = (
-    "Look at it: a browser opens report.html, Foxglove or rerun result.mcap, evo reads trajectory.tum, DuckDB the "
-    ".parquet files."
-)
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
@@ -177,14 +182,15 @@ def library(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits})
         return
-    print(
-        f"{arguments.output}: {record['references']} references, {record['features']} features, "
-        f"{state.bits} bits a place, hash {state.hash[:12]}"
-    )
+    text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
+    print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
+    print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
+    from vplog.report import outcome_of
+
     paths, pipeline, library, topics = _asked(arguments)
     # a cache that is sent over the net costs more than it saves
     use_cache = arguments.cache and "://" not in str(arguments.shown)
@@ -207,7 +213,7 @@ def run(arguments: argparse.Namespace) -> None:
     elif "maps" in found:
         print_joint(arguments.shown, found)
     else:
-        print_run(arguments.shown, found)
+        print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
 
 
 def _library_at_hand(library: Path) -> AbstractContextManager[Path]:
@@ -278,6 +284,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from vplog.demo import DemoSettings, make_drive
     from vplog.evaluation import evaluate as evaluate_run
     from vplog.pipeline import run as run_pipeline
+    from vplog.report import outcome_of
     from vplog.retell import report as write_report
 
     pipeline = pipeline_of(arguments)
@@ -292,8 +299,8 @@ def demo(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    print_run(arguments.output / "run", done.record)
-    print(_DEMO_NEXT)
+    out = arguments.output / "run"
+    print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
     print_evaluation(found)
 
 
