@@ -119,7 +119,7 @@ def test_version(verb: Verb) -> None:
         ("evaluate", "out"),
         ("info", "a.mcap", "b.mcap"),
         ("map",),
-        ("explain", "out", "--closure", "-1"),
+        ("explain", "out", "--closure", "K"),
         ("export", "out", "--format", "tum"),
     ],
     ids=" ".join,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -144,7 +145,7 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
 
 def _closure(text: str) -> tuple[int, ...]:
     parts = text.split(":")
-    if len(parts) > 2 or not all(part.isascii() and part.isdecimal() for part in parts):
+    if len(parts) > 2 or not all(re.fullmatch("-?[0-9]{1,20}", part) for part in parts):
         what = "must be a row of closures.parquet (K), or two keyframes by row or stamp in ns (QUERY:MATCH)"
         raise argparse.ArgumentTypeError(f"{what}, not {text!r}")
     return tuple(int(part) for part in parts)
