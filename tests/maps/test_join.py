@@ -205,7 +205,7 @@ def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Calla
     assert "it is a folder" in verb(*command, "-o", tmp_path).error
     assert "length 4 is even" in verb(*command, "--sequence", 4).error
     shutil.rmtree(copy / "libraries")
-    assert "lacks its library" in verb(*command).error
+    assert "has lost its library" in verb(*command).error
 
 
 def test_a_merged_map_is_joined_without_logs(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
