@@ -46,7 +46,7 @@ LAYERS = (
     {"info_page", "redescribe"},
     {"explain_picture"},
     {"explain"},
-    {"cli_print", "cli_options"},
+    {"cli_print", "cli_options", "cli_parser"},
     {"cli_maps", "cli_results", "cli_study"},
     {"cli"},
     {"__main__"},

@@ -53,7 +53,7 @@ def test_a_covariance_that_closures_contradict_gives_way_to_the_drift_model() ->
     rough = replace(drive, odometry=replace(drive.odometry))
     found = solved(rough, 1e-6)
     told = " ".join(found.warnings)
-    assert "was not believed" in told
+    assert "is implausible" in told
     assert found.closures.verdict.count(Verdict.ACCEPTED) >= 50
 
 

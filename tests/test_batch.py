@@ -204,7 +204,7 @@ def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp
     before = files(whole)
     other = tmp_path / "other"
     build_library(logs[:1], other, pipeline)
-    with pytest.raises(LibraryError, match="would not compare"):
+    with pytest.raises(LibraryError, match="cannot be compared"):
         run_batch(logs, whole, pipeline, other)
     with pytest.raises(LibraryError, match=r"places\.references"):
         run_batch(logs, whole, load_pipeline("default", [*QUICK, "places.references=5"]))
@@ -430,7 +430,7 @@ def test_a_join_that_fails_takes_no_fates_along(
     said = verb("batch", *logs, "-o", root, *OPTIONS)
     assert (said.code, said.out.count("unchanged")) == (1, 2)
     assert said.err.splitlines()[-1] == (
-        f"vplog: error: The drives are in {root}, but not joined: The disk is full. When that is mended: "
+        f"vplog: error: The drives are in {root}, but not joined: The disk is full. Then join them: "
         f"vplog map join {root}"
     )
     said = verb("batch", *logs, bad, "-o", root, *OPTIONS)
@@ -460,7 +460,7 @@ def test_what_was_found_stays_known_after_ctrl_c(
 
 def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, verb: Callable[..., Said]) -> None:
     said = verb("batch", *logs, "-o", tmp_path / "map", "--odometry-file", tmp_path / "poses.tum")
-    assert "2 logs are given. Give them one by one" in said.error
+    assert "2 logs are given. Give each log by itself" in said.error
 
 
 @pytest.mark.parametrize(

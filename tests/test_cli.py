@@ -117,6 +117,10 @@ def test_version(verb: Verb) -> None:
         ("run", "a.mcap", "-o", "out", "--threads", "0"),
         ("run", "a.mcap", "-o", "out", "--threads", "many"),
         ("evaluate", "out"),
+        ("info", "a.mcap", "b.mcap"),
+        ("map",),
+        ("explain", "out", "--closure", "K"),
+        ("export", "out", "--format", "tum"),
     ],
     ids=" ".join,
 )
@@ -125,6 +129,83 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
     assert (said.code, said.out) == (2, "")
     assert said.err.startswith("usage: vplog")
     assert "Traceback" not in said.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("infp drive.mcap", "Did you mean info?"),
+        ("map exprt M -o x.parquet", "Did you mean export?"),
+        ("fly", "Verbs: info, library, run,"),
+        ("--json info drive.mcap", "--json goes behind the verb: vplog VERB --json"),
+        ("run A -o OUT --otput x", "Did you mean --output?"),
+        ("run A --otput x", "no option --otput. Did you mean --output?"),
+        ("run A -o OUT --odometry /odom", "--odometry-topic, --odometry-file"),
+        ("run A -o OUT --closure 3", "It is an option of vplog explain."),
+        ("evaluate RUN --truth gps --methods bobb", "It is an option of vplog compare, vplog study."),
+        ("run A -o OUT --threads many", "argument --threads: must be a whole number from 1 to 1000000000, not 'many'"),
+        ("run A -o OUT --threads 0", "from 1 to"),
+        ("batch A -o MAP --retries -1", "from 0 to"),
+        ("compare A --methods bobb --truth gps --distance-m near", "must be a number above 0, not 'near'"),
+        ("export RUN --format kity -o FILE", "'kity' is none of tum, kitti, euroc,"),
+        ("export RUN --format kity -o FILE", "Did you mean kitti?"),
+        ("explain RUN --closure Q:M", "not 'Q:M'"),
+        ("explain RUN --closure 1:2:3", "(QUERY:MATCH)"),
+        ("explain RUN --closure 3,4", "(QUERY:MATCH)"),
+        ("library A -o LIB --thread 3", "no option --thread. Did you mean --threads?"),
+        ("info A B", "one argument too many: B"),
+        ("help fly", "Verbs: info"),
+        ("run -o OUT", "LOG"),
+    ],
+)
+def test_wrong_usage_says_what_is_meant_in_one_line(verb: Verb, arguments: str, said: str) -> None:
+    answer = verb(*arguments.split())
+    assert (answer.code, answer.out) == (2, "")
+    usage, *_, error = answer.err.splitlines()
+    assert usage.startswith("usage: vplog")
+    assert said in error
+    assert error.split(": error: ")[1].count("All options: vplog") == 1
+    assert "invalid" not in error
+
+
+def test_every_unknown_option_of_every_verb_is_named_before_anything_else(verb: Verb) -> None:
+    for words in (["info"], ["run"], ["evaluate"], ["batch"], ["map", "query"], ["map", "merge"], ["config"], ["demo"]):
+        said = verb(*words, "--frobnicate", "7")
+        assert said.code == 2
+        assert "no option --frobnicate" in said.err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["A B -o OUT --threads 2", "-o OUT A --threads 2 B", "A -o OUT B --threads 2", "--threads 2 -o OUT A B",
+     "-oOUT A B", "A --output=OUT B", "-o OUT -- A B"],
+)  # fmt: skip
+def test_logs_may_stand_anywhere_among_the_options(arguments: str) -> None:
+    from pathlib import Path
+
+    from vplog import cli
+
+    found = cli._parser().parse_args(["run", *arguments.split()])
+    assert found.logs == [Path("A"), Path("B")]
+    assert found.output == Path("OUT")
+    two = cli._parser().parse_args(["compare", "--truth", "index", "A", "--methods", "bobb", "B", "--sequence", "3"])
+    assert (two.query, two.map, two.sequence) == (Path("A"), Path("B"), 3)
+    assert cli._parser().parse_args(["compare", "--truth", "index", "--methods", "bobb", "A"]).map is None
+    box = cli._parser().parse_args(["map", "export", "M", "--box=-33.9,18,-33,19", "-o", "F", "R"])
+    assert (box.sources, box.box) == ([Path("M"), Path("R")], (-33.9, 18.0, -33.0, 19.0))
+
+
+def test_help_is_a_verb_too(verb: Verb) -> None:
+    assert verb("help").out == verb("--help").out
+    assert verb("help", "run").out == verb("run", "--help").out
+    assert verb("help", "map", "query").out == verb("map", "query", "--help").out
+    assert verb("-V").out == verb("--version").out
+
+
+def test_a_mistyped_topic_finds_the_one_meant(verb: Verb, drive: Drive) -> None:
+    for typed in (IMAGE.strip("/"), IMAGE.upper(), IMAGE[:-2]):
+        error = verb("info", drive.log, "--image-topic", typed).error
+        assert f"Did you mean {IMAGE}?" in error
 
 
 def test_json_of_info(verb: Verb, drive: Drive) -> None:

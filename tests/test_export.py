@@ -185,7 +185,9 @@ def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, t
     camera = Camera("c", None, "none", np.zeros(0), 4, 4, np.eye(4))
     write_mcap(folder / "result.mcap", keyframes, world, graph, ledger, tables.TableMetadata({}, ""), camera)
     for kind in ("geojson", "geoparquet"):
-        assert "no three satellite fixes" in verb("export", folder, "--format", kind, "-o", tmp_path / "x").error
+        assert (
+            "fewer than three satellite fixes" in verb("export", folder, "--format", kind, "-o", tmp_path / "x").error
+        )
     assert verb("export", folder, "--format", "tum", "-o", tmp_path / "x").code == 0
 
 
@@ -263,3 +265,51 @@ def test_layouts_in_the_contract_are_those_of_the_code() -> None:
             base, _, length = text.removesuffix("]").partition("[")
             assert (part.name, str(part.type.value_type)) == (column, base)
             assert part.type.list_size == np.prod([int(one) for one in length.split("*")])
+
+
+# Standard output
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_dash_is_standard_output(
+    kind: str, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfdbinary: pytest.CaptureFixture
+) -> None:
+    """The bytes that a file would have."""
+    from vplog import cli
+
+    if kind == "rrd":
+        pytest.importorskip("rerun")
+    monkeypatch.chdir(tmp_path)
+    for name in ("file", "-"):
+        capfdbinary.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["export", str(finished), "--format", kind, "-o", name])
+        written, said = capfdbinary.readouterr()
+        assert (stop.value.code, said) == (0, b"")
+    if kind == "rrd":  # which holds the time of its making
+        assert written[:4] == (tmp_path / "file").read_bytes()[:4]
+    else:
+        assert written == (tmp_path / "file").read_bytes()
+    assert not (tmp_path / "-").exists()
+
+
+def test_a_dash_is_refused_where_it_cannot_be(
+    verb: Verb, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "--json" in verb("export", finished, "--format", "tum", "-o", "-", "--json").error
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    assert "terminal" in verb("export", finished, "--format", "geoparquet", "-o", "-").error
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    for words in (
+        f"report {finished} -o -", f"explain {finished} --closure 0 -o -", "info A --html -", "run A -o -",
+        "library A -o -", "demo -o -", "schemas -o -", "optimize A.g2o -o -", "batch A -o -", "map export M -o -",
+        "map query M A -o -", "map merge M -o -", "map redescribe M --library L -o -", "compare A --methods bobb "
+        "--truth index -o -", "study A --truth index -o -", "run - -o OUT", "info -", "evaluate - --truth gps",
+    ):  # fmt: skip
+        said = verb(*words.split())
+        assert (said.code, said.out) == (2, ""), words
+        assert "name a path" in said.err, words
+    assert "-" in verb("evaluate", finished, "--truth", "-").error
+    assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shlex
@@ -96,6 +97,56 @@ def test_what_stops_a_run_is_a_problem(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         cli.main(["info", str(tmp_path / "empty.mcap")])
     assert ended.value.code == 0  # the answer is the preflight's, not an error
+
+
+def words_of(told: str | None) -> list[str]:
+    """A command that a record names, with a file for each of its placeholders."""
+    assert told is not None
+    return shlex.split(told)[1:]
+
+
+def test_the_command_of_a_log_that_cannot_be_run_works_all_the_same(verb: Any, drive: Path, tmp_path: Path) -> None:
+    """Another topic where one works, a library where there are images alone, nothing where there are none."""
+    without = preflight(drive, TopicChoice(odometry="")).record
+    assert words_of(without["command"])[-2:] == ["--odometry-topic", "/odom"]
+    assert f"this works {without['command']}" in verb("info", drive, "--odometry-topic", "").out
+    messages = ros_messages(Drive(), 2)
+    spoiled = [
+        dataclasses.replace(
+            m, topic="/broken/image/compressed", message=dataclasses.replace(m.message, data=np.zeros(9, np.uint8))
+        )
+        for m in messages
+        if m.topic == "/cam/image/compressed"
+    ]
+    two = write_ros2(tmp_path / "two", messages + spoiled)
+    broken = preflight(two, TopicChoice(image="/broken/image/compressed")).record
+    assert not broken["ready"]
+    assert preflight(two, cli_options.topics_of(cli._parser().parse_args(words_of(broken["command"])))).record["ready"]
+    assert "--image-topic /cam/image/compressed" in broken["command"]
+    images = write_ros2(tmp_path / "images", [m for m in messages if m.topic == "/cam/image/compressed"])
+    record = preflight(images).record
+    assert words_of(record["command"])[0] == "library"
+    done = verb(*[str(tmp_path / "lib") if word == "OUT" else word for word in words_of(record["command"])])
+    assert done.code == 0, done.err
+    blind = write_ros2(tmp_path / "blind", [m for m in messages if m.topic == "/odom"])
+    assert preflight(blind).record["command"] is None
+    said = verb("info", blind)
+    assert "vplog run" not in said.out
+    assert "vplog run" not in page(preflight(blind))
+
+
+def test_check_is_one_line_and_a_status(verb: Any, drive: Path, tmp_path: Path) -> None:
+    good = verb("info", drive, "--check")
+    assert (good.code, good.err) == (0, "")
+    assert good.out == f"{drive} can be run: vplog run {drive} -o OUT\n"
+    error = verb("info", drive, "--check", "--odometry-topic", "").error
+    assert error.startswith(f"{drive} cannot be run. There is no odometry")
+    assert error.endswith("--odometry-topic /odom")
+    told = verb("info", drive, "--check", "--json", "--odometry-topic", "")
+    assert told.code == 1
+    assert json.loads(told.out)["ready"] is False
+    assert verb("info", drive, "--check", "--json").json["ready"] is True
+    assert "no such file" in verb("info", tmp_path / "none.mcap", "--check").error
 
 
 def test_the_command_runs_with_what_was_asked_for(drive: Path, tmp_path: Path) -> None:

@@ -8,9 +8,12 @@ import pytest
 from pydantic import Field, ValidationError
 
 from vplog.errors import SettingsError
+from vplog.methods import known_methods, read_method
+from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.settings import Settings, load_yaml, override
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 
@@ -61,6 +64,133 @@ def test_what_does_not_fit_is_named(tree: dict[str, Any], where: str) -> None:
     with pytest.raises(SettingsError) as error:
         Outer.read(tree, "my.yaml")
     assert _one_line(error).startswith(f"my.yaml: {where}")
+
+
+FOREIGN = (
+    "pydantic",
+    "http",
+    "Input should",
+    "Extra inputs",
+    "union",
+    "instance of",
+    "type=",
+    "Value error",
+    "NoneType",
+)
+"""Words of pydantic, which no message may have."""
+WRONG: tuple[Any, ...] = (
+    None, True, -1, 0, 0.5, 10**40, float("nan"), float("inf"), float("-inf"), "", "many", "1.5", "nan", [], [1, "a"],
+    {}, {"a": 1}, {1: 2}, {"kind": "nonsense"}, {"kind": None}, {"kind": [1]}, b"\xff", object(),
+)  # fmt: skip
+
+
+def places(settings: Settings, above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Path of every setting and group of settings."""
+    for name, value in settings:
+        yield (*above, name)
+        if isinstance(value, Settings):
+            yield from places(value, (*above, name))
+
+
+def trees() -> Iterator[tuple[tuple[str, ...], dict[str, Any], Pipeline]]:
+    """Path of every setting of every method, and the least that a file must say to reach it."""
+    for kind in known_methods():
+        made = Pipeline.read({"places": {"kind": kind}}, kind)
+        yield from ((path, {"places": {"kind": kind}}, made) for path in places(made) if path[0] == "places")
+    for kind in ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm"):
+        made = Pipeline.read({"solve": {"kind": kind}}, kind)
+        yield from ((path, {"solve": {"kind": kind}}, made) for path in places(made) if path[0] == "solve")
+    yield from ((path, {}, Pipeline()) for path in places(Pipeline()) if path[0] not in ("places", "solve"))
+
+
+def changed(tree: dict[str, Any], path: tuple[str, ...], value: Any) -> dict[str, Any]:
+    if len(path) == 1:
+        return {**tree, path[0]: value}
+    return {**tree, path[0]: changed(tree.get(path[0], {}), path[1:], value)}
+
+
+def test_no_wrong_value_of_any_setting_is_told_in_the_words_of_pydantic() -> None:
+    refused = set()
+    for path, tree, _ in trees():
+        for wrong in WRONG:
+            try:
+                Pipeline.read(changed(tree, path, wrong), "my.yaml")
+            except SettingsError as error:
+                said = str(error)
+                refused.add(path)
+                assert said.startswith("my.yaml: "), said
+                assert "\n" not in said, said
+                assert len(said) < 500, said
+                assert not [word for word in FOREIGN if word in said], said
+                assert ".".join(path) in said or path[0] in said, said
+                assert any(word in said for word in (" must be ", " is no setting.", " is ", " than ")), said
+    assert {path for path, *_ in trees()} == refused, "a setting that takes anything"
+
+
+def test_a_mistyped_name_of_any_setting_finds_it() -> None:
+    for path, tree, _ in trees():
+        name = path[-1]
+        if len(name) < 5:
+            continue
+        for typed in (name[1:], name[:2] + name[3:], name[:1] + name[2] + name[1] + name[3:]):
+            if typed == name:
+                continue
+            with pytest.raises(SettingsError) as error:
+                Pipeline.read(changed(tree, (*path[:-1], typed), 1), "my.yaml")
+            said = _one_line(error)
+            assert said.startswith(f"my.yaml: {'.'.join((*path[:-1], typed))} is no setting. "), said
+            assert ".".join(path) in said, said
+
+
+@pytest.mark.parametrize(
+    ("assignment", "said"),
+    [
+        ("propose.per_query=0", "propose.per_query must be a whole number (at least 1), not 0."),
+        ("noise.drift_per_metre=7", "noise.drift_per_metre must be a number (above 0 and at most 1), not 7."),
+        ("keyframes.distance_m=far", "keyframes.distance_m must be a number (at least 0) or null, not 'far'."),
+        ("library.choose=spreed", "one of random, spread, coverage, not 'spreed'. Did you mean spread?"),
+        ("solve.kind=gcn", "solve.kind must be one of cauchy, dcs, geman_mcclure, gnc, lm, pcm, not 'gcn'."),
+        ("per_query=3", "per_query is no setting. Did you mean propose.per_query?"),
+        ("places.words=3", "places.words is no setting. It belongs to places.kind=bovf or fabmap or hybrid."),
+        ("sequence.length=4", "sequence: length 4 is even"),
+        ("places.box_columns=40", "places: a box of 40 x 6 is larger than the grid"),
+    ],
+)
+def test_a_wrong_setting_says_where_what_is_allowed_and_what_is_near(assignment: str, said: str) -> None:
+    with pytest.raises(SettingsError) as error:
+        load_pipeline("default", ["features.max_features=400", assignment])
+    message = _one_line(error)
+    assert message.startswith(f"--set {assignment}: ")
+    assert said in message
+    with pytest.raises(SettingsError, match=r"my\.yaml: "):
+        pipeline_from(override({}, assignment), "my.yaml", ["features.max_features=400"])
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        ("bob", "Did you mean bobb?"),
+        ("bobb:refernces=3", "method bobb:refernces=3: refernces is no setting. Did you mean references?"),
+        ("hybrid:bobb.rows=0", "bobb.rows must be a whole number (at least 1 and at most 255), not 0."),
+        ("fabmap:seen_if_absent=0.9", "fabmap:seen_if_absent=0.9: seen_if_absent 0.9 must be below"),
+    ],
+)
+def test_a_wrong_method_says_what_is_near(method: str, said: str) -> None:
+    with pytest.raises(SettingsError) as error:
+        read_method(method, Pipeline())
+    assert said in _one_line(error)
+
+
+def test_a_mistyped_pipeline_finds_the_shipped_one() -> None:
+    with pytest.raises(SettingsError, match="Did you mean quick"):
+        load_pipeline("quik")
+
+
+def test_a_broken_file_says_in_which_line(tmp_path: Path) -> None:
+    path = tmp_path / "p.yaml"
+    path.write_text("propose:\n  per_query: 3\n  gap_s: [1, 2\n")
+    with pytest.raises(SettingsError, match="line 4"):
+        load_yaml(path)
 
 
 def test_settings_do_not_change() -> None:

@@ -48,7 +48,7 @@ is computed, at 0.3 MB a keyframe."""
 
 
 _OTHER = (
-    "{what} made {count} of the drives that were in the map before. Give their logs too and they are made anew; the "
+    "{what} made {count} of the drives that were in the map before. Give their logs too, to compute them again; the "
     "first is {first}."
 )
 _CODE = ("code", "versions")
@@ -234,7 +234,7 @@ def _tell_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
     try:
         tell_failures(store, done)
     except (VplogError, OSError) as error:
-        return [f"failures.json does not tell of this batch: {error}"]
+        return [f"failures.json does not list the failures of this batch: {error}"]
     return []
 
 

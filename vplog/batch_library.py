@@ -41,7 +41,9 @@ def map_library(
         store.write_head(map_store.Head(None, settings))
     known = store.head().library
     if known is not None and not store.library(known).is_dir():
-        raise LibraryError(f"{store} has lost its library {known[:12]}. Make the map anew in another folder.")
+        raise LibraryError(
+            f"{store} lacks its library {known[:12]}. Build the map again in another folder with `vplog batch`."
+        )
     made = store.staging / "library"
     if given is not None:
         check_library(given, pipeline)
@@ -49,7 +51,7 @@ def map_library(
         if known not in (None, digest):
             raise LibraryError(
                 f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
-                f"{known[:12]}: they would not compare. Leave --library out, or make another map."
+                f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
             )
         if known is None:
             digest = pipeline.places.load(given, threads).hash  # held against what it says of itself

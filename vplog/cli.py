@@ -6,12 +6,13 @@ import argparse
 import json
 import logging
 import os
+import shlex
 import signal
 import sys
 import threading
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, cast
+from typing import TYPE_CHECKING, NoReturn
 
 import vplog
 from vplog.cli_maps import add_maps
@@ -25,12 +26,21 @@ from vplog.cli_options import (
     topic_options,
     topics_of,
 )
-from vplog.cli_print import Progress, print_evaluation, print_info, print_joint, print_json, print_run, say
+from vplog.cli_parser import Parser
+from vplog.cli_print import (
+    Progress,
+    print_evaluation,
+    print_info,
+    print_joint,
+    print_json,
+    print_line,
+    print_run,
+    say,
+)
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
 from vplog.cores import available, limited
-from vplog.errors import VplogError, was_interrupted
-from vplog.urls import without_secrets
+from vplog.errors import LogError, VplogError, was_interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -39,11 +49,6 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
     Verb = Callable[[argparse.Namespace], None]
-
-_DEMO_NEXT = (
-    "Look at it: a browser opens report.html, Foxglove or rerun result.mcap, evo reads trajectory.tum, DuckDB the "
-    ".parquet files."
-)
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
@@ -59,7 +64,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
-    arguments = _parser().parse_args(argv)
+    arguments = _parser().parse_args(sys.argv[1:] if argv is None else argv)
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
@@ -160,12 +165,18 @@ def info(arguments: argparse.Namespace) -> None:
         from vplog.info_page import write_page
 
         write_page(arguments.html, found)
+    record = found.record
     if arguments.json:
-        print_json(found.record)
-    else:
-        print_info(found.record)
+        print_json(record)
+    elif not arguments.check:
+        print_info(record)
         if arguments.html is not None:
             print(f"page      {arguments.html}")
+    elif record["ready"]:
+        print(f"{arguments.log} can be run: {record['command']}")
+    if arguments.check and not record["ready"]:
+        instead = f" This works: {record['command']}" if record["command"] else ""
+        raise LogError(f"{arguments.log} cannot be run. {' '.join(record['problems'])}{instead}")
 
 
 def library(arguments: argparse.Namespace) -> None:
@@ -182,16 +193,17 @@ def library(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
         return
-    print(
-        f"{arguments.output}: {record['references']} references, {record['features']} features, "
-        f"{state.bits} bits a place, hash {state.hash[:12]}"
-    )
+    text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
+    print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
     for warning in warnings:
         say(f"warning: {warning}")
+    print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
+    from vplog.report import outcome_of
+
     paths, pipeline, library, topics = _asked(arguments)
     # a cache that is sent over the net costs more than it saves
     use_cache = arguments.cache and "://" not in str(arguments.shown)
@@ -216,7 +228,7 @@ def run(arguments: argparse.Namespace) -> None:
     elif "maps" in found:
         print_joint(arguments.shown, found)
     else:
-        print_run(arguments.shown, found)
+        print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
 
 
 def _library_at_hand(library: Path) -> AbstractContextManager[Path]:
@@ -287,6 +299,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from vplog.demo import DemoSettings, make_drive
     from vplog.evaluation import evaluate as evaluate_run
     from vplog.pipeline import run as run_pipeline
+    from vplog.report import outcome_of
     from vplog.retell import report as write_report
 
     pipeline = pipeline_of(arguments)
@@ -304,21 +317,14 @@ def demo(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    print_run(arguments.output / "run", done.record)
-    print(_DEMO_NEXT)
+    out = arguments.output / "run"
+    print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
     print_evaluation(found)
 
 
-class _Parser(argparse.ArgumentParser):
-    """What is wrong with a command, without the tokens of URLs in it."""
-
-    def error(self, message: str) -> NoReturn:
-        super().error(without_secrets(message))
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = cast("argparse.ArgumentParser", _Parser(prog="vplog", description=vplog.__doc__))
-    parser.add_argument("--version", action="version", version=f"vplog {vplog.__version__}")
+    parser = Parser(prog="vplog", description=vplog.__doc__)
+    parser.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print one JSON object")
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -360,11 +366,16 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
     )
     add("config", config, settings)
+    sub = group("help", "What a verb does, and all its options.")
+    sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
+    sub.set_defaults(verb=lambda arguments: parser.parse_args([*arguments.words, "--help"]), debug=False)
     return parser
 
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=place, metavar="LOG")
+    text = "one line alone, and exit status 1 where a run cannot work"
+    sub.add_argument("--check", action="store_true", help=text)
     text = "also write a page with pictures of the drive"
     sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 

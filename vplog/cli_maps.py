@@ -117,7 +117,7 @@ def batch(arguments: argparse.Namespace) -> None:
     if arguments.odometry_file is not None and len(arguments.logs) > 1:
         raise SettingsError(
             f"--odometry-file {arguments.odometry_file} is of one drive, and {len(arguments.logs)} logs are given. "
-            "Give them one by one, each with its own; the map grows."
+            "Give each log by itself with its own file; each command adds a drive to the map."
         )
     with _drive_ahead(arguments), Progress(arguments) as progress:
         from vplog.batch import run_batch, settings_for
@@ -148,7 +148,7 @@ def _end(
             raise ResultError(wrong)
         if found["join_error"]:
             said = f"The drives are in {found['map']}, but not joined: {found['join_error'].rstrip('.')}."
-            raise ResultError(f"{said} When that is mended: vplog map join {found['map']}")
+            raise ResultError(f"{said} Then join them: vplog map join {found['map']}")
 
 
 def info_map(arguments: argparse.Namespace) -> None:
@@ -260,7 +260,7 @@ def add_maps(
     sub.set_defaults(verb=remove_drives)
     sub.add_argument("map", type=place, metavar="MAP")
     sub.add_argument("drives", nargs="+", metavar="DRIVE", help="as `map info` names them")
-    text = "a map anew with another library"
+    text = "describe the drives of a map with another library"
     sub = maps.add_parser("redescribe", help=text, description=redescribe_map.__doc__, parents=[common, threads])
     sub.set_defaults(verb=redescribe_map)
     sub.add_argument("map", type=place, metavar="MAP")
@@ -321,7 +321,7 @@ def _add_batch(sub: argparse.ArgumentParser) -> None:
     _add_workers(sub)
     text = "do not look for closures between the drives at the end"
     sub.add_argument("--no-join", dest="join", action="store_false", help=text)
-    text = "keep what stages came to, 0.35 MB a keyframe, so that other settings need no images; in a map on this disk"
+    text = "keep intermediate results, 0.35 MB a keyframe, so that other settings read no images; local maps only"
     sub.add_argument("--keep-cache", action="store_true", help=text)
     text = "reference library (default: the map's, else one of the first logs)"
     sub.add_argument("--library", type=place, metavar="LIB", help=text)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
 
+STDOUT = Path("-")
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -22,7 +23,7 @@ _MOST = 10**9
 def place(text: str) -> Path:
     """What an argument names: a path, or what is read and written by URL (vplog/remote.py)."""
     if "://" not in text:
-        return Path(text)
+        return _path(text)
     from vplog.remote import located
 
     try:
@@ -34,14 +35,25 @@ def place(text: str) -> Path:
 def local(text: str) -> Path:
     """A folder that is written to bit by bit, which storage by URL is not."""
     if "://" in text:
-        raise argparse.ArgumentTypeError("must be a local folder")
-    return Path(text)
+        raise argparse.ArgumentTypeError(f"must be a local folder, not {text}")
+    return _path(text)
 
 
 def local_file(text: str) -> Path:
     """A single file that is written by those who do not send what they write."""
     if "://" in text:
-        raise argparse.ArgumentTypeError("must be a local file")
+        raise argparse.ArgumentTypeError(f"must be a local file, not {text}")
+    return _path(text)
+
+
+def local_file_or_stdout(text: str) -> Path:
+    """A single local file, or `-`, the standard output."""
+    return STDOUT if text == "-" else local_file(text)
+
+
+def _path(text: str) -> Path:
+    if text == "-":
+        raise argparse.ArgumentTypeError("the standard streams are of no use here: name a path (./- is one too)")
     return Path(text)
 
 
@@ -94,11 +106,12 @@ def resolved(text: str) -> Path:
 
 def at_least(least: int) -> Callable[[str], int]:
     def whole_number(text: str) -> int:
-        value = int(text)
-        if value < least:
-            raise argparse.ArgumentTypeError(f"must be {least} or more")
-        if value > _MOST:
-            raise argparse.ArgumentTypeError(f"must be {_MOST} or less")
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= _MOST:
+            raise argparse.ArgumentTypeError(f"must be a whole number from {least} to {_MOST}, not {text!r}")
         return value
 
     return whole_number
@@ -109,14 +122,22 @@ def at_least_one(text: str) -> int:
 
 
 def not_negative(text: str) -> float:
-    value = float(text)
+    value = _number(text)
     if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError("must be 0 or more")
+        raise argparse.ArgumentTypeError(f"must be a number of 0 or more, not {text!r}")
     return value
 
 
 def positive(text: str) -> float:
-    value = float(text)
+    value = _number(text)
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError("must be more than 0")
+        raise argparse.ArgumentTypeError(f"must be a number above 0, not {text!r}")
     return value
+
+
+def _number(text: str) -> float:
+    """NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

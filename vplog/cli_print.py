@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
+import shutil
 import sys
 import textwrap
 from contextlib import suppress
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from vplog.urls import without_secrets
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
     from pathlib import Path
     from types import TracebackType
 
-    from rich.console import Console
-
     from vplog.batch import Drive
+    from vplog.report import Outcome
+
+
+_UNMOVED_M = 1e-3
+"""m: less is what rounding and the solver's last digits come to."""
 
 
 def say(message: str) -> None:
@@ -26,61 +34,123 @@ def say(message: str) -> None:
         print(f"vplog: {without_secrets(message)}", file=sys.stderr)
 
 
-def print_info(found: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
+def terminal_width() -> int | None:
+    """Columns of the terminal that stdout is; None for a pipe or a file, where a line has no limit."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
+
+def print_line(label: str, text: str) -> None:
+    """A label and a text, wrapped between words where stdout is a terminal: names are whole and can be copied."""
+    line, width = f"{label:10}{' ' if len(label) > 9 else ''}{text}", terminal_width()
+    if width is not None:
+        line = textwrap.fill(
+            line, max(width, 20), subsequent_indent=" " * min(10, width // 4), break_long_words=False,
+            break_on_hyphens=False,
+        )  # fmt: skip
+    print(line)
+
+
+def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Aligned columns, numbers to the right; a block for each row where the terminal is too narrow for them.
+
+    A title may have several lines. No cell is ever shortened, and no name broken.
+    """
+    from rich.cells import cell_len
+
+    cells = [["".join(c if c.isprintable() else repr(c)[1:-1] for c in cell) for cell in row] for row in rows]
+    heads = [list(line) for line in zip_longest(*(title.split("\n") for title in titles), fillvalue="")]
+    widths = [max(map(cell_len, column)) for column in zip(*heads, *cells, strict=True)]
+    right = [all(re.fullmatch(r"[-+.\d]*", cell) for cell in column) for column in zip(*cells, strict=True)]
+    width = terminal_width()
+    if width is None or sum(widths) + 2 * len(widths) <= width:
+        for row in heads + cells:
+            blanks = [" " * (wide - cell_len(cell)) for wide, cell in zip(widths, row, strict=True)]
+            texts = (
+                blank + cell if number else cell + blank
+                for blank, cell, number in zip(blanks, row, right or [False] * len(row), strict=True)
+            )
+            print("  ".join(texts).rstrip())
+        return
+    for first, *others in cells:
+        print(first)
+        named = zip(titles[1:], others, strict=True)
+        print_line("", ", ".join(f"{' '.join(title.split())} {cell}" for title, cell in named if cell))
+
+
+def print_next(look: str, *commands: str) -> None:
+    """Where to look at what came of it, and the commands that go on from there, each on a line to be copied."""
+    print_line("look at", look)
+    for command in commands:
+        print(f"{'next':10}{command}")
+
+
+def print_info(found: dict[str, Any]) -> None:
     from vplog.info import in_words
 
     seconds = max(found["end_ns"] - found["start_ns"], 0) / 1e9
-    print(f"log       {found['path']}\nkind      {found['kind']}, {found['messages']} messages over {seconds:.1f} s")
-    table = Table("topic", "type", "count", "Hz", "role", "used", "why", box=None)
+    print(f"log       {found['path']}")
+    print_line("kind", f"{found['kind']}, {found['messages']} messages over {seconds:.1f} s")
+    rows = []
     for topic in found["topics"]:
         rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f}"
         used = "yes" if topic["used"] else ""
-        cells = (topic["name"], topic["type"], str(topic["count"]), rate, topic["role"], used, topic["why"])
-        table.add_row(*(escape(cell) for cell in cells))
-    console(sys.stdout).print(table)
+        rows.append((topic["name"], topic["type"], str(topic["count"]), rate, topic["role"], used, topic["why"]))
+    print_table(("topic", "type", "count", "Hz", "role", "used", "why"), rows)
     for name, text in in_words(found):
-        print(f"{name:10}{text}")
+        print_line(name, text)
     for gap in found["gaps"]:
-        print(f"gap       {gap['seconds']:.1f} s without {gap['what']}, {gap['after_s']:.1f} s behind the start")
-    for warning in found["warnings"]:
-        print(f"warning   {warning}")
-    for problem in found["problems"]:
-        print(f"problem   {problem}")
-    print(f"run       {found['command']}")
+        print_line("gap", f"{gap['seconds']:.1f} s without {gap['what']}, {gap['after_s']:.1f} s after the start")
+    for kind in ("warning", "problem"):
+        for text in found[f"{kind}s"]:
+            print_line(kind, text)
+    if found["command"]:
+        print(f"{'run' if found['ready'] else 'this works':10} {found['command']}")
 
 
-def print_run(out: Path, record: dict[str, Any]) -> None:
+def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
+    """`outcome` is that of the run folder; `out` is what the user called it."""
     from vplog.data import Verdict
 
-    counts = record["counts"]
-    print(f"{out}: {counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates")
+    counts, totals, named = record["counts"], record["totals"], shlex.quote(str(out))
+    print_line(f"{out}:", _came_of(outcome, record))
+    print_line("", f"{counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates:")
     for name, count in counts["verdicts"].items():
-        print(f"  {count:6d} {name}: {Verdict(name).sentence}")
-    print(f"  {record['solution']['reason']}")
+        print_line(f"{count:9d}", f"{name}: {Verdict(name).sentence}")
     for warning in record["warnings"]:
         say(f"warning: {warning}")
-    totals = record["totals"]
-    print(f"  {totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+    print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+    commands = [f"vplog evaluate {named} --truth FILE.tum", f"vplog export {named} --format kitti -o FILE"]
+    if outcome.closures:
+        commands.insert(1, f"vplog explain {named} --worst")
+    print_next(f"{out}/report.html in a browser, {out}/result.mcap in Foxglove", *commands)
+
+
+def _came_of(outcome: Outcome, record: dict[str, Any]) -> str:
+    if outcome.moved_m < _UNMOVED_M:  # the reason is what the user needs, whatever its words
+        return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
+    closures = f"{outcome.closures} closure{'' if outcome.closures == 1 else 's'}"
+    places = f"{outcome.places} place{'' if outcome.places == 1 else 's'}"
+    causes = [f"{closures} at {places}"] if outcome.closures else []
+    causes += ["the satellite fixes"] if record["gps"] else []
+    return f"the trajectory moved by up to {outcome.moved_m:.2f} m{', by ' if causes else ''}{' and '.join(causes)}"
 
 
 def print_joint(out: Path, record: dict[str, Any]) -> None:
     for number, found in enumerate(record["maps"]):
-        print(f"{out}: map {number}: {', '.join(found['drives'])}")
-        if found["reason"]:
-            print(f"  {found['reason']}")
+        several = f" in one frame, map{number}.g2o" if len(found["drives"]) > 1 else " by itself"
+        print_line(f"{out}:", f"{', '.join(found['drives'])}{several}")
     for tie in record["joins"]:
-        residual = "" if tie["kept"] == 0 else f", median {tie['median_residual_sigma']:.2f} sigma"
-        print(
-            f"  {tie['query_drive']} to {tie['match_drive']}: {tie['candidates']} candidates, "
-            f"{tie['verified']} verified, {tie['kept']} kept{residual}"
-        )
+        text = f"{tie['kept']} closures of {tie['candidates']} candidates"
+        print_line("", f"{tie['query_drive']} to {tie['match_drive']}: {text}")
     for warning in record["warnings"]:
         say(f"warning: {warning}")
-    totals = record["totals"]
-    print(f"  {totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+    totals, named = record["totals"], shlex.quote(str(out))
+    print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+    first = shlex.quote(f"{out}/{record['maps'][0]['drives'][0]}")
+    print_next(
+        f"{out}/DRIVE/report.html, and {out}/DRIVE/joint_trajectory.tum of each drive in a map of several",
+        f"vplog evaluate {named} --truth FILE.tum", f"vplog export {first} --format kitti -o FILE",
+    )  # fmt: skip
 
 
 def print_evaluation(found: dict[str, Any]) -> None:
@@ -200,7 +270,7 @@ def print_explanation(told: dict[str, Any]) -> None:
         ("solver", told["solver"]),
         ("to change", told["change"]),
     ):
-        print(textwrap.fill(text, 110, initial_indent=f"{name:10}", subsequent_indent=" " * 10))
+        print_line(name, text)
     if told["picture"]:
         print(f"{'picture':10}{told['picture']['file']}")
 
@@ -222,38 +292,33 @@ _BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
 
 
 def print_batch(found: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table("drive", "state", box=None, pad_edge=False)
-    for title in ("keyframes", "closures", "attempts", "seconds", "peak MB"):
-        table.add_column(title, justify="right")
-    table.add_column("worker")
-    table.add_column("error", overflow="fold")
+    rows = []
     for drive in found["drives"]:
         computed = drive["state"] == "computed"
         counts = [str(drive[name]) if computed else "" for name in ("keyframes", "accepted")]
         counts += [str(drive["attempts"] or "")]
         counts += [f"{drive[name]:.{digits}f}" if drive[name] else "" for name, digits in _BATCH_COSTS]
-        table.add_row(escape(drive["drive"]), drive["state"], *counts, escape(drive["worker"]), escape(drive["error"]))
-    console(sys.stdout).print(table)
-    print(
-        f"{found['map']}: {len(found['drives'])} drives, {found['failed']} failed, {found['seconds']:.1f} s, "
-        f"{found['jobs']} at once, {found['threads_per_job']} threads each"
+        rows.append((drive["drive"], drive["state"], *counts, drive["worker"], drive["error"]))
+    titles = ("drive", "state", "keyframes", "closures", "attempts", "seconds", "peak MB", "worker", "error")
+    print_table(titles, rows)
+    print_line(
+        f"{found['map']}:",
+        f"{len(found['drives'])} drives, {found['failed']} failed, {found['seconds']:.1f} s, {found['jobs']} at once, "
+        f"{found['threads_per_job']} threads each",
     )
     for component in (found["joined"] or {}).get("components", []):
-        print(f"together  {', '.join(component['drives'])}")
+        print_line("together", ", ".join(component["drives"]))
     for drive in found["drives"]:
         for warning in drive["warnings"]:
             say(f"warning: {drive['drive']}: {warning}")
     for warning in found["warnings"] + (found["joined"] or {}).get("warnings", []):
         say(f"warning: {warning}")
+    named = shlex.quote(str(found["map"]))
+    look = f"{found['map']}/runs/drive=ID/report.html of each drive"
+    print_next(look, f"vplog map info {named}", f"vplog map query {named} LOG")
 
 
 def print_map(found: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
     known = found["library"]
     each = "" if found["bytes_per_place"] is None else f", {found['bytes_per_place']:g} bytes a place"
     print(
@@ -269,14 +334,12 @@ def print_map(found: dict[str, Any]) -> None:
         joined = sum(len(one["drives"]) for one in found["components"])
         groups = len(found["components"])
         print(f"joined    {joined} drives in {groups} group{'' if groups == 1 else 's'}, each in one frame")
-    table = Table("drive", box=None, pad_edge=False)
-    for title in ("keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"):
-        table.add_column(title, justify="right")
+    rows = []
     for drive in found["drives"]:
         counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
         costs = (f"{value or 0:.1f}" for value in (drive["bytes"] / 1e6, drive["seconds"], drive["peak_memory_mb"]))
-        table.add_row(escape(drive["drive"]), *counts, *costs)
-    console(sys.stdout).print(table)
+        rows.append((drive["drive"], *counts, *costs))
+    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"), rows)
     for drive, failure in found["failures"].items():
         say(f"failed: {drive}: {failure['error']}")
     for problem in found["problems"]:
@@ -312,7 +375,7 @@ def print_merge(found: dict[str, Any]) -> None:
     taken = sum(one["state"] != "there already" for one in found["drives"])
     print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
     if any(one["state"] == "taken" for one in found["drives"]):
-        print(f"What joins them: vplog map join {found['map']}")
+        print(f"next      vplog map join {shlex.quote(str(found['map']))}")
 
 
 def print_redescribed(found: dict[str, Any]) -> None:
@@ -326,17 +389,12 @@ def print_redescribed(found: dict[str, Any]) -> None:
 
 def print_answers(found: dict[str, Any]) -> None:
     """The best place of every view; all of them are in the file and in the JSON."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table("view", "drive", box=None, pad_edge=False)
-    for title in ("keyframe", "score", "support"):
-        table.add_column(title, justify="right")
-    for answer in found["answers"]:
-        if answer["rank"] == 0:
-            numbers = (str(answer["keyframe"]), f"{answer['score']:.3f}", str(answer["support"]))
-            table.add_row(str(answer["query"]), escape(answer["drive"]), *numbers)
-    console(sys.stdout).print(table)
+    rows = [
+        (str(one["query"]), one["drive"], str(one["keyframe"]), f"{one['score']:.3f}", str(one["support"]))
+        for one in found["answers"]
+        if one["rank"] == 0
+    ]
+    print_table(("view", "drive", "keyframe", "score", "support"), rows)
     for warning in found["warnings"]:
         say(f"warning: {warning}")
     print(f"{found['log']}: {found['answered']} of {found['views']} views are like a place of {found['map']}")
@@ -345,72 +403,63 @@ def print_answers(found: dict[str, Any]) -> None:
 
 
 def print_comparison(found: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    print(
-        f"{found['queries']} queries, {found['positives']} with a true match, against {found['map_frames']} frames; "
-        f"library of {found['library']['size']} images"
+    print_line(
+        f"{found['queries']}",
+        f"queries, {found['positives']} with a true match, against {found['map_frames']} frames; library of "
+        f"{found['library']['size']} images",
     )
-    table = Table(box=None, pad_edge=False)
-    table.add_column("method", overflow="fold")  # what gives way where the terminal is narrow
-    for title in ("R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms"):
-        table.add_column(title, justify="right", no_wrap=True)
     shares = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1")
+    rows: list[Sequence[str]] = []
     for name, method in found["methods"].items():
         costs = [f"{method['bytes_per_image']:g}"]
         costs += [f"{method[cost]:.2f}" for cost in ("encode_ms", "query_ms")]
-        table.add_row(escape(name), *(f"{method[share]:.3f}" for share in shares), *costs)
+        rows.append((name, *(f"{method[share]:.3f}" for share in shares), *costs))
         if "sequence" in method:
-            by_sequence = method["sequence"]
-            table.add_row(f"  L={by_sequence['length']}", *(f"{by_sequence[share]:.3f}" for share in shares))
-    console(sys.stdout).print(table)
+            scores = method["sequence"]
+            rows.append((f"  L={scores['length']}", *(f"{scores[share]:.3f}" for share in shares), "", "", ""))
+    titles = ("method", "R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms")
+    print_table(titles, rows)
     for warning in found["warnings"]:
         say(f"warning: {warning}")
 
 
 def print_study(out: Path, found: dict[str, Any]) -> None:
     """Methods by pair of drives, departures from the paper, and where the rest is."""
-    from rich.markup import escape
-    from rich.table import Table
-
     done = found["experiments"]
     scores = ("r_at_1", "anr", "ap")
     if "pairs" in done:
-        table = Table(box=None, pad_edge=False)
-        table.add_column("R@1 / ANR %", overflow="fold")
         rows = done["pairs"]["rows"]
-        for query, other in dict.fromkeys((row["query"], row["map"]) for row in rows):
-            table.add_column(escape(f"{query}\nin {other}"), justify="right")
-        for title in ("mean", "worst", "bytes"):
-            table.add_column(title, justify="right", no_wrap=True)
+        pairs = dict.fromkeys((row["query"], row["map"]) for row in rows)
+        table = []
         for mean in done["pairs"]["mean"]:
             cells = [f"{r['r_at_1']:.2f} / {r['anr']:.2f}" for r in rows if r["method"] == mean["method"]]
             cells += [f"{mean['r_at_1']:.3f} / {mean['anr']:.2f}"]
             cells += [f"{mean['r_at_1_worst']:.2f} / {mean['anr_worst']:.2f}", f"{mean['bytes_per_image']:g}"]
-            table.add_row(escape(mean["method"]), *cells)
-        console(sys.stdout).print(table)
+            table.append((mean["method"], *cells))
+        print_table(("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes"), table)
     if "sizes" in done:
-        table = Table("library size", "method", "R@1", "ANR %", "AP", box=None, pad_edge=False)
-        for row in done["sizes"]["mean"]:
-            table.add_row(str(row["size"]), escape(row["method"]), *(f"{row[score]:.3f}" for score in scores))
-        console(sys.stdout).print(table)
+        table = [
+            (str(row["size"]), row["method"], *(f"{row[score]:.3f}" for score in scores))
+            for row in done["sizes"]["mean"]
+        ]
+        print_table(("library size", "method", "R@1", "ANR %", "AP"), table)
     if "ablations" in done:
-        table = Table("bobb without", "setting", "R@1", "ANR %", "AP", box=None, pad_edge=False)
-        for row in done["ablations"]["rows"]:
-            changes = [f"{row[f'{score}_change']:+.3f}" for score in scores]
-            table.add_row(escape(row["name"]), escape(row["setting"]), *changes)
-        console(sys.stdout).print(table)
+        table = [
+            (row["name"], row["setting"], *(f"{row[f'{score}_change']:+.3f}" for score in scores))
+            for row in done["ablations"]["rows"]
+        ]
+        print_table(("bobb without", "setting", "R@1", "ANR %", "AP"), table)
     for warning in found["warnings"]:
         say(f"warning: {warning}")
     figures = sum(len(one["figures"]) for one in done.values()) // 2
-    print(f"{out}: study.json, and {figures} figures as PNG and SVG")
+    print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")
 
 
 class Progress:
     """Bars with an ETA on a terminal's stderr; silence elsewhere."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
+        from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
         from rich.progress import TimeRemainingColumn as Eta
 
@@ -419,7 +468,7 @@ class Progress:
         self._bars = Progress(
             TextColumn("{task.description:<18}", markup=False),
             BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
-            console=console(sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
+            console=Console(file=sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
         )  # fmt: skip
 
     def __enter__(self) -> Progress:
@@ -438,16 +487,6 @@ class Progress:
         """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
         if self._line_by_line:
             say(f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}")
-
-
-def console(stream: Any) -> Console:
-    from rich.console import Console
-
-    class Told(Console):
-        def on_broken_pipe(self) -> None:
-            raise BrokenPipeError  # main() decides what comes of it; rich would exit with 1
-
-    return Told(file=stream, width=None if stream.isatty() else 160)
 
 
 def print_json(tree: dict[str, Any]) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import re
+import sys
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from vplog.cli_options import local_file, place, positive, topics_of
+from vplog.cli_options import STDOUT, local_file, local_file_or_stdout, place, positive, topics_of
 from vplog.cli_print import print_evaluation, print_explanation, print_json, print_optimised
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from vplog.evaluation import TruthOptions
 
@@ -22,6 +25,7 @@ _MOST_OFFSET_S = 1e9
 """s; thirty years, from any clock that starts at zero to one of today."""
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
 """Those of export.py, here too since that imports numpy."""
+_BINARY = ("geoparquet", "rrd")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -85,10 +89,11 @@ def export(arguments: argparse.Namespace) -> None:
     """A finished run in the format of another tool."""
     from vplog.export import export as export_run
 
-    found = export_run(arguments.run, arguments.format, arguments.output)
+    with _file_or_stdout(arguments, arguments.format in _BINARY) as path:
+        found = export_run(arguments.run, arguments.format, path)
     if arguments.json:
         print_json(found)
-    else:
+    elif path == arguments.output:
         print("\n".join(found["written"]))
 
 
@@ -112,6 +117,25 @@ def _add_truth_options(sub: argparse.ArgumentParser) -> None:
     )
 
 
+@contextmanager
+def _file_or_stdout(arguments: argparse.Namespace, binary: bool = False) -> Iterator[Path]:
+    """The file to write: the one that -o names; for `-` a scratch file that goes to stdout when it is whole."""
+    if arguments.output is not STDOUT:  # ./- is a file
+        yield arguments.output
+        return
+    from vplog.errors import SettingsError
+    from vplog.scratch import scratch
+
+    if arguments.json:
+        raise SettingsError("-o - and --json both write to stdout. Leave out one, or name a file with -o.")
+    if binary and sys.stdout.isatty():
+        raise SettingsError(f"{arguments.format} is binary and stdout a terminal. Name a file with -o, or use a pipe.")
+    with scratch("stdout") as folder:
+        yield folder / "out"
+        sys.stdout.buffer.write((folder / "out").read_bytes())
+        sys.stdout.buffer.flush()
+
+
 def add_results(
     add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
 ) -> None:
@@ -129,9 +153,10 @@ def add_results(
     sub = add("export", export)
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    sub.add_argument("-o", "--output", type=local_file, required=True, metavar="FILE", help="file to write")
+    text = "file to write; - is stdout"
+    sub.add_argument("-o", "--output", type=local_file_or_stdout, required=True, metavar="FILE", help=text)
     sub = add("optimize", optimize)
-    sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
+    sub.add_argument("graph", type=local_file, metavar="GRAPH.g2o")
     sub.add_argument(
         "-o", "--output", type=place, required=True, metavar="OUT", help="the graph at its solved poses, as g2o"
     )
@@ -161,6 +186,7 @@ def _seconds(text: str) -> float:
 
 def _closure(text: str) -> tuple[int, ...]:
     parts = text.split(":")
-    if len(parts) > 2:
-        raise argparse.ArgumentTypeError("must be K or QUERY:MATCH")
+    if len(parts) > 2 or not all(re.fullmatch("-?[0-9]{1,20}", part) for part in parts):
+        what = "must be a row of closures.parquet (K), or two keyframes by row or stamp in ns (QUERY:MATCH)"
+        raise argparse.ArgumentTypeError(f"{what}, not {text!r}")
     return tuple(int(part) for part in parts)

@@ -106,8 +106,8 @@ def _truth_options() -> argparse.ArgumentParser:
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("query", type=place, metavar="QUERY", help="drive whose frames are looked for")
-    sub.add_argument("map", type=place, nargs="?", metavar="MAP", help="drive they are looked for in (default: QUERY)")
+    sub.add_argument("query", type=place, metavar="QUERY", help="drive whose frames are recognised")
+    sub.add_argument("map", type=place, nargs="?", metavar="MAP", help="drive that is searched (default: QUERY)")
     sub.add_argument(
         "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
     )

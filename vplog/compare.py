@@ -173,7 +173,9 @@ def _extract_all(
         references = walk.references
         warnings += walk.warnings
     if len(references) < (wanted.size or 0):
-        warnings.append(f"The library has {len(references)} images instead of {wanted.size}: its drive has no more.")
+        warnings.append(
+            f"The library has {len(references)} images instead of {wanted.size}: its drive has no more frames."
+        )
     return map_walk, query_walk, references, warnings
 
 
@@ -207,7 +209,9 @@ def check_truth(known: PlaceTruth, query: Log, other: Log, min_gap: int | None) 
             outside = len(log.stamps()) - len(frames)
             warnings.append(f"{log.name}: {outside} of {len(log.stamps())} frames have no truth and are left out.")
     if known.about["source"] == "poses" and query is not other:
-        warnings.append("--truth poses takes the odometry of both drives to be in one frame.")
+        warnings.append(
+            "--truth poses assumes that the odometry of both drives is in one frame; else give a TUM file for each."
+        )
     return warnings
 
 

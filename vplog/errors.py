@@ -1,5 +1,13 @@
 """The error tree. Every message says what happened, where, and what to do next; only cli.py prints and exits."""
 
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
 
 class VplogError(Exception):
     """A known failure that a user can act on: one line, no traceback."""
@@ -42,3 +50,15 @@ def was_interrupted(error: BaseException | None) -> bool:
         seen.add(id(error))
         error = error.__cause__ or error.__context__
     return False
+
+
+def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, cutoff: float = 0.6) -> str:
+    """` Did you mean X?`, X the choice whose spelling (by `key`) is nearest to a mistyped name; empty where none is.
+
+    `cutoff` is difflib's least similarity, 0..1; its own default 0.6 lets two swapped letters of three pass.
+    """
+    spelled: dict[str, str] = {}
+    for choice in choices:
+        spelled.setdefault(key(choice).lower(), choice)
+    found = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=cutoff)
+    return f" Did you mean {spelled[found[0]]}?" if found else ""

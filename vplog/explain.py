@@ -97,7 +97,7 @@ def worst(closures: Closures, _keyframes: Keyframes) -> int:
 
 def _part(record: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
     if not isinstance(record.get(name), dict):
-        raise ResultError(f"{folder}/run.json lacks {name}. Run `vplog run` again to write it anew.")
+        raise ResultError(f"{folder}/run.json lacks {name}. Write it again with `vplog run`.")
     return record[name]
 
 
@@ -133,7 +133,7 @@ def _boxes(
 ) -> tuple[list[SharedBoxes], str]:
     """What both views share on the library's references, or why that is not known."""
     if not row["shared_references"]:
-        return [], f"{pipeline.places.kind} tells of no reference that both views share"
+        return [], f"{pipeline.places.kind} names no reference that both views share"
     try:
         with library_at(folder, record) as library:
             state = pipeline.places.load(library, 1)

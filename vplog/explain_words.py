@@ -91,7 +91,7 @@ def _geometry(row: Row) -> str:
     said[0] += f"; {row['inliers']} agree with one geometry" if row["inliers"] else "; none agree with one geometry"
     said[0] += f" and cover {100 * row['spread']:.0f} % of the image." if row["spread"] else "."
     if row["reverse_inliers"] >= 0:
-        said.append(f"Looked at the other way round, {row['reverse_inliers']} agree.")
+        said.append(f"Checked in reverse, {row['reverse_inliers']} agree.")
     if row["tx"] is not None:
         moved = np.array([row["tx"], row["ty"], row["tz"]])
         turn = geometry.rotation(np.array([row["qx"], row["qy"], row["qz"], row["qw"]]))

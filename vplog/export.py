@@ -56,7 +56,7 @@ def _copy(source: Path, path: Path) -> None:
     try:
         data = source.read_bytes()
     except OSError as error:
-        raise ResultError(f"Cannot read {source}: {error.strerror}. Run `vplog run` again to write it anew.") from None
+        raise ResultError(f"Cannot read {source}: {error.strerror}. Write it again with `vplog run`.") from None
     with replacing(path) as stream:
         stream.write(data)
 
@@ -65,7 +65,7 @@ def _earth(folder: Path, kind: str, tracks: Tracks) -> Earth:
     if tracks.earth is None:
         others = ", ".join(one for one in FORMATS if not one.startswith("geo"))
         raise ResultError(
-            f"The run in {folder} has no three satellite fixes within the drive, so {kind} has no place on earth for "
-            f"it. Other formats: {others}."
+            f"{folder} has fewer than three satellite fixes, so no place on earth, which {kind} needs. "
+            f"Other formats: {others}."
         )
     return tracks.earth

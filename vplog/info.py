@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,8 @@ PICTURE_PX = 480
 _GAP_S = 1.0
 """s without a message that count as a gap, where they are also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
+_MOST_TRIED = 4
+"""Other topics that are tried where those chosen do not work: each reads the log again."""
 _MOST_GAPS = 20
 """Gaps that are listed, the longest."""
 _OPTIONS = {
@@ -63,8 +66,31 @@ class Preflight:
 
 
 def preflight(path: Path, topics: TopicChoice | None = None) -> Preflight:
-    """Read the chosen topics once and decode a few frames. Raises LogError where the log cannot be opened."""
-    topics = topics or logs.TopicChoice()
+    """Read the chosen topics once and decode a few frames. Raises LogError where the log cannot be opened.
+
+    Where a run cannot work, other topics are tried in the same way, and the record's `command` is one that works.
+    """
+    found = _look(path, topics or logs.TopicChoice())
+    if found.record["problems"]:
+        found.record["command"] = _working(path, topics or logs.TopicChoice(), found)
+    return found
+
+
+def _working(path: Path, topics: TopicChoice, found: Preflight) -> str | None:
+    """A run with another camera or odometry topic, or, with images alone, a library; None where nothing works."""
+    unused = [topic for topic in found.record["topics"] if topic["count"] and not topic["used"]]
+    for topic in [topic for topic in unused if topic["role"] in ("image", "odometry")][:_MOST_TRIED]:
+        file = {"odometry_file": None} if topic["role"] == "odometry" else {}
+        choice = topics.model_copy(update={topic["role"]: topic["name"], **file})
+        with suppress(LogError):
+            if _look(path, choice).record["ready"]:
+                return command(path, choice)
+    images = topics.model_copy(update={"odometry": None, "odometry_file": None})
+    return command(path, images).replace("vplog run", "vplog library", 1) if found.pictures else None
+
+
+def _look(path: Path, topics: TopicChoice) -> Preflight:
+    """What is there with these topics, whose `command` runs on it where nothing is in the way."""
     log = logs.open(path, topics)
     found = log.info()
     problems: list[str] = []
@@ -153,7 +179,10 @@ def _keyframes(
         problems.append(str(error))
         return None, []
     if len(keyframes.stamp_ns) < 2:
-        problems.append("By the odometry nothing moves far enough for a second keyframe, and a graph needs two.")
+        problems.append(
+            "By the odometry nothing moves far enough for a second keyframe, and a graph needs two. Choose another "
+            "odometry with --odometry-topic or --odometry-file."
+        )
     return len(keyframes.stamp_ns), missing
 
 

@@ -68,7 +68,7 @@ def page(found: Preflight) -> str:
         f'<p class="dim">{escape(record["kind"])}, {record["messages"]} messages over {seconds:.1f} s</p>',
         ready,
         *_lines("Problems", "bad", record["problems"]),
-        f"<h2>Command</h2><pre>{escape(record['command'])}</pre>",
+        *([f"<h2>Command</h2><pre>{escape(record['command'])}</pre>"] if record["command"] else []),
         *_lines("Warnings", "warn", record["warnings"]),
         f"<h2>What would be used</h2><dl>{''.join(_facts(record))}</dl>",
         *_pictures(found.pictures, record["start_ns"]),

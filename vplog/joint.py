@@ -236,7 +236,10 @@ def _told(
         warnings.append(f"Closures of {later} to {earlier} were not enough to join them. {reason.strip()}")
     if len(joined.maps) > 1:
         single = [drives[members[0]].name for members in joined.maps if len(members) == 1]
-        warnings += [f"{name} joins no other drive and is kept apart, in its own frame." for name in single]
+        warnings += [
+            f"{name} has too few closures with other drives (join.least_closures) and stays in its own frame."
+            for name in single
+        ]
     warnings += [f"{alone.name}: {text}" for alone in drives for text in alone.done.record["warnings"]]
     about = [
         {"name": alone.name, "folder": alone.name, "keyframes": len(alone.done.keyframes.stamp_ns), "map": number}

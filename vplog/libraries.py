@@ -61,7 +61,7 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
     for name, value in pipeline.places:
         if getattr(made, name) != value:
             raise LibraryError(
-                f"{folder} was made with places.{name}={getattr(made, name)}, and this run asks for {value}. "
+                f"{folder} was made with places.{name}={getattr(made, name)}, and this run has {value}. "
                 f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
             )
 

@@ -7,7 +7,7 @@ import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.errors import SettingsError
+from vplog.errors import SettingsError, nearest
 from vplog.pipeline import load_pipeline
 from vplog.places import PlaceSettings
 from vplog.settings import override
@@ -45,7 +45,8 @@ def read_method(text: str, pipeline: Pipeline) -> Any:
         except SettingsError as error:
             if Path(name).suffix in (".yaml", ".yml"):
                 raise
-            raise SettingsError(f"No method {name!r}. Methods: {', '.join(sorted(known))}. {error}") from None
+            methods = f"Methods: {', '.join(sorted(known))}."
+            raise SettingsError(f"No method {name!r}.{nearest(name, known)} {methods} {error}") from None
     tree = chosen.model_dump(mode="json")
     for assignment in assignments:
         try:

@@ -93,7 +93,9 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
         poses[rows], weight[edges] = solution.world_from_body, solution.weight
         solutions.append(replace(solution, reason=where + solution.reason))
     if not solutions:
-        raise GraphError("No edge joins two poses, so there is nothing to solve.")
+        raise GraphError(
+            "No edge joins two poses, so there is nothing to solve. Give a graph with edges between two poses."
+        )
     return Solution(
         poses,
         weight,

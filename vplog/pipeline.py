@@ -14,7 +14,7 @@ from vplog import logs, record
 from vplog.back_end import about_gps, back_end
 from vplog.cores import limited
 from vplog.data import Closures, EdgeKind, Keyframes, Reference
-from vplog.errors import SettingsError
+from vplog.errors import SettingsError, nearest
 from vplog.features.sift import SiftSettings
 from vplog.graph import consistency
 from vplog.graph.cross_check import CrossCheckSettings
@@ -122,8 +122,9 @@ def load_pipeline(name: str, assignments: Iterable[str] = ()) -> Pipeline:
         shipped = pipeline_folder()
         path = shipped / f"{name}.yaml"
         if not path.is_file():
-            known = ", ".join(sorted(file.stem for file in shipped.glob("*.yaml")))
-            raise SettingsError(f"No pipeline {name!r}. Pipelines: {known}, or the path of a .yaml file.")
+            known = sorted(file.stem for file in shipped.glob("*.yaml"))
+            choices = f"Pipelines: {', '.join(known)}, or the path of a .yaml file."
+            raise SettingsError(f"No pipeline {name!r}.{nearest(name, known)} {choices}")
     return pipeline_from(load_yaml(path), path.name, assignments)
 
 
@@ -131,7 +132,7 @@ def pipeline_from(tree: dict[str, Any], where: str, assignments: Iterable[str] =
     """A pipeline from a tree of settings, with `a.b=c` overrides. Raises SettingsError."""
     for assignment in assignments:
         tree = override(tree, assignment)
-    return Pipeline.read(tree, f"{where} and --set" if assignments else where)
+    return Pipeline.read(tree, where, assignments)
 
 
 def pipeline_schema() -> dict[str, Any]:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vplog import geodesy, geometry
 from vplog.data import Trajectory
+from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
 from vplog.results.atomic import replacing
 from vplog.results.report.content import Content
@@ -38,6 +41,29 @@ def write_report(
     with replacing(path) as stream:
         stream.write(text.encode())
     return path
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run changed of the odometry."""
+
+    moved_m: float
+    """Largest distance between a corrected and an odometry position, both from the same first pose."""
+    closures: int
+    """Loop closures with more than half their weight."""
+    places: int
+    """Those of them that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
+
+
+def outcome_of(folder: Path, spacing: int) -> Outcome:
+    """Raises ResultError where a table of the run is missing or damaged."""
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    closures = tables.read_closures(folder / "closures.parquet")
+    first_from_odom = after.world_from_body[0] @ geometry.inverse(odometry.odom_from_body[0])
+    moved = (after.world_from_body - first_from_odom @ odometry.odom_from_body)[:, :3, 3]
+    used = closures.weight > 0.5  # NaN where the solver never had it
+    places = min(spaced_apart(one[used].astype(np.int64), spacing) for one in (closures.query, closures.match))
+    return Outcome(float(np.linalg.norm(moved, axis=1).max()), int(used.sum()), places)
 
 
 @dataclass(frozen=True, eq=False)

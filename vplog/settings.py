@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import reprlib
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from vplog.errors import SettingsError
+from vplog.errors import SettingsError, nearest
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
 
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 """What the parser raises: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
+
+_A_SETTING = "`vplog config` prints every setting."
+_A_FILE = "`vplog config` prints one that is."
 
 
 class Settings(BaseModel):
@@ -24,33 +29,129 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
     @classmethod
-    def read(cls, tree: dict[str, Any], where: str) -> Self:
-        """Check a tree of plain values. Raises SettingsError with the first thing that does not fit."""
+    def read(cls, tree: dict[str, Any], where: str, assignments: Iterable[str] = ()) -> Self:
+        """Validate a tree of plain values; `assignments` are the `a.b=c` that overrode values of the file `where`.
+
+        Raises SettingsError for the first value that does not fit: its place, its name, what is allowed, the nearest
+        name.
+        """
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            first = error.errors()[0]
-            name = ".".join(str(part) for part in first["loc"]) or "the top level"
-            raise SettingsError(
-                f"{where}: {name}: {first['msg']} (got {reprlib.repr(first['input'])[:80]}). "
-                "`vplog config` prints every setting with its default."
-            ) from None
+            name, text = _explain(error.errors()[0], _schema(cls))
+            parts = name.split(".")
+            set_by = [one for one in assignments if _same_branch(one.partition("=")[0].split("."), parts)]
+            place = f"--set {set_by[-1]}" if set_by else where
+            raise SettingsError(f"{place}: {text} {_A_SETTING}") from None
+
+
+@cache
+def _schema(settings: type[Settings]) -> dict[str, Any]:
+    return settings.model_json_schema()
+
+
+def _same_branch(one: list[str], other: list[str]) -> bool:
+    return all(a == b for a, b in zip(one, other, strict=False))
+
+
+def _explain(error: Any, schema: dict[str, Any]) -> tuple[str, str]:
+    """Dotted name of the setting that an error of pydantic is about, and what is wrong with it, in sentences."""
+    path, node, group = _located(error["loc"], schema)
+    kind, value = error["type"], error["input"]
+    if kind.startswith("union_tag"):  # the group's `kind` names none of its methods
+        path, value = [*path, "kind"], value.get("kind") if isinstance(value, dict) else None
+        node = {"enum": sorted(node["discriminator"]["mapping"])}
+    name = ".".join(path)
+    if kind == "value_error":  # raised by a validator of these settings, in words
+        return name, f"{name}{': ' if name else ''}{error['ctx']['error']}."
+    if not node:
+        return name, f"{name} is no setting.{_other_names(path, list(group.get('properties', {})), schema)}"
+    given = "null" if value is None else reprlib.repr(value)[:80]
+    near = nearest(value, map(str, node.get("enum", ()))) if isinstance(value, str) else ""
+    return name, f"{name or 'it'} must be {_allowed(node)}, not {given}.{near}"
+
+
+def _other_names(path: list[str], siblings: list[str], schema: dict[str, Any]) -> str:
+    """The settings that may be meant by the unknown one at `path`, in a sentence: nearest, then those beside it."""
+    *groups, name = path
+    methods = schema["properties"].get(path[0], {}).get("discriminator", {}).get("mapping", {})
+    kinds = [kind for kind, at in methods.items() if name in _resolved({"$ref": at}, schema)["properties"]]
+    if kinds and len(path) == 2:
+        return f" It belongs to {path[0]}.kind={' or '.join(kinds)}."
+    names = [".".join([*groups, one]) for one in siblings]
+    near = nearest(name, names, key=_last) or nearest(name, _names(schema), key=_last, cutoff=0.8)
+    return near or f" Settings{' of ' if groups else ''}{'.'.join(groups)}: {', '.join(siblings)}."
+
+
+def _last(name: str) -> str:
+    return name.rsplit(".", 1)[-1]
+
+
+def _located(loc: Sequence[str | int], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any], dict[str, Any]]:
+    """Names on the way to a setting, its JSON schema (empty where it has none), and that of the group it is in."""
+    path, node, group = [], schema, schema
+    for part in loc:
+        if "discriminator" in node and part in node["discriminator"]["mapping"]:  # the method, which no name holds
+            node = _resolved({"$ref": node["discriminator"]["mapping"][part]}, schema)
+        elif "anyOf" not in node and part != "[key]":
+            group, inner = node, node.get("items") if isinstance(part, int) else node.get("properties", {}).get(part)
+            path, node = [*path, str(part)], _resolved(inner or {}, schema)
+    return path, node, group
+
+
+def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    return schema["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
+
+
+def _names(schema: dict[str, Any]) -> list[str]:
+    """Dotted names of the settings in the groups of a schema."""
+    names = []
+    for group, node in schema.get("properties", {}).items():
+        members = map(partial(_resolved, schema=schema), node.get("oneOf", [node]))
+        names += [f"{group}.{name}" for member in members for name in member.get("properties", {})]
+    return list(dict.fromkeys(names))
+
+
+_TYPES = {
+    "integer": "a whole number", "number": "a number", "boolean": "true or false", "string": "text", "null": "null",
+    "array": "a list",
+}  # fmt: skip
+_LIMITS = {
+    "minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below",
+    "minItems": "of length at least",
+}  # fmt: skip
+
+
+def _allowed(node: dict[str, Any]) -> str:
+    """What a JSON schema allows, in words."""
+    if "anyOf" in node:
+        return " or ".join(_allowed(one) for one in node["anyOf"])
+    if "enum" in node or "const" in node:
+        return f"one of {', '.join(map(str, node.get('enum', [node.get('const')])))}"
+    limits = " and ".join(f"{word} {node[name]}" for name, word in _LIMITS.items() if name in node)
+    items = f" in which each is {_allowed(node['items'])}" if "items" in node else ""
+    kind = _TYPES.get(node.get("type", ""), "a group of settings (name: value each)")
+    return f"{kind}{f' ({limits})' if limits else ''}{items}"
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
     """A YAML file as a tree. Raises SettingsError where it is not one."""
     try:
         if path.stat().st_size > 1_000_000:  # a pipeline is a few lines; refuse what could blow up the parser
-            raise SettingsError(f"{path} is larger than 1 MB, so it is not a pipeline file.")
+            raise SettingsError(f"{path} is larger than 1 MB, so it is not a pipeline file. {_A_FILE}")
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"Cannot read {path}: {error}.") from None
+        why = (error.strerror or error) if isinstance(error, OSError) else error
+        raise SettingsError(f"Cannot read {path}: {why}. {_A_FILE}") from None
     except _NOT_YAML as error:
-        raise SettingsError(f"{path} is not YAML: {str(error).splitlines()[0]}.") from None
+        mark = getattr(error, "problem_mark", None)
+        line = "" if mark is None else f" in line {mark.line + 1}"
+        why = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise SettingsError(f"{path} is not YAML{line}: {why}. {_A_FILE}") from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):
-        raise SettingsError(f"{path} must be a mapping of settings at its top level.")
+        raise SettingsError(f"{path} holds no settings (name: value each) at its top level. {_A_FILE}")
     return tree
 
 
@@ -58,11 +159,12 @@ def override(tree: dict[str, Any], assignment: str) -> dict[str, Any]:
     """A copy of the tree with `a.b=value` set; the value is read as YAML."""
     name, equals, text = assignment.partition("=")
     if not equals or not all(name.split(".")):
-        raise SettingsError(f"--set {assignment}: write it as --set stage.setting=value.")
+        raise SettingsError(f"--set {assignment}: write it as --set stage.setting=value. {_A_SETTING}")
     try:
         value = yaml.safe_load(text)
     except _NOT_YAML:
-        raise SettingsError(f"--set {assignment}: {text!r} is not a YAML value.") from None
+        why = f"{reprlib.repr(text)} is not a YAML value; quote text that has brackets or colons"
+        raise SettingsError(f"--set {reprlib.repr(assignment)[1:-1]}: {why}.") from None
     return _with(tree, name.split("."), value)
 
 
@@ -73,5 +175,5 @@ def _with(tree: dict[str, Any], path: list[str], value: Any) -> dict[str, Any]:
     below = tree.get(head)
     below = {} if below is None else below
     if not isinstance(below, dict):
-        raise SettingsError(f"--set: {head} is a value, not a group of settings.")
+        raise SettingsError(f"--set {'.'.join(path)}: {head} is a value, not a group of settings. {_A_SETTING}")
     return {**tree, head: _with(below, rest, value)}

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.containers import Channel
-from vplog.logs.image_folder import ImageFolder
+from vplog.logs.image_folder import ImageFolder, stamps_of
 from vplog.logs.messages import PoseMessage, decode
 from vplog.logs.odometry_message import read_odometry
 from vplog.stages import Log
@@ -167,6 +167,48 @@ def test_image_folder(names: list[str], stamps: list[int], note: str, tmp_path: 
     assert [int(f.decode().image[0, 0]) for f in log.frames(log.stamps())] == [2, 0, 1]
     assert note in " ".join(log.warnings)
     assert (log.camera().matrix, log.camera().width, log.odometry()) == (None, 6, None)
+
+
+@pytest.mark.parametrize(
+    ("count", "unit", "width"),
+    [("s", 10**9, 10), ("ms", 10**6, 13), ("us", 10**3, 16), ("ns", 1, 19), ("ns", 1, 20), ("us", 10**3, 20),
+     ("ms", 10**6, 20), ("s", 10**9, 20), ("ns", 1, 0)],
+)  # fmt: skip
+def test_whole_numbers_in_the_years_of_cameras_are_times(count: str, unit: int, width: int) -> None:
+    rng = np.random.default_rng([unit, width])
+    for year_s in (0.7e9, 1.4e9, 1.7e9, 4.0e9):
+        since_1970 = int(year_s * 10**9 / unit) + np.cumsum(rng.integers(1, 10**11 // unit + 2, 20))
+        names = [str(value).zfill(width) for value in since_1970.tolist()]
+        assert stamps_of(names) == [value * unit for value in since_1970.tolist()], count
+
+
+@pytest.mark.parametrize("width", [0, 6, 10, 13, 16, 19, 20])
+@pytest.mark.parametrize("step", [1, 2, 5, 10, 100, 1000])
+def test_counters_are_no_times_however_wide(width: int, step: int) -> None:
+    for first in (0, 1, 42, 1000):
+        names = [str(first + step * i).zfill(width) for i in range(30)]
+        assert stamps_of(names) is None
+
+
+@pytest.mark.parametrize("unit", [1, 1000])
+@pytest.mark.parametrize("width", [0, 16, 20])
+def test_us_and_ns_since_a_start_are_told_by_the_period(unit: int, width: int) -> None:
+    rng = np.random.default_rng([unit, width])
+    for rate_hz in (0.3, 1, 10, 15, 29.97, 60, 120, 190):
+        period = 1e9 / rate_hz / unit
+        values = rng.integers(0, 5 * 10**14 // unit) + np.cumsum(period * rng.uniform(0.98, 1.02, 25)).astype(np.int64)
+        names = [str(value).zfill(width) for value in values.tolist()]
+        assert stamps_of(names) == [value * unit for value in values.tolist()]
+
+
+def test_numbers_that_no_clock_has_count_the_images(tmp_path: Path) -> None:
+    assert stamps_of(["9" * 20, "9" * 19 + "8"]) is None
+    assert stamps_of(["00000000000000000007"]) is None
+    assert stamps_of([str(START_NS), "left"]) is None
+    assert stamps_of(["²1", "²2"]) is None
+    for name in ("²2", "²10", "²1"):
+        (tmp_path / f"{name}.png").write_bytes(png(np.full((4, 6), 1, np.uint8)))
+    assert len(logs.open(tmp_path).stamps()) == 3
 
 
 def test_damaged_images_of_a_folder_keep_their_time_and_are_counted(tmp_path: Path) -> None:

@@ -182,7 +182,7 @@ def test_columns_of_other_libraries_are_refused(state: PaperBobbState, places: l
             state.from_arrow(column)
     boxes = places[0].boxes
     for wrong in (12, -2, 2**31 - 1):
-        with pytest.raises(LibraryError, match="references that this library does not have"):
+        with pytest.raises(LibraryError, match="references that this library lacks"):
             state.from_arrow(state.to_arrow([Place(np.array([0, 1, wrong, -1], np.int32), boxes)]))
     with pytest.raises(LibraryError, match="beyond the grid"):
         state.from_arrow(state.to_arrow([Place(places[0].references, np.full((4, 4, 4), 65, np.uint8))]))

@@ -211,9 +211,12 @@ def test_a_departure_that_is_no_more_is_one_line(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("DAY", "DUSK", "--only", "pairs,maps"), "--only maps: there is no such experiment. Choose of pairs"),
+        (
+            ("DAY", "DUSK", "--only", "pairs,maps"),
+            "--only maps: there is no such experiment. Experiments: pairs",
+        ),
         (("DAY", "DAY"), "is given twice"),
-        (("DAY", "DUSK", "--min-gap", "3"), "--min-gap is for a drive looked for in its own past"),
+        (("DAY", "DUSK", "--min-gap", "3"), "--min-gap is for one drive, matched with its own past"),
         (("DAY", "DUSK", "--methods", "vlad", "--only", "sizes"), "none of them makes boxes"),
         (("DAY", "DUSK", "--methods", "surf"), "No method 'surf'"),
         (("DAY", "DUSK", "--sizes", "50", "--only", "sizes"), "the shortest drive has only 9 frames"),

@@ -45,7 +45,7 @@ def build_graph(
     poses, n = keyframes.odom_from_body, len(keyframes.stamp_ns)
     if n < 2:
         raise GraphError(
-            f"{keyframes.drive or 'The drive'} has {n} keyframes; a graph needs 2. Lower the keyframe spacing."
+            f"{keyframes.drive or 'The drive'} has {n} keyframes; a graph needs 2. Lower --set keyframes.distance_m."
         )
     if edge_covariances.shape != (n - 1, 6, 6):
         raise GraphError(f"{n} keyframes need ({n - 1}, 6, 6) edge covariances, not {edge_covariances.shape}.")

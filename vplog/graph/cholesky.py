@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _BY_THREAD = 4
 """Shares for each thread of what a child hands on: the first rows of a triangle are longer."""
-OPEN = "The graph leaves its poses too open to say where they are. Check its edges' information."
+OPEN = "The graph does not constrain all its poses. Check the information of its edges."
 
 
 @dataclass(frozen=True, eq=False)

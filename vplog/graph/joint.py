@@ -158,10 +158,10 @@ def join(
 def _places(one: Between, spacing: int, weight: Floats | None = None) -> int:
     """Places of the drive that has fewer, of closures with weight (L,): keyframes so far from one to the next."""
     kept = slice(None) if weight is None else weight > 0.5
-    return min(_apart(one.query[kept], spacing), _apart(one.match[kept], spacing))
+    return min(spaced_apart(one.query[kept], spacing), spaced_apart(one.match[kept], spacing))
 
 
-def _apart(keyframes: Ints, spacing: int) -> int:
+def spaced_apart(keyframes: Ints, spacing: int) -> int:
     """The most of the keyframes that are so far from each other."""
     count, last = 0, -spacing
     for one in np.unique(keyframes).tolist():

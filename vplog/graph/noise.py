@@ -136,13 +136,13 @@ def edge_covariance(
     least, largest = np.median(share[:, 0]), np.median(share[:, -1])
     if least < settings.best_share / 2.0:  # what is raised by less than that was as good as believed
         warnings.append(
-            f"The odometry's covariance was not believed: it claims {least:.1%} of the drift model's sigma "
+            f"The odometry's covariance is implausible: it claims {least:.1%} of the drift model's sigma "
             f"({settings.drift_per_metre:.1%} of the distance, {np.degrees(settings.turn_per_metre):.3f} deg/m), which "
             f"no odometry reaches, so it is raised to {settings.best_share:.0%} of it."
         )
     if largest > most:
         warnings.append(
-            f"The odometry's covariance was not believed: it is one constant, {largest:.1f} times the drift model in "
+            f"The odometry's covariance is implausible: it is one constant, {largest:.1f} times the drift model in "
             f"sigma, so it is lowered to {most:g} times."
         )
     return within, warnings, source

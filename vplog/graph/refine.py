@@ -214,7 +214,7 @@ def _told(
         chi2 = chi2_of_fixes(poses, fixes, world)[believed > 0]
         beyond = int((chi2 > chi2_quantile(0.99, 3)).sum())
         said.append(
-            f"{int(believed.sum())} of {len(fixes)} GPS fixes were kept, {beyond} of them beyond 99 % of their noise."
+            f"{int(believed.sum())} of {len(fixes)} GPS fixes were used, {beyond} of them beyond 99 % of their noise."
         )
     error = float(0.5 * (solution.weight * residual_sigma(graph, poses) ** 2).sum())
     refined = replace(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import statistics
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,8 +34,11 @@ if TYPE_CHECKING:
 PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM", b"P5", b"P6", b"P2", b"P3")
-_UNITS = ((11, 10**9), (14, 10**6), (17, 10**3), (20, 1))
-"""Digits below which a whole number is in s, ms, us, ns, and the ns of that unit; today's have 10, 13, 16, 19."""
+_SINCE_1970_S = (631_152_000, 4_102_444_800)
+"""1990 to 2100: whole numbers of s, ms, us or ns in it have 9 to 19 digits, and never fit two of the units.
+In ns since a start they come up after a week."""
+_PERIODS_NS = (5_000_000, 5_000_000_000)
+"""200 Hz down to 0.2 Hz, as cameras have it: in us and in ns two ranges that meet and do not overlap."""
 
 
 _TRIED = 10
@@ -49,22 +54,29 @@ def is_image(path: Path) -> bool:
 
 def natural_order(path: Path) -> tuple:
     """Sorts `2.png` before `10.png`."""
-    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", path.name))
+    return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name))
 
 
 def stamps_of(names: list[str]) -> list[int] | None:
-    """ns from file stems that are all decimal seconds or all whole s, ms, us or ns since 1970; else None.
+    """ns from file stems that are times; None where they count the images.
 
-    Whole numbers of fewer than 10 digits count the frames instead: seconds since 1970 have had 10 since 2001.
+    Times are decimal seconds, or whole s, ms, us or ns that all lie between 1990 and 2100. Others are us or ns since
+    some start, as of a machine's boot, where their median step is the period of a camera in one of the two: counters
+    go in steps of a few, with leading zeros or without.
     """
-    if all(re.fullmatch(r"\d{1,10}\.\d{1,9}", name) for name in names):
+    if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
         parts = [name.split(".") for name in names]
         return [int(whole) * 10**9 + int(fraction.ljust(9, "0")) for whole, fraction in parts]
-    if not all(re.fullmatch(r"\d{10,19}", name) for name in names) or len({len(name) for name in names}) != 1:
+    if not all(re.fullmatch(r"[0-9]{1,30}", name) for name in names):
         return None
-    unit = next(ns for digits, ns in _UNITS if len(names[0]) < digits)
-    stamps = [int(name) * unit for name in names]
-    return stamps if max(stamps) < 2**63 else None
+    values = sorted({int(name) for name in names})
+    low_ns, high_ns = (bound * 10**9 for bound in _SINCE_1970_S)
+    units = (10**9, 10**6, 10**3, 1)
+    unit = next((ns for ns in units if low_ns <= values[0] * ns and values[-1] * ns < high_ns), 0)
+    if not unit and len(values) > 1:
+        step = statistics.median(b - a for a, b in pairwise(values))
+        unit = next((ns for ns in (10**3, 1) if _PERIODS_NS[0] <= step * ns < _PERIODS_NS[1]), 0)
+    return [int(name) * unit for name in names] if unit and values[-1] * unit < 2**63 else None
 
 
 @dataclass(eq=False)

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.errors import LogError
+from vplog.errors import LogError, nearest
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -240,4 +240,5 @@ def _refusal(named: list[Candidate], wanted: str, role: str, found: list[str], l
     if not found:
         return f"{what} {_NAMES[role]} topics: none."
     option = role.replace("_", "-")
-    return f"{what} {_NAMES[role]} topics: {', '.join(sorted(set(found)))}. Choose one with --{option}-topic."
+    near = nearest(wanted, sorted(found), key=lambda topic: topic.strip("/"), cutoff=0.5)
+    return f"{what}{near} {_NAMES[role]} topics: {', '.join(sorted(set(found)))}. Choose one with --{option}-topic."

@@ -97,10 +97,12 @@ class BobbSettings(WeighedMatchSettings):
                 f"a box of {self.box_columns} x {self.box_rows} is larger than the grid of {self.columns} x {self.rows}"
             )
         if self.box_columns * self.box_rows > 255:
-            raise ValueError(f"a box of {self.box_columns} x {self.box_rows} cells overlaps by more than a byte holds")
+            raise ValueError(
+                f"a box of {self.box_columns} x {self.box_rows} has more than 255 cells; use smaller boxes"
+            )
         boxes = (self.columns - self.box_columns + 1) * (self.rows - self.box_rows + 1)
         if boxes > NOWHERE:
-            raise ValueError(f"{boxes} positions of a box do not fit a byte; use fewer columns or rows")
+            raise ValueError(f"a box has {boxes} positions, and {NOWHERE} is the most; use fewer columns or rows")
         return self
 
     @property
@@ -314,7 +316,9 @@ class BobbState:
         check_values(column, *lists)
         references, weights, boxes = (part.flatten().to_numpy() for part in lists)
         if np.any((references >= len(self.matcher)) & (references != NOBODY)):
-            raise LibraryError("The descriptors name references that this library does not have.")
+            raise LibraryError(
+                "The descriptors name references that this library lacks; compute them again with `vplog run`."
+            )
         positions = (s.columns - s.box_columns + 1) * (s.rows - s.box_rows + 1)
         if np.any((boxes >= positions) & (boxes != NOWHERE)):
             raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")

@@ -250,7 +250,9 @@ class PaperBobbState:
         references = lists[0].flatten().to_numpy().reshape(-1, s.references)
         boxes = lists[1].flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
         if len(references) and (references.max() >= len(self.library) or references.min() < -1):
-            raise LibraryError("The descriptors name references that this library does not have.")
+            raise LibraryError(
+                "The descriptors name references that this library lacks; compute them again with `vplog run`."
+            )
         if len(boxes) and boxes.max() > s.grid:
             raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
         return [Place(r, b) for r, b in zip(references, boxes, strict=True)]

@@ -150,7 +150,7 @@ class BovfState:
         words, counts = (part.to_numpy() for part in parts)
         places = words_by_place(column, words, len(self.vocabulary))
         if not np.all(counts):
-            raise LibraryError("The descriptors name a word zero times; write them anew with `vplog run`.")
+            raise LibraryError("The descriptors name a word zero times; compute them again with `vplog run`.")
         return [Words(words[place], counts[place]) for place in places]
 
     def save(self, folder: Path) -> None:

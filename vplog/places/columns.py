@@ -24,19 +24,21 @@ def check_values(*arrays: pa.Array) -> None:
     for array in arrays:
         lists = pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type)
         if array.null_count or (lists and array.flatten().null_count):
-            raise LibraryError("Some descriptors have no value; write them anew with `vplog run`.")
+            raise LibraryError("Some descriptors have no value; compute them again with `vplog run`.")
 
 
 def words_by_place(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: int) -> list[slice]:
     """Which of all words (K,) each list of the column has. Raises LibraryError where a place's do not increase, or
     are beyond the `vocabulary`."""
     if len(words) and words.max() >= vocabulary:
-        raise LibraryError("The descriptors name words that this library does not have.")
+        raise LibraryError(
+            "The descriptors name words that this library does not have; compute them again with `vplog run`."
+        )
     lengths = column.value_lengths().to_numpy()
     stop = np.cumsum(lengths)
     start = stop - lengths
     rising = np.diff(words.astype(np.int32), prepend=-1) > 0
     rising[start[start < len(words)]] = True  # a place's first word follows none
     if not np.all(rising):
-        raise LibraryError("The descriptors name a word twice or out of order; write them anew with `vplog run`.")
+        raise LibraryError("The descriptors name a word twice or out of order; compute them again with `vplog run`.")
     return [slice(a, b) for a, b in zip(start.tolist(), stop.tolist(), strict=True)]

@@ -70,5 +70,5 @@ def vectors_from_arrow(column: pa.Array, arrow_type: pa.FixedSizeListType) -> li
     check_values(column)
     values = column.flatten().to_numpy().reshape(-1, arrow_type.list_size)
     if not np.all(np.isfinite(values)):
-        raise LibraryError("Some descriptors have values that are not finite; write them anew with `vplog run`.")
+        raise LibraryError("Some descriptors have values that are not finite; compute them again with `vplog run`.")
     return list(values)

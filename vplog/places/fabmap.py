@@ -80,7 +80,7 @@ class FabmapSettings(Settings):
         if self.seen_if_absent >= self.seen_if_there:
             raise ValueError(
                 f"seen_if_absent {self.seen_if_absent} must be below seen_if_there {self.seen_if_there}: "
-                "a word seen would else speak against its being there"
+                "else an observed word would be evidence of its absence"
             )
         return self
 

@@ -32,5 +32,7 @@ def relearn(settings: Any, folder: Path, threads: int, learn: Callable[..., Any]
     made = settings.read(record["settings"], f"{folder}/library.json")
     state = (learn or settings.learn)(made, stored.load_references(folder, threads), threads)
     if state.hash != record["hash"]:
-        raise LibraryError(f"{folder}: the content does not give the hash in library.json; build the library anew.")
+        raise LibraryError(
+            f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
+        )
     return state

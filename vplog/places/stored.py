@@ -128,7 +128,9 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         sync_all(folder)
         put_in_place(part, folder / "library.json")
     except OSError as error:
-        raise LibraryError(f"Cannot write the library {folder}: {error.strerror or error}.") from None
+        raise LibraryError(
+            f"Cannot write the library {folder}: {error.strerror or error}. Choose another folder."
+        ) from None
 
 
 def _write(path: Path, table: pa.Table, compression: str) -> None:
@@ -148,9 +150,11 @@ def read_library_record(folder: Path) -> dict[str, Any]:
             f"{folder} is not a library: it has no library.json. Build one: vplog library LOG -o {folder}"
         ) from None
     except (OSError, ValueError, RecursionError) as error:
-        raise LibraryError(f"{folder}/library.json cannot be read: {error}.") from None
+        raise LibraryError(
+            f"{folder}/library.json cannot be read: {error}. Build it again with `vplog library`."
+        ) from None
     if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
-        raise LibraryError(f"{folder}/library.json lacks its hash or settings; build the library anew.")
+        raise LibraryError(f"{folder}/library.json lacks its hash or settings; build it again with `vplog library`.")
     check_version(folder / "library.json", record.get("format", _FORMAT), _FORMAT, record.get("vplog"))
     return record
 
@@ -163,14 +167,18 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
         features = _table(folder / "features.parquet", _FEATURES)
         references = _table(folder / "references.parquet", _REFERENCES)
         if any(column.null_count for table in (features, references) for column in table.columns):
-            raise LibraryError(f"{folder}: the tables have empty cells; build the library anew.")
+            raise LibraryError(f"{folder}: the tables have empty cells; build it again with `vplog library`.")
         entries = references.to_pylist()
     except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
-        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}. Build the library anew.") from None
+        raise LibraryError(
+            f"{folder} cannot be read: {str(error).splitlines()[0]}. Build it again with `vplog library`."
+        ) from None
     owners = features["reference"].to_numpy()
     start = np.searchsorted(owners, np.arange(len(references) + 1))
     if len(owners) and (owners[0] < 0 or owners[-1] >= len(references) or np.any(np.diff(owners) < 0)):
-        raise LibraryError(f"{folder}: features.parquet names references that references.parquet lacks.")
+        raise LibraryError(
+            f"{folder}: features.parquet names references that references.parquet lacks; build it again."
+        )
     points = np.column_stack([features["x"].to_numpy(), features["y"].to_numpy()]).astype(np.float32)
     sizes = features["size"].to_numpy()
     descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
@@ -185,7 +193,9 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
             raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
         image = _decode(entry["image"])
         if image is None or image.shape != (height, width):
-            raise LibraryError(f"{folder}: the image of reference {row} is damaged; build the library anew.")
+            raise LibraryError(
+                f"{folder}: the image of reference {row} is damaged; build it again with `vplog library`."
+            )
         nothing = np.full(part.stop - part.start, np.nan, np.float32)
         thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
         found = Features(points[part], sizes[part], descriptors[part], nothing, width, height, thumbnail)
@@ -199,12 +209,12 @@ def _table(path: Path, schema: pa.Schema) -> pa.Table:
     with open_table(path) as file:
         try:
             check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+            if file.metadata.num_rows > _MAX_FEATURES:
+                raise ValueError(f"{file.metadata.num_rows} rows")
         except ValueError as error:
             raise LibraryError(
-                f"{path.parent}: the tables are not those of a library ({error}); build it anew."
+                f"{path.parent}: the tables are not those of a library ({error}); build it again with `vplog library`."
             ) from None
-        if file.metadata.num_rows > _MAX_FEATURES:
-            raise LibraryError(f"{path.parent}: the tables are not those of a library; build it anew.")
         return read_table(path, file, schema.names).select(schema.names)
 
 

@@ -110,7 +110,8 @@ class Bench:
         stamps = walk.stamp_ns[sorted(set(rows))]
         found = {one.stamp_ns: one.decode().image for one in self.logs[drive].frames(stamps)}
         if len(found) < len(stamps):
-            raise LogError(f"{self.names[drive]}: a frame that was read before cannot be read again. Was it changed?")
+            why = "a frame that was read before cannot be read again. Leave the log unchanged, and run again."
+            raise LogError(f"{self.names[drive]}: {why}")
         return [found[int(walk.stamp_ns[row])] for row in rows]
 
     def references(self, library: Library) -> list[Reference]:

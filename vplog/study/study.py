@@ -17,7 +17,7 @@ import numpy as np
 import vplog
 from vplog import logs, record
 from vplog.compare import check_truth, same_drive
-from vplog.errors import ResultError, SettingsError, TruthError
+from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import TruthChoice, open_truth
 from vplog.inputs import hash_inputs
 from vplog.methods import read_methods
@@ -170,7 +170,8 @@ def _choose(only: Sequence[str] | None, drives: int) -> list[str]:
     """Names of the experiments to do. Raises SettingsError for one that is none, or that needs more drives."""
     for name in only or ():
         if name not in EXPERIMENTS:
-            raise SettingsError(f"--only {name}: there is no such experiment. Choose of {', '.join(EXPERIMENTS)}.")
+            known = f"Experiments: {', '.join(EXPERIMENTS)}."
+            raise SettingsError(f"--only {name}: there is no such experiment.{nearest(name, EXPERIMENTS)} {known}")
         if drives < 2 and name in _TWO_DRIVES:
             raise SettingsError(f"--only {name} is about {_TWO_DRIVES[name]}; give two drives or more.")
     return [name for name in EXPERIMENTS if (only is None or name in only) and not (drives < 2 and name in _TWO_DRIVES)]
@@ -182,11 +183,11 @@ def _check_drives(drives: Sequence[Path], min_gap: int | None) -> None:
             raise SettingsError(f"{path} is given twice. Give each drive once; it is query and map in turn.")
     if len(drives) == 1 and min_gap is None:
         raise SettingsError(
-            f"{drives[0]} alone is looked for in its own past. Say how many frames older a match must be: "
+            f"{drives[0]} is the only drive, so its frames are matched with older ones. Say how many frames older: "
             "--min-gap 50. Or give more drives of the same route."
         )
     if len(drives) > 1 and min_gap is not None:
-        raise SettingsError("--min-gap is for a drive looked for in its own past; leave it out, or give one drive.")
+        raise SettingsError("--min-gap is for one drive, matched with its own past; leave it out, or give one drive.")
 
 
 def _begin(out: Path) -> None:
