@@ -520,5 +520,6 @@ def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:
     at = {name: tmp_path / name for name in ("short", "gone", "long", "same")}
     for name, size in (("short", 10), ("long", 30), ("same", 10)):
         at[name].write_bytes(bytes(size))
-    found = batch._longest_first([{"log": name} for name in at], at)
-    assert [about["log"] for about in found] == ["long", "short", "same", "gone"]
+    logs = {name: str(path) for name, path in at.items()}
+    found = batch._longest_first([{"drive": name} for name in at], logs)
+    assert [about["drive"] for about in found] == ["long", "short", "same", "gone"]

@@ -301,7 +301,7 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
     monkeypatch.setattr(candidates, "_CHOICE", 1)
     few = PIPELINE.model_copy(update={"join": JoinSettings(most_drives=1)})
     with map_store.reading(copy) as store:
-        drives = read_drives(store)
+        drives = read_drives(store, {})
         by_name = {member.drive: member for member in drives.members}
         other = next(name for name in by_name if name not in HALVES)
         members = [by_name[name] for name in (other, *HALVES)]

@@ -253,7 +253,7 @@ def test_no_bytes_lead_beyond_the_arrays(made: Map, seed: int) -> None:
         where = rng.integers(1000, len(data), 2000)
     data[where] = rng.integers(0, 256, len(where)) if seed % 3 else 255
     path = part.path.with_name("strange.lists")
-    path.write_bytes(data[:-4].tobytes() + zlib.crc32(data[:-4]).to_bytes(4, "little"))
+    path.write_bytes(data[:-4].tobytes() + zlib.crc32(data[:-4].tobytes()).to_bytes(4, "little"))
     try:
         segment = open_segment(path)
     except ResultError:
