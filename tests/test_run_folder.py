@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -29,7 +30,6 @@ from .test_resume import OPTIONS, QUICK
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from conftest import Said
 
@@ -141,6 +141,24 @@ def test_runs_of_several_drives_hold_all_drives_of_the_run_before(log: Path, oth
     complete(out, [log, other])
     complete(out, [other, log])
     refused(out, other, "another log")
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_drive_of_a_joint_run_or_of_a_map_is_not_replaced(
+    force: bool, log: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    complete(tmp_path / "out", [log, other], joint=True)
+    drive = tmp_path / "map" / "runs" / "drive=a"
+    complete(drive, log)
+    written(drive / "drive.json", b"{}")
+    before = tree(tmp_path)
+    for folder in (tmp_path / "out" / "a", drive):
+        monkeypatch.chdir(folder)
+        for out in (folder, Path()):
+            with pytest.raises(SettingsError, match=f"{out} is a drive of the run or map in {folder.parent}"):
+                complete(out, log, force=force)
+    assert tree(tmp_path) == before
+    complete(tmp_path / "out" / "c", log, force=force)
 
 
 def test_random_sets_of_logs(tmp_path: Path) -> None:

@@ -64,6 +64,9 @@ def begun(
 
     def begin() -> list[str]:
         check_regular(out, "run.json")
+        above = out.absolute().parent
+        if out.absolute().name in _drives_in(_read(above / "run.json") or {}) or (out / "drive.json").exists():
+            raise SettingsError(f"{out} is a drive of the run or map in {above}. Choose another folder with -o.")
         if not force:
             _check_same_logs(out, files)
         return _results_in(out, library, drives or {}, resumable)
