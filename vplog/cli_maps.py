@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,10 +25,11 @@ from vplog.cli_print import (
     print_export,
     print_joined,
     print_json,
+    print_line,
     print_map,
     print_merge,
     print_redescribed,
-    say,
+    warn,
 )
 
 if TYPE_CHECKING:
@@ -86,8 +88,8 @@ def remove_drives(arguments: argparse.Namespace) -> None:
     else:
         print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
         if found["still_joined"]:
-            said = f"Solve those that were joined with {', '.join(found['still_joined'])}"
-            print(f"{said}: vplog map join {found['map']}")
+            print_line("to solve", f"{', '.join(found['still_joined'])} were joined with what is removed")
+            print(f"next      vplog map join {shlex.quote(str(found['map']))}")
 
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
@@ -200,8 +202,7 @@ def index_map(arguments: argparse.Namespace) -> None:
             f"{found['map']}: {found['places']} places of {len(found['drives'])} drives in {len(found['segments'])} "
             f"files, {found['bytes'] / 1e6:.1f} MB"
         )
-        for warning in found["warnings"]:
-            say(f"warning: {warning}")
+        warn(found["warnings"])
 
 
 def _cache(arguments: argparse.Namespace) -> Cache | None:
