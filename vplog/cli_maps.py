@@ -29,6 +29,7 @@ from vplog.cli_print import (
     print_map,
     print_merge,
     print_redescribed,
+    print_result,
     warn,
 )
 
@@ -48,10 +49,7 @@ def export_map(arguments: argparse.Namespace) -> None:
         found = write_map(
             arguments.sources, arguments.output, arguments.drive, arguments.box, arguments.format, progress
         )
-    if arguments.json:
-        print_json(found)
-    else:
-        print_export(found)
+    print_result(arguments, found, print_export)
 
 
 def merge_maps(arguments: argparse.Namespace) -> None:
@@ -60,10 +58,7 @@ def merge_maps(arguments: argparse.Namespace) -> None:
 
     with Progress(arguments) as progress:
         found = merge(arguments.maps, arguments.target, progress, arguments.drive)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_merge(found)
+    print_result(arguments, found, print_merge)
 
 
 def join_map(arguments: argparse.Namespace) -> None:
@@ -72,10 +67,7 @@ def join_map(arguments: argparse.Namespace) -> None:
 
     with Progress(arguments) as progress:
         found = join(arguments.map, arguments.threads, progress)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_joined(found)
+    print_result(arguments, found, print_joined)
 
 
 def remove_drives(arguments: argparse.Namespace) -> None:
@@ -141,10 +133,7 @@ def _end(
     from vplog.errors import ResultError
 
     try:
-        if arguments.json:
-            print_json(found)
-        else:
-            shown(found)
+        print_result(arguments, found, shown)
     finally:
         if found["failed"]:
             raise ResultError(wrong)
@@ -159,10 +148,7 @@ def info_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.info import describe_map
 
     found = describe_map(arguments.map, check=arguments.check)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_map(found)
+    print_result(arguments, found, print_map)
     if wrong := found["damaged_files"]:
         raise ResultError(
             f"{len(wrong)} damaged files in {arguments.map}: vplog batch LOG -o MAP computes drives again."
@@ -182,10 +168,7 @@ def query_map(arguments: argparse.Namespace) -> None:
                 arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
                 arguments.output, arguments.threads, progress, workers, cache,
             )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_answers(found)
+    print_result(arguments, found, print_answers)
 
 
 def index_map(arguments: argparse.Namespace) -> None:

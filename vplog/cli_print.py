@@ -16,7 +16,7 @@ from vplog.urls import without_secrets
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -491,6 +491,13 @@ class Progress:
         """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
         if self._line_by_line:
             say(f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}")
+
+
+def print_result(
+    arguments: argparse.Namespace, found: dict[str, Any], in_words: Callable[[dict[str, Any]], None]
+) -> None:
+    """One JSON object with --json, else in words."""
+    (print_json if arguments.json else in_words)(found)
 
 
 def print_json(tree: dict[str, Any]) -> None:
