@@ -108,7 +108,7 @@ def test_no_cell_of_a_table_is_cut_at_any_width(
         titles = ["".join(rng.choice(letters, 5)) for _ in range(columns)]
         rows = [["".join(rng.choice(letters, rng.integers(1, 60))) for _ in range(columns)] for _ in range(count)]
         for width in WIDTHS:
-            monkeypatch.setattr(cli_print, "terminal_width", lambda width=width: width)
+            monkeypatch.setattr(cli_print, "terminal_width", lambda _, width=width: width)
             cli_print.print_table(titles, rows)
             out = capsys.readouterr().out
             for row in rows:
@@ -126,12 +126,35 @@ def test_what_would_move_the_cursor_is_shown(capsys: pytest.CaptureFixture[str])
 def test_lines_wrap_between_words(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     text = f"No topic '/left' in run.mcap. Image topics: {LONG}, /right. Choose one with --image-topic, or not-at-all."
     for width in WIDTHS:
-        monkeypatch.setattr(cli_print, "terminal_width", lambda width=width: width)
+        monkeypatch.setattr(cli_print, "terminal_width", lambda _, width=width: width)
         cli_print.print_line("warning", text)
         out = capsys.readouterr().out
         assert out.split() == ["warning", *text.split()]
         assert (len(out.splitlines()) == 1) == (width is None or width == 200)
         assert all(len(line) <= (width or 1000) or LONG in line for line in out.splitlines() if width != 20)
+
+
+def test_lines_on_stderr_wrap_too_and_by_its_own_width(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = f"error: No topic '/left' in run.mcap. Image topics: {LONG}, /right. Choose one with --image-topic."
+    for width in WIDTHS:
+        monkeypatch.setattr(cli_print, "terminal_width", lambda of, width=width: width if of is sys.stderr else 30)
+        cli_print.say(text)
+        err = capsys.readouterr().err
+        assert err.split() == ["vplog:", *text.split()]
+        assert (len(err.splitlines()) == 1) == (width is None or width == 200)
+
+
+@pytest.mark.parametrize("columns", [50, None])
+def test_an_evaluation_wraps_between_words(
+    columns: int | None, finished: Path, drive: Drive, verb: Verb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = verb("evaluate", finished, "--truth", drive.truth).out.split()
+    monkeypatch.setattr(cli_print, "terminal_width", lambda _: columns)
+    out = verb("evaluate", finished, "--truth", drive.truth).out
+    assert out.split() == words
+    assert all(len(line) <= (columns or 1000) for line in out.splitlines())
 
 
 # What came of a run
@@ -182,7 +205,7 @@ def test_what_came_of_a_run_is_said_in_metres(outcome: Outcome, gps: Any, said: 
     assert cli_print._came_of(outcome, {"gps": gps, "solution": {"reason": "No closure passed."}}).endswith(said)
 
 
-def test_verbs_of_runs_and_maps_say_what_next(verb: Verb, joint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_joint_run_says_what_next(joint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
     cli_print.print_joint(joint, json.loads((joint / "run.json").read_text()))

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -24,11 +25,11 @@ from vplog.record import head
 from vplog.results.run_record import read_finished_run
 from vplog.run_folder import begun
 
+from .test_cli import no_images, no_messages, no_odometry, wrong_magic
 from .test_resume import OPTIONS, QUICK
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from conftest import Said
 
@@ -142,6 +143,24 @@ def test_runs_of_several_drives_hold_all_drives_of_the_run_before(log: Path, oth
     refused(out, other, "another log")
 
 
+@pytest.mark.parametrize("force", [False, True])
+def test_a_drive_of_a_joint_run_or_of_a_map_is_not_replaced(
+    force: bool, log: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    complete(tmp_path / "out", [log, other], joint=True)
+    drive = tmp_path / "map" / "runs" / "drive=a"
+    complete(drive, log)
+    written(drive / "drive.json", b"{}")
+    before = tree(tmp_path)
+    for folder in (tmp_path / "out" / "a", drive):
+        monkeypatch.chdir(folder)
+        for out in (folder, Path()):
+            with pytest.raises(SettingsError, match=f"{out} is a drive of the run or map in {folder.parent}"):
+                complete(out, log, force=force)
+    assert tree(tmp_path) == before
+    complete(tmp_path / "out" / "c", log, force=force)
+
+
 def test_random_sets_of_logs(tmp_path: Path) -> None:
     """Refused if and only if the content of a log of the run before is not among those given."""
     chance = random.Random(7)
@@ -184,9 +203,20 @@ def test_an_unfinished_run_of_another_log_is_not_dropped(log: Path, other: Path,
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, LogError, ResultError])
 def test_a_run_that_came_to_nothing_leaves_nothing(error: type[BaseException], log: Path, tmp_path: Path) -> None:
-    with pytest.raises(error), begun(tmp_path / "out", Pipeline(), log, 1):
+    with pytest.raises(error), begun(tmp_path / "new" / "out", Pipeline(), log, 1):
         raise error
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: Path, tmp_path: Path) -> None:
+    """It would fail again; stages that it finished stay for other runs."""
+    out = tmp_path / "out"
+    with pytest.raises(LogError) as failed, begun(out, Pipeline(), log, 1, drives={"a": log, "b": other}):
+        written(out / ".cache" / "extract-0.stage", b"a result")
+        raise LogError
+    assert not hasattr(failed.value, "__notes__")
+    assert [path.name for path in out.rglob("*") if path.is_file()] == ["extract-0.stage"]
+    complete(out, log)
 
 
 def test_a_request_stays_while_it_is_gone_on_with(log: Path, tmp_path: Path) -> None:
@@ -331,3 +361,46 @@ def test_a_run_over_that_of_another_log_is_interrupted_killed_and_gone_on_with(
     own = {name: data for name, data in tree(out).items() if name not in ("run.json", "report.html", "notes.txt")}
     assert own == {name: data for name, data in tree(empty).items() if name not in ("run.json", "report.html")}
     assert tree(out).keys() - tree(empty).keys() == {"notes.txt"}
+
+
+def test_explained_closures_go_with_the_run_that_they_are_of(log: Path, other: Path, tmp_path: Path) -> None:
+    out, mine = tmp_path / "out", ("closure-5.svg", "closure-5-mine.png", "closure-x.png", "a-closure-5.png")
+    complete(out, [log, other], joint=True)
+    for folder in (out, out / "a", out / "b"):
+        for name in ("closure-7.png", "closure-12345.png", *mine):
+            (folder / name).write_text("a picture")
+    complete(out, [log, other], joint=True)
+    assert tree(out).keys() == {"run.json"} | {
+        f"{folder}{name}" for folder in ("", "a/", "b/") for name in ("run.json", *mine)
+    }
+
+
+def test_what_cannot_be_begun_leaves_no_folder(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    """Nor one above it, nor does it touch a run that is there, whatever fails before anything is computed."""
+    bad, log, text = tmp_path / "bad", drive.log, written(tmp_path / "x.yaml", b"nothing: 1")
+    bad.mkdir()
+    blind, lost, empty = no_images(bad, log), no_odometry(bad, log), no_messages(bad, log)
+    given = [
+        [blind], [lost], [empty], [wrong_magic(bad, log)], [bad / "absent"], ["http://127.0.0.1:9/x.mcap"],
+        [log, lost], [log, bad / "absent"], ["--one-drive", log, lost], [log, blind, "--gps"],
+        *([log, *one] for one in (
+            ["--library", bad / "absent"], ["--library", bad], ["--set", "solve.kind=none"], ["--pipeline", text],
+            ["--image-topic", "/absent"], ["--odometry-topic", "/absent"], ["--camera-info-topic", "/absent"],
+            ["--odometry-file", text], ["--calibration", text], ["--depth-topic", "/absent"],
+        )),
+    ]  # fmt: skip
+    run, new = tmp_path / "run", tmp_path / "new" / "folder" / "out"
+    complete(run, log)
+    before = tree(run)
+    for number, arguments in enumerate(given):
+        assert verb("run", *arguments, "-o", run if number % 5 == 1 else new, *OPTIONS).code in (1, 2), arguments
+        assert not (tmp_path / "new").exists(), arguments
+        assert tree(run) == before, arguments
+        assert not list(run.glob(".*")), arguments
+    for arguments in (
+        ["batch", bad / "absent"], ["batch", log, "--library", bad], ["library", blind], ["demo", "--set", "x.y=1"],
+        ["study", bad / "absent", log, "--truth", "index"], ["map", "merge", bad / "absent"],
+        ["compare", blind, log, "--methods", "bobb", "--truth", "index"],
+    ):  # fmt: skip
+        assert verb(*arguments, "-o", new).code == 1, arguments
+        assert not (tmp_path / "new").exists(), arguments

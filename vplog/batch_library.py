@@ -36,10 +36,8 @@ def map_library(
 
     Raises LibraryError where another one is given, or where the settings describe places otherwise.
     """
-    settings = pipeline.model_dump(mode="json")
-    if not (store.root / "map.json").exists():
-        store.write_head(map_store.Head(None, settings))
-    known = store.head().library
+    begun = (store.root / "map.json").exists()
+    known = store.head().library if begun else None
     if known is not None and not store.library(known).is_dir():
         raise LibraryError(
             f"{store} lacks its library {known[:12]}. Build the map again in another folder with `vplog batch`."
@@ -67,6 +65,8 @@ def map_library(
         check_library(store.library(known), pipeline)
         digest = known
     if known is None:
+        if not begun:  # a folder that holds a library alone is known as a map
+            store.write_head(map_store.Head(None, pipeline.model_dump(mode="json")))
         map_store.add_library(store, made, digest)
     return digest
 

@@ -10,7 +10,7 @@ import shlex
 import signal
 import sys
 import threading
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -36,6 +36,7 @@ from vplog.cli_print import (
     print_line,
     print_run,
     say,
+    warn,
 )
 from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
@@ -143,7 +144,7 @@ def _flush() -> None:
 
 
 def _interrupted(error: BaseException) -> NoReturn:
-    known = getattr(error, "__notes__", ["nothing is lost of what was finished in the output folder"])
+    known = getattr(error, "__notes__", ["what was finished in the output folder stays"])
     say(f"interrupted; {known[-1]}")
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
@@ -195,20 +196,21 @@ def library(arguments: argparse.Namespace) -> None:
         return
     text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
     print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
-    for warning in warnings:
-        say(f"warning: {warning}")
+    warn(warnings)
     print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
+    from vplog.remote import local_copy
     from vplog.report import outcome_of
 
     paths, pipeline, library, topics = _asked(arguments)
     # a cache that is sent over the net costs more than it saves
     use_cache = arguments.cache and "://" not in str(arguments.shown)
     with ExitStack() as stack, Progress(arguments) as progress:
-        library = None if library is None else stack.enter_context(_library_at_hand(library))
+        if library is not None:  # by URL, as an unfinished run may name it
+            library = stack.enter_context(local_copy(library))
         if len(paths) > 1 and not arguments.one_drive:
             from vplog.joint import run_joint
 
@@ -231,15 +233,8 @@ def run(arguments: argparse.Namespace) -> None:
         print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
 
 
-def _library_at_hand(library: Path) -> AbstractContextManager[Path]:
-    """One by URL, as a run that is gone on with may name, is copied."""
-    from vplog.remote import local_copy
-
-    return local_copy(library)
-
-
 def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
-    """Logs, settings, library and topics: those of the command, or with --resume of the run that is gone on with."""
+    """Logs, settings, library and topics: those of the command, or with --resume those of the unfinished run."""
     if not arguments.resume:
         if not arguments.logs:
             arguments.refuse("the following arguments are required: LOG")
@@ -254,8 +249,8 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
     names = [name for name in asking if name in asked_by or name.endswith(("_topic", "_file"))]
     given = [name for name in names if asking[name] not in (None, [], False, "default")]
     if given or not arguments.cache:
-        option = given[0].removesuffix("_file").replace("_", "-") if given else "no-cache"
-        arguments.refuse(f"argument --resume: a run is gone on with as it began; leave out --{option}")
+        option = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
+        arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{option}")
     asked = asked_for(arguments.output, arguments.logs)
     arguments.one_drive, arguments.force = not asked.several, True  # what it replaces, it was asked when it began
     return asked.logs, asked.pipeline, asked.library, asked.topics

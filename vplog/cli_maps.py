@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,10 +25,12 @@ from vplog.cli_print import (
     print_export,
     print_joined,
     print_json,
+    print_line,
     print_map,
     print_merge,
     print_redescribed,
-    say,
+    print_result,
+    warn,
 )
 
 if TYPE_CHECKING:
@@ -46,10 +49,7 @@ def export_map(arguments: argparse.Namespace) -> None:
         found = write_map(
             arguments.sources, arguments.output, arguments.drive, arguments.box, arguments.format, progress
         )
-    if arguments.json:
-        print_json(found)
-    else:
-        print_export(found)
+    print_result(arguments, found, print_export)
 
 
 def merge_maps(arguments: argparse.Namespace) -> None:
@@ -58,10 +58,7 @@ def merge_maps(arguments: argparse.Namespace) -> None:
 
     with Progress(arguments) as progress:
         found = merge(arguments.maps, arguments.target, progress, arguments.drive)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_merge(found)
+    print_result(arguments, found, print_merge)
 
 
 def join_map(arguments: argparse.Namespace) -> None:
@@ -70,10 +67,7 @@ def join_map(arguments: argparse.Namespace) -> None:
 
     with Progress(arguments) as progress:
         found = join(arguments.map, arguments.threads, progress)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_joined(found)
+    print_result(arguments, found, print_joined)
 
 
 def remove_drives(arguments: argparse.Namespace) -> None:
@@ -86,8 +80,8 @@ def remove_drives(arguments: argparse.Namespace) -> None:
     else:
         print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
         if found["still_joined"]:
-            said = f"Solve those that were joined with {', '.join(found['still_joined'])}"
-            print(f"{said}: vplog map join {found['map']}")
+            print_line("to solve", f"{', '.join(found['still_joined'])} were joined with what is removed")
+            print(f"next      vplog map join {shlex.quote(str(found['map']))}")
 
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
@@ -139,10 +133,7 @@ def _end(
     from vplog.errors import ResultError
 
     try:
-        if arguments.json:
-            print_json(found)
-        else:
-            shown(found)
+        print_result(arguments, found, shown)
     finally:
         if found["failed"]:
             raise ResultError(wrong)
@@ -157,10 +148,7 @@ def info_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.info import describe_map
 
     found = describe_map(arguments.map, check=arguments.check)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_map(found)
+    print_result(arguments, found, print_map)
     if wrong := found["damaged_files"]:
         raise ResultError(
             f"{len(wrong)} damaged files in {arguments.map}: vplog batch LOG -o MAP computes drives again."
@@ -180,10 +168,7 @@ def query_map(arguments: argparse.Namespace) -> None:
                 arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
                 arguments.output, arguments.threads, progress, workers, cache,
             )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_answers(found)
+    print_result(arguments, found, print_answers)
 
 
 def index_map(arguments: argparse.Namespace) -> None:
@@ -200,8 +185,7 @@ def index_map(arguments: argparse.Namespace) -> None:
             f"{found['map']}: {found['places']} places of {len(found['drives'])} drives in {len(found['segments'])} "
             f"files, {found['bytes'] / 1e6:.1f} MB"
         )
-        for warning in found["warnings"]:
-            say(f"warning: {warning}")
+        warn(found["warnings"])
 
 
 def _cache(arguments: argparse.Namespace) -> Cache | None:

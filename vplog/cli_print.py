@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
-import shutil
 import sys
 import textwrap
 from contextlib import suppress
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from vplog.urls import without_secrets
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -29,25 +29,35 @@ _UNMOVED_M = 1e-3
 
 
 def say(message: str) -> None:
-    """A line on stderr. Where that is closed or full, no work is lost for it."""
+    """A line on stderr, wrapped as those of results. Where that is closed or full, no work is lost for it."""
     with suppress(OSError):
-        print(f"vplog: {without_secrets(message)}", file=sys.stderr)
+        print(_wrapped(f"vplog: {without_secrets(message)}", terminal_width(sys.stderr)), file=sys.stderr)
 
 
-def terminal_width() -> int | None:
-    """Columns of the terminal that stdout is; None for a pipe or a file, where a line has no limit."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+def warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        say(f"warning: {warning}")
+
+
+def terminal_width(stream: TextIO) -> int | None:
+    """Columns of the terminal that a stream is; None for a pipe or a file, where a line has no limit."""
+    with suppress(OSError, ValueError):  # it is no file
+        return os.get_terminal_size(stream.fileno()).columns or None
+    return None
 
 
 def print_line(label: str, text: str) -> None:
     """A label and a text, wrapped between words where stdout is a terminal: names are whole and can be copied."""
-    line, width = f"{label:10}{' ' if len(label) > 9 else ''}{text}", terminal_width()
-    if width is not None:
-        line = textwrap.fill(
-            line, max(width, 20), subsequent_indent=" " * min(10, width // 4), break_long_words=False,
-            break_on_hyphens=False,
-        )  # fmt: skip
-    print(line)
+    print(_wrapped(f"{label:10}{' ' if len(label) > 9 else ''}{text}", terminal_width(sys.stdout)))
+
+
+def _wrapped(line: str, width: int | None) -> str:
+    if width is None:
+        return line
+    return textwrap.fill(
+        line, max(width, 20), subsequent_indent=" " * min(10, width // 4), break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
 
 
 def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -61,7 +71,7 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     heads = [list(line) for line in zip_longest(*(title.split("\n") for title in titles), fillvalue="")]
     widths = [max(map(cell_len, column)) for column in zip(*heads, *cells, strict=True)]
     right = [all(re.fullmatch(r"[-+.\d]*", cell) for cell in column) for column in zip(*cells, strict=True)]
-    width = terminal_width()
+    width = terminal_width(sys.stdout)
     if width is None or sum(widths) + 2 * len(widths) <= width:
         for row in heads + cells:
             blanks = [" " * (wide - cell_len(cell)) for wide, cell in zip(widths, row, strict=True)]
@@ -116,8 +126,7 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
     print_line("", f"{counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates:")
     for name, count in counts["verdicts"].items():
         print_line(f"{count:9d}", f"{name}: {Verdict(name).sentence}")
-    for warning in record["warnings"]:
-        say(f"warning: {warning}")
+    warn(record["warnings"])
     print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
     commands = [f"vplog evaluate {named} --truth FILE.tum", f"vplog export {named} --format kitti -o FILE"]
     if outcome.closures:
@@ -142,8 +151,7 @@ def print_joint(out: Path, record: dict[str, Any]) -> None:
     for tie in record["joins"]:
         text = f"{tie['kept']} closures of {tie['candidates']} candidates"
         print_line("", f"{tie['query_drive']} to {tie['match_drive']}: {text}")
-    for warning in record["warnings"]:
-        say(f"warning: {warning}")
+    warn(record["warnings"])
     totals, named = record["totals"], shlex.quote(str(out))
     print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
     first = shlex.quote(f"{out}/{record['maps'][0]['drives'][0]}")
@@ -156,7 +164,7 @@ def print_joint(out: Path, record: dict[str, Any]) -> None:
 def print_evaluation(found: dict[str, Any]) -> None:
     for number, one in enumerate(found.get("maps", [])):
         ate = one["ate_after"]
-        print(f"map {number}     ATE rmse {ate['rmse_m']:.6f} m as one trajectory ({ate['alignment']})")
+        print_line(f"map {number}", f"ATE rmse {ate['rmse_m']:.6f} m as one trajectory ({ate['alignment']})")
         for drive in one["drives"]:
             before, after = drive["ate_before"]["rmse_m"], drive["ate_after"]["rmse_m"]
             print(f"  {drive['drive']}: ATE rmse {before:.6f} m before, {after:.6f} m after, by itself")
@@ -169,27 +177,27 @@ def print_evaluation(found: dict[str, Any]) -> None:
         say(f"warning: {drive} is left out: {why}")
     if "maps" in found:
         return
-    for line in _truth_notes(found):
-        say(f"warning: {line}")
+    warn(_truth_notes(found))
     if found.get("closures"):
         _print_closures(found["closures"])
     residuals = found.get("residuals")
     if residuals and residuals["to_truth"] is not None:
         near = "" if residuals["to_neighbours"] is None else f", {residuals['to_neighbours']:.2f} to its neighbours"
-        print(f"residuals median {residuals['to_truth']:.2f} sigma to the truth{near} (honest ones have about 1)")
+        text = (
+            f"median {residuals['to_truth']:.2f} sigma to the truth{near} (consistent with their covariance: about 1)"
+        )
+        print_line("residuals", text)
     for when in ("before", "after"):
         ate, rpe, drift = found[f"ate_{when}"], found.get(f"rpe_{when}"), found.get(f"drift_{when}")
         scale = f", scale {ate['scale']:.4f}" if ate["alignment"] == "Sim(3)" else ""
-        line = f"{when:9} ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m ({ate['alignment']}{scale})"
+        line = f"ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m ({ate['alignment']}{scale})"
         if rpe is not None and rpe["count"]:
             line += f"   RPE {rpe['translation_rmse_m']:.4f} m, {rpe['rotation_rmse_deg']:.4f} deg a frame"
-        print(line)
+        print_line(when, line)
         if drift is not None and drift["segments"]:
-            ends = f"{drift['lengths_m'][0]:g} to {drift['lengths_m'][-1]:g} m"
-            print(
-                f"{'':9} drift {drift['translation_m']:.2f} m, {drift['rotation_deg']:.2f} deg per 100 m "
-                f"(mean of {drift['segments']} segments of {ends} of path)"
-            )
+            over = f"{drift['segments']} segments of {drift['lengths_m'][0]:g} to {drift['lengths_m'][-1]:g} m of path"
+            text = f"drift {drift['translation_m']:.2f} m, {drift['rotation_deg']:.2f} deg per 100 m (mean of {over})"
+            print_line("", text)
 
 
 def _truth_notes(found: dict[str, Any]) -> list[str]:
@@ -226,39 +234,42 @@ def _print_closures(closures: dict[str, Any], indent: str = "") -> None:
         name: "none" if closures.get(name) is None else f"{closures[name]:.3f}"
         for name in ("precision", "place_precision", "recall")
     }
-    bounds, blank = closures["criterion"], f"{indent}{'':9} "
-    print(
-        f"{indent}closures  {closures['accepted']} accepted, {closures['accepted_true']} of them true, "
-        f"{closures['accepted_false']} false (precision {share['precision']}); {closures['opposite']} in the opposite "
-        "direction"
+    bounds, blank = closures["criterion"], indent
+    print_line(
+        f"{indent}closures",
+        f"{closures['accepted']} accepted, {closures['accepted_true']} of them true, {closures['accepted_false']} "
+        f"false (precision {share['precision']}); {closures['opposite']} in the opposite direction",
     )
     if closures["not_judged"]:
-        print(f"{blank}{closures['not_judged']} are not judged: the truth has a gap there, or is too coarse to tell")
-    print(
-        f"{blank}true by pose: within {bounds['translation_m']:.2f} m and {bounds['rotation_deg']:g} deg of the truth, "
-        f"or the claimed covariance, at most {bounds['most']:g} times that: {bounds['length_m']:.0f} m of drive"
+        print_line(
+            blank, f"{closures['not_judged']} are not judged: the truth has a gap there, or is too coarse to tell"
+        )
+    print_line(
+        blank,
+        f"true by pose: within {bounds['translation_m']:.2f} m and {bounds['rotation_deg']:g} deg of the truth, "
+        f"or the claimed covariance, at most {bounds['most']:g} times that: {bounds['length_m']:.0f} m of drive",
     )
     if closures["overconfident"]:
-        print(f"{blank}{closures['overconfident']} true ones are further off than their covariance claims (99.9 %)")
+        print_line(
+            blank, f"{closures['overconfident']} true ones are further off than their covariance claims (99.9 %)"
+        )
     if closures["by_place"]:
-        print(f"{blank}{closures['by_place']} without a pose in metres are judged by place")
-    print(
-        f"{indent}places    {closures['same_place']} accepted between frames within {bounds['distance_m']:g} m and "
-        f"{bounds['heading_deg']:g} deg between optical axes (precision {share['place_precision']})"
+        print_line(blank, f"{closures['by_place']} without a pose in metres are judged by place")
+    print_line(
+        f"{indent}places",
+        f"{closures['same_place']} accepted between frames within {bounds['distance_m']:g} m and "
+        f"{bounds['heading_deg']:g} deg between optical axes (precision {share['place_precision']})",
     )
     if "revisits" not in closures:
         return
-    print(f"{blank}{closures['revisits_found']} of {closures['revisits']} revisits found (recall {share['recall']})")
+    recall = f"{closures['revisits_found']} of {closures['revisits']} revisits found (recall {share['recall']})"
+    print_line(blank, recall)
     if closures["directions"]:
-        print(
-            f"{blank}{closures['directions']} closures without metres, {closures['directions_true']} of them true by "
-            "place, turn and direction"
-        )
+        what = f"{closures['directions_true']} of them true by place, turn and direction"
+        print_line(blank, f"{closures['directions']} closures without metres, {what}")
     if closures["without_pose"]:
-        print(
-            f"{blank}{closures['without_pose']} candidates agree without a calibration, "
-            f"{closures['without_pose_same_place']} of them of one place"
-        )
+        what = f"{closures['without_pose_same_place']} of them of one place"
+        print_line(blank, f"{closures['without_pose']} candidates agree without a calibration, {what}")
 
 
 def print_explanation(told: dict[str, Any]) -> None:
@@ -282,8 +293,7 @@ def print_optimised(found: dict[str, Any]) -> None:
     )
     print(f"  error {found['error_before']:.6g} before, {found['error_after']:.6g} after (half the chi-square)")
     print(f"  {found['reason']}")
-    for warning in found["warnings"]:
-        say(f"warning: {warning}")
+    warn(found["warnings"])
     print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
@@ -311,8 +321,7 @@ def print_batch(found: dict[str, Any]) -> None:
     for drive in found["drives"]:
         for warning in drive["warnings"]:
             say(f"warning: {drive['drive']}: {warning}")
-    for warning in found["warnings"] + (found["joined"] or {}).get("warnings", []):
-        say(f"warning: {warning}")
+    warn(found["warnings"] + (found["joined"] or {}).get("warnings", []))
     named = shlex.quote(str(found["map"]))
     look = f"{found['map']}/runs/drive=ID/report.html of each drive"
     print_next(look, f"vplog map info {named}", f"vplog map query {named} LOG")
@@ -342,8 +351,7 @@ def print_map(found: dict[str, Any]) -> None:
     print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"), rows)
     for drive, failure in found["failures"].items():
         say(f"failed: {drive}: {failure['error']}")
-    for problem in found["problems"]:
-        say(f"warning: {problem}")
+    warn(found["problems"])
     for line in found["damaged_files"]:
         say(f"damaged: {line}")
 
@@ -351,27 +359,26 @@ def print_map(found: dict[str, Any]) -> None:
 def print_export(found: dict[str, Any]) -> None:
     for drive in found.get("left_out", ()):
         say(f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes.")
-    for warning in found.get("warnings", ()):
-        say(f"warning: {warning}")
+    warn(found.get("warnings", ()))
     print(f"{found['written']}: {found['places']} places of {len(found['drives'])} drives")
 
 
 def print_joined(found: dict[str, Any]) -> None:
     print(f"{found['map']}: {found['pairs']} pairs of drives looked at, {found['pairs_computed']} of them now")
     for component in found["components"]:
-        print(f"together   {', '.join(component['drives'])}, in joint/{component['folder']}")
+        print_line("together", f"{', '.join(component['drives'])}, in joint/{component['folder']}")
     if found["alone"]:
-        print(f"alone      {', '.join(found['alone'])}")
-    for warning in found["warnings"]:
-        say(f"warning: {warning}")
+        print_line("alone", ", ".join(found["alone"]))
+    warn(found["warnings"])
+    named = shlex.quote(str(found["map"]))
+    print_next(f"{found['map']}/joint/KEY of the drives together", f"vplog evaluate {named} --truth FILE.tum")
 
 
 def print_merge(found: dict[str, Any]) -> None:
     for one in found["drives"]:
         other = "" if one["as"] == one["drive"] else f" as {one['as']}"
         print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
-    for warning in found["warnings"]:
-        say(f"warning: {warning}")
+    warn(found["warnings"])
     taken = sum(one["state"] != "there already" for one in found["drives"])
     print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
     if any(one["state"] == "taken" for one in found["drives"]):
@@ -383,8 +390,8 @@ def print_redescribed(found: dict[str, Any]) -> None:
         other = "" if one["was"] == one["drive"] else f", was {one['was']}"
         print(f"{one['state']:10}{one['drive']}{other}{': ' if one['error'] else ''}{one['error']}")
     print(f"{found['map']}: {len(found['drives']) - found['failed']} drives, library {found['library']}")
-    for warning in (found["joined"] or {}).get("warnings", []):
-        say(f"warning: {warning}")
+    warn((found["joined"] or {}).get("warnings", []))
+    print(f"next      vplog map query {shlex.quote(str(found['map']))} LOG")
 
 
 def print_answers(found: dict[str, Any]) -> None:
@@ -395,8 +402,7 @@ def print_answers(found: dict[str, Any]) -> None:
         if one["rank"] == 0
     ]
     print_table(("view", "drive", "keyframe", "score", "support"), rows)
-    for warning in found["warnings"]:
-        say(f"warning: {warning}")
+    warn(found["warnings"])
     print(f"{found['log']}: {found['answered']} of {found['views']} views are like a place of {found['map']}")
     if found["written"]:
         print(f"written   {found['written']}")
@@ -419,8 +425,7 @@ def print_comparison(found: dict[str, Any]) -> None:
             rows.append((f"  L={scores['length']}", *(f"{scores[share]:.3f}" for share in shares), "", "", ""))
     titles = ("method", "R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms")
     print_table(titles, rows)
-    for warning in found["warnings"]:
-        say(f"warning: {warning}")
+    warn(found["warnings"])
 
 
 def print_study(out: Path, found: dict[str, Any]) -> None:
@@ -449,8 +454,7 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
             for row in done["ablations"]["rows"]
         ]
         print_table(("bobb without", "setting", "R@1", "ANR %", "AP"), table)
-    for warning in found["warnings"]:
-        say(f"warning: {warning}")
+    warn(found["warnings"])
     figures = sum(len(one["figures"]) for one in done.values()) // 2
     print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")
 
@@ -487,6 +491,13 @@ class Progress:
         """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
         if self._line_by_line:
             say(f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}")
+
+
+def print_result(
+    arguments: argparse.Namespace, found: dict[str, Any], in_words: Callable[[dict[str, Any]], None]
+) -> None:
+    """One JSON object with --json, else in words."""
+    (print_json if arguments.json else in_words)(found)
 
 
 def print_json(tree: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vplog.cli_options import STDOUT, local_file, local_file_or_stdout, place, positive, topics_of
-from vplog.cli_print import print_evaluation, print_explanation, print_json, print_optimised
+from vplog.cli_print import print_evaluation, print_explanation, print_json, print_optimised, print_result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -38,10 +38,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
         found = evaluate_map(arguments.run, arguments.truth, options)
     else:
         found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), options)
-    if arguments.json:
-        print_json(found)
-    else:
-        print_evaluation(found)
+    print_result(arguments, found, print_evaluation)
 
 
 def explain(arguments: argparse.Namespace) -> None:
@@ -54,10 +51,7 @@ def explain(arguments: argparse.Namespace) -> None:
     else:
         choose = numbered(*arguments.closure) if len(arguments.closure) == 1 else between(*arguments.closure)
     told = explain_closure(arguments.run, choose, arguments.output, arguments.log, arguments.no_picture)
-    if arguments.json:
-        print_json(told)
-    else:
-        print_explanation(told)
+    print_result(arguments, told, print_explanation)
 
 
 def optimize(arguments: argparse.Namespace) -> None:
@@ -65,10 +59,7 @@ def optimize(arguments: argparse.Namespace) -> None:
     from vplog.optimize import optimize as optimize_graph
 
     done = optimize_graph(arguments.graph, arguments.output, arguments.method)
-    if arguments.json:
-        print_json(done.record)
-    else:
-        print_optimised(done.record)
+    print_result(arguments, done.record, print_optimised)
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -109,12 +100,8 @@ def _add_truth_options(sub: argparse.ArgumentParser) -> None:
         "--heading-deg", type=positive, metavar="DEG", help="and their optical axes turned by less (default: 45)"
     )
     sub.add_argument("--align", choices=_ALIGNMENTS, default="se3", help="alignment of the ATE (default: se3)")
-    sub.add_argument(
-        "--truth-offset-s",
-        type=_seconds,
-        metavar="S",
-        help="add to the truth's stamps (default: found, for closures alone)",
-    )
+    text = "add to the truth's stamps (default: found, for closures alone)"
+    sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help=text)
 
 
 @contextmanager

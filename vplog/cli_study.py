@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from vplog.cli_options import at_least, at_least_one, local, pipeline_of, place, positive, topics_of
-from vplog.cli_print import Progress, print_comparison, print_json, print_study
+from vplog.cli_print import Progress, print_comparison, print_json, print_result, print_study
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,10 +36,7 @@ def compare(arguments: argparse.Namespace) -> None:
             threads=arguments.threads,
             progress=progress,
         )
-    if arguments.json:
-        print_json(done.record)
-    else:
-        print_comparison(done.record)
+    print_result(arguments, done.record, print_comparison)
 
 
 def study(arguments: argparse.Namespace) -> None:

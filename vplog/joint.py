@@ -18,6 +18,7 @@ from vplog.graph.correct import correct_trajectory
 from vplog.joint_graph import between_of, judged_by, own_drive
 from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of
+from vplog.parts import odometry_of
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables, tum
 from vplog.results.run_record import CACHE
@@ -66,8 +67,11 @@ def run_joint(
     """
     if pipeline.gps.use:
         raise SettingsError("GPS holds one drive at a time: run each by itself with --gps, or several without.")
-    drives_at = dict(zip(_names([logs.open(path, topics).name for path in paths]), paths, strict=True))
+    opened = [logs.open(path, topics) for path in paths]
+    drives_at = dict(zip(_names([log.name for log in opened]), paths, strict=True))
     check_library(library, pipeline)
+    for log in opened:  # before the first drive is computed
+        odometry_of(log)
     watch = Watch()
     with ExitStack() as stack:
         made = stack.enter_context(

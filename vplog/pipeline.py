@@ -65,9 +65,6 @@ _UNCALIBRATED = (
 )
 
 
-_NO_CLOSURE = "No closure passed verification: the trajectory is that of the odometry."
-
-
 class Pipeline(Settings):
     """Every setting of a run. A pipeline file holds only what differs."""
 
@@ -271,7 +268,9 @@ def run(
                 "error_after": solution.error_after,
                 "iterations": solution.iterations,
                 "converged": solution.converged,
-                "reason": solution.reason if EdgeKind.LOOP in graph.kind or solved.fixes else _NO_CLOSURE,
+                "reason": solution.reason
+                if EdgeKind.LOOP in graph.kind or solved.fixes
+                else "No closure passed verification.",
             },
             "odometry": {"sigma_factor": float(np.sqrt(solved.refined.noise)), "scale": solved.refined.scale},
             "gps": on_earth,

@@ -29,8 +29,9 @@ _RUN_FILES = (
     "closures.parquet", "edges.parquet", "trajectory.parquet", "library/library.json", "library/features.parquet",
     "library/references.parquet", "map[0-9]*.g2o", "joins.parquet", "joint_keyframes.parquet",
     "joint_trajectory.parquet", "joint_trajectory.tum",
+    *(f"closure-{'[0-9]' * digits}.png" for digits in range(1, 10)),
 )  # fmt: skip
-"""All that a run may have written into its folder or into those of its drives, as glob patterns."""
+"""All that runs and `explain` write into the folder of a run and into those of its drives, as glob patterns."""
 
 
 @contextmanager
@@ -63,6 +64,9 @@ def begun(
 
     def begin() -> list[str]:
         check_regular(out, "run.json")
+        above = out.absolute().parent
+        if out.absolute().name in _drives_in(_read(above / "run.json") or {}) or (out / "drive.json").exists():
+            raise SettingsError(f"{out} is a drive of the run or map in {above}. Choose another folder with -o.")
         if not force:
             _check_same_logs(out, files)
         return _results_in(out, library, drives or {}, resumable)
@@ -76,20 +80,20 @@ def begun(
             yield made
         except BaseException as error:
             kept = set(cache.rglob(f"*{ENDING}")) - before if resumable else ()
-            if not kept:
-                request.unlink(missing_ok=True)
-                with suppress(OSError):  # not there, or it holds what was kept of other runs
-                    cache.rmdir()
-            passing = was_interrupted(error) or (kept and isinstance(error, OSError | MemoryError | ResultError))
-            if resumable and passing:
+            interrupted = was_interrupted(error)
+            if kept and (interrupted or isinstance(error, OSError | MemoryError | ResultError)):
                 error.add_note(_what_is_kept(out, kept))
+            else:
+                request.unlink(missing_ok=True)  # resumed, it would fail again
+                with suppress(OSError):  # not there, or it holds what was kept of this and other runs
+                    cache.rmdir()
+                if resumable and interrupted:
+                    error.add_note("no stage was finished, so nothing is kept. Give the same command again")
             raise
 
 
 def _what_is_kept(out: Path, kept: Collection[Path]) -> str:
-    """Of a run that was interrupted, and how to go on."""
-    if not kept:
-        return "no stage was finished, so nothing is kept of this run. Begin it again with the same command"
+    """Of a run that was interrupted, and the command that resumes it."""
     stages = ", ".join(sorted({file.name.split("-")[0] for file in kept}))
     return (
         f"{sum(file.stat().st_size for file in kept) / 1e6:.1f} MB of results of stages ({stages}) are kept in "

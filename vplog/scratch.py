@@ -67,6 +67,20 @@ def _sweep(among: Path) -> None:
             shutil.rmtree(path.parent, ignore_errors=True)
 
 
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """A folder, with those above it, for a block; those made for it go again where they are empty at its end. Raises
+    OSError where it cannot be made."""
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        with suppress(OSError):  # it holds something
+            for one in made:
+                one.rmdir()
+
+
 def put_in_place(part: Path, path: Path) -> None:
     """Rename a file or a folder with its files to `path`, so that after a power cut what is there is whole: content is
     on the disk before the name is. Raises OSError."""

@@ -250,7 +250,7 @@ def test_drives_with_gps_are_kept_apart(joint: Path, tmp_path: Path) -> None:
 
 
 def test_a_map_is_joined_on_demand(copy: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
-    assert "together   after, before" in verb("map", "join", copy).out
+    assert "together  after, before" in verb("map", "join", copy).out
     assert verb("map", "join", copy, "--json").json["pairs_computed"] == 0
     assert "is not a map" in verb("map", "join", tmp_path / "none").error
     (copy / "joint.json").write_text("{")

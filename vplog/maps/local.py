@@ -6,7 +6,7 @@ import ctypes
 import fcntl
 import os
 import shutil
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from vplog.errors import ResultError, SettingsError
 from vplog.folders import check_regular, regular_files
 from vplog.maps.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
 from vplog.results.atomic import replacing
-from vplog.scratch import sync, sync_all
+from vplog.scratch import made_folder, sync, sync_all
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -34,21 +34,26 @@ def locked(root: Path) -> Iterator[None]:
         if others:
             raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
     check_regular(root)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        lock = (root / ".lock").open("a")
-    except OSError as error:
-        raise SettingsError(
-            f"Cannot write to {root}: {error.strerror}. Check its permissions, or choose another folder."
-        ) from None
-    with lock:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(made_folder(root))
+            lock = stack.enter_context((root / ".lock").open("a"))
+        except OSError as error:
+            raise SettingsError(
+                f"Cannot write to {root}: {error.strerror}. Check its permissions, or choose another folder."
+            ) from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise SettingsError(f"Another vplog process is writing to {root}. Wait for it to end.") from None
         except OSError as error:  # file systems without locks
             raise SettingsError(f"Cannot lock {root}/.lock: {error.strerror}. Choose another folder with -o.") from None
-        yield
+        try:
+            yield
+        finally:
+            if not (root / "map.json").exists():  # nothing came of it
+                shutil.rmtree(root / ".staging", ignore_errors=True)
+                (root / ".lock").unlink(missing_ok=True)
 
 
 def settle(store: Store) -> None:

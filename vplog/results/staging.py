@@ -11,14 +11,14 @@ import fcntl
 import json
 import os
 import shutil
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, TextIO
 
 from vplog.errors import ResultError, SettingsError
 from vplog.parquet_bounds import check_file
 from vplog.results.atomic import replacing
-from vplog.scratch import files_in
+from vplog.scratch import files_in, made_folder, put_in_place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -36,24 +36,19 @@ def staged(out: Path, begin: Callable[[], Sequence[str]]) -> Iterator[Path]:
     `begin` is called when `out`, which is made where it is not there, has no other writer. It may refuse, and gives
     glob patterns of the results that an earlier writer may have left there. Raises SettingsError or ResultError.
     """
-    existed, staging = out.exists(), out / _STAGING
-    try:
-        with _locked(out):
-            if (out / _COMMITTED).exists():
-                _move(out)
-            results = begin()
-            shutil.rmtree(staging, ignore_errors=True)  # of a process that was killed
-            staging.mkdir()
-            try:
-                yield staging
-                _commit(out, results)
-            finally:
-                shutil.rmtree(staging, ignore_errors=True)
+    staging = out / _STAGING
+    with _locked(out):
+        if (out / _COMMITTED).exists():
             _move(out)
-    finally:
-        if not existed:
-            with suppress(OSError):  # it holds something
-                out.rmdir()
+        results = begin()
+        shutil.rmtree(staging, ignore_errors=True)  # of a process that was killed
+        staging.mkdir()
+        try:
+            yield staging
+            _commit(out, results)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+        _move(out)
 
 
 def recover(out: Path) -> None:
@@ -73,20 +68,18 @@ def _locked(out: Path, wait: bool = False) -> Iterator[None]:
     """`out` for one process at a time, on file systems that have locks. Raises SettingsError."""
     path = out / _LOCK
     while True:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            lock = path.open("a")
-        except OSError as error:
-            raise SettingsError(
-                f"Cannot make the folder {out} or write in it: {error.strerror}. Choose another with -o."
-            ) from None
-        with lock:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(made_folder(out))
+                lock = stack.enter_context(path.open("a"))
+            except OSError as error:
+                raise SettingsError(
+                    f"Cannot make the folder {out} or write in it: {error.strerror}. Choose another with -o."
+                ) from None
             if not _has(lock, path, wait):
                 continue  # another process had it, and has removed it
-            try:
-                yield
-            finally:
-                path.unlink(missing_ok=True)
+            stack.callback(path.unlink, missing_ok=True)
+            yield
             return
 
 
@@ -111,7 +104,7 @@ def _commit(out: Path, results: Sequence[str]) -> None:
     before = {path.relative_to(out).as_posix() for pattern in results for path in out.glob(pattern)}
     with replacing(staging / _STALE) as stream:
         stream.write(json.dumps(sorted(before - set(files_in(staging)))).encode())
-    staging.rename(out / _COMMITTED)
+    put_in_place(staging, out / _COMMITTED)
 
 
 def _move(out: Path) -> None:

@@ -23,6 +23,7 @@ from vplog.inputs import hash_inputs
 from vplog.methods import read_methods
 from vplog.references import PAPER_SIZE
 from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
+from vplog.scratch import made_folder
 from vplog.study.bench import Bench, all_pairs
 from vplog.study.charts import CHARTS
 from vplog.study.experiments import NUMBERS, Plan
@@ -76,9 +77,9 @@ def study(
     plan = Plan(tuple(methods), library_size, tuple(sorted(set(sizes))), seeds, pipeline)
     recognisers = read_methods(methods, pipeline)
     _check_drives(drives, min_gap)
-    _begin(out)
     warnings: list[str] = []
     with ExitStack() as stack:
+        _begin(out, stack)
         stack.enter_context(record.heard(warnings))
         opened = [logs.open(path, topics) for path in drives]
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=out)))
@@ -190,11 +191,11 @@ def _check_drives(drives: Sequence[Path], min_gap: int | None) -> None:
         raise SettingsError("--min-gap is for one drive, matched with its own past; leave it out, or give one drive.")
 
 
-def _begin(out: Path) -> None:
+def _begin(out: Path, stack: ExitStack) -> None:
     if out.is_dir() and any(out.iterdir()) and not any((out / f"{n}.json").is_file() for n in ("study", "trials")):
         raise SettingsError(f"{out} is a folder with other things in it, not a study. Choose another with -o.")
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(made_folder(out))
     except OSError as error:
         raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
 
