@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     Int32s = NDArray[np.int32]
     Bytes = NDArray[np.uint8]
     Uint16s = NDArray[np.uint16]
+    Bools = NDArray[np.bool_]
 
 
 THUMBNAIL_SIDE = 128

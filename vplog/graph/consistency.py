@@ -20,11 +20,7 @@ from vplog.graph.marginals import edge_covariances
 from vplog.graph.normal import half_chi2_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Int32s, Ints, PoseGraph, Solution
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph, Solution
 
 _SURE = 0.999999
 """Probability with which odometry as good as its noise says passes keep_odometry_if_worse: 4.9 sigma of one edge."""

@@ -24,12 +24,8 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from typing import Any
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, PoseGraph, Solution
+    from vplog.data import Bools, Floats, PoseGraph, Solution
     from vplog.graph.satellites import GpsSettings
-
-    Bools = NDArray[np.bool_]
 
 _STEP = 1e-4
 """Of the scale, for differences: far above rounding, far below what any drive tells."""

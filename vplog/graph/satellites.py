@@ -18,12 +18,8 @@ from vplog.graph.truncated import truncated_weights
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Gps, Ints, Keyframes, Odometry
+    from vplog.data import Bools, Floats, Gps, Ints, Keyframes, Odometry
     from vplog.graph.factors import Factors
-
-    Bools = NDArray[np.bool_]
 
 _FREE = 1e2
 """m and rad; holds the first pose so weakly that the fixes alone say where the graph is."""

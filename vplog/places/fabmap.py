@@ -35,10 +35,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Features, Float32s, Floats, Reference
+    from vplog.data import Bools, Features, Float32s, Floats, Reference
 
     Words = NDArray[np.uint16]
-    Bools = NDArray[np.bool_]
 
 _WORD_BYTES, _PLACE_BYTES = 2, 4
 """In a table: a word's number in two bytes; where a place's list begins in four."""
