@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_chain
-from vplog.graph.dcs import DcsSettings
-from vplog.graph.geman_mcclure import GemanMcClureSettings
+from vplog.graph.robust_kernels import DcsSettings, GemanMcClureSettings
 from vplog.settings import Settings
 
 if TYPE_CHECKING:

@@ -32,8 +32,8 @@ from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_kept
 from vplog.graph.pcm import PcmSettings
+from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.scrutiny import Scrutiny
-from vplog.graph.truncated import truncated_weights
 from vplog.graph.workers import Workers
 from vplog.settings import Settings
 

@@ -14,7 +14,7 @@ from vplog.errors import GraphError
 from vplog.geodesy import local_enu
 from vplog.graph.consistency import chi2_quantile
 from vplog.graph.factors import least_squares
-from vplog.graph.truncated import truncated_weights
+from vplog.graph.robust_kernels import truncated_weights
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
