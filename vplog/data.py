@@ -8,7 +8,7 @@ moves (b of a_from_b), as GTSAM has them. Stamps are int64 nanoseconds since the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -122,6 +122,11 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def rows(self, rows: slice | Ints) -> Features:
+        """Some of the features."""
+        parts = {name: getattr(self, name)[rows] for name in ("points", "sizes", "descriptors", "depth_m")}
+        return replace(self, **parts)
 
 
 @dataclass(frozen=True, eq=False)

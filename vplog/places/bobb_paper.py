@@ -20,7 +20,7 @@ from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp, stored
 from vplog.places.columns import check_type, check_values
-from vplog.places.relearn import relearn
+from vplog.places.relearn import RelearnedSettings
 from vplog.places.search import BoxIndex
 from vplog.places.shared import Shared, list_shared
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference
 
 
-class PaperBobbSettings(lib.WordSettings):
+class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     """Bag of bounding boxes with the paper's numbers (section IV)."""
 
     kind: Literal["bobb_paper"] = "bobb_paper"
@@ -76,10 +76,6 @@ class PaperBobbSettings(lib.WordSettings):
         with ThreadPoolExecutor(threads) as pool:
             patterns = list(pool.map(lambda row: _prepare(library, row, self), range(len(library))))
         return PaperBobbState(self, library, patterns)
-
-    def load(self, folder: Path, threads: int) -> PaperBobbState:
-        """A library saved by `PaperBobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(PaperBobbSettings, folder, threads)
 
 
 @dataclass(frozen=True, eq=False)
