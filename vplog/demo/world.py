@@ -133,9 +133,11 @@ class _Shapes:
         self.quad(np.array([*corners[3], top]), np.array([*(2 * long), 0]), np.array([*(-2 * wide), 0]), faces[2])
 
     def quads(self) -> Quads:
-        places = (np.array([row[side] for row in self._rows], np.float64).reshape(-1, 3) for side in range(3))
-        pictures = (np.array([row[which] for row in self._rows], np.int32) for which in (3, 4))
-        return Quads(*places, *pictures)
+        corner, right, down = (
+            np.array([row[side] for row in self._rows], np.float64).reshape(-1, 3) for side in range(3)
+        )
+        texture, mask = (np.array([row[which] for row in self._rows], np.int32) for which in (3, 4))
+        return Quads(corner, right, down, texture, mask)
 
 
 def build_world(settings: DemoSettings) -> World:
