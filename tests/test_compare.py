@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tests.places.sequence_matrix import match_sequences
 from vplog import compare, geometry, logs
 from vplog.errors import LogError, SettingsError
 from vplog.evaluate.pairs import index_pairs
@@ -23,7 +24,7 @@ from vplog.methods import known_methods, read_method, split_methods
 from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
-from vplog.places.sequence import SequenceSettings, match_sequences
+from vplog.places.sequence import SequenceSettings
 from vplog.trials import evaluate_method, stored_bytes
 from vplog.walks import candidate_stops, extract_walk
 

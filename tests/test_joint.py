@@ -33,7 +33,7 @@ def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_no
     ties = {(tie["query_drive"], tie["match_drive"]): tie for tie in record["joins"]}
     assert ties["after", "before"]["kept"] >= 3
     assert ties["drive", "before"]["kept"] == ties["drive", "after"]["kept"] == 0
-    assert any("drive joins no other drive" in warning for warning in record["warnings"])
+    assert any("drive has too few closures with other drives" in warning for warning in record["warnings"])
 
     known = read_truth(drive.truth)
     poses = {name: tables.read_keyframes(joint / name / "joint_keyframes.parquet") for name in ("before", "after")}

@@ -17,16 +17,13 @@ from vplog.stages import index_of_part
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Int32s, Ints
+    from vplog.data import Bools, Int32s, Ints
     from vplog.graph.joint import JoinSettings
     from vplog.loops.verify import Drive
     from vplog.pipeline import Pipeline
     from vplog.stages import PlaceState
 
     Progress = Callable[[int, int], None]
-    Bools = NDArray[np.bool_]
 
 _NO_POSE = (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.TOO_FEW_INLIERS)
 """Verdicts of views that geometry does not show to be of one place."""

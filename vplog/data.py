@@ -8,7 +8,7 @@ moves (b of a_from_b), as GTSAM has them. Stamps are int64 nanoseconds since the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     Int32s = NDArray[np.int32]
     Bytes = NDArray[np.uint8]
     Uint16s = NDArray[np.uint16]
+    Bools = NDArray[np.bool_]
 
 
 THUMBNAIL_SIDE = 128
@@ -121,6 +122,11 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def rows(self, rows: slice | Ints) -> Features:
+        """Some of the features."""
+        parts = {name: getattr(self, name)[rows] for name in ("points", "sizes", "descriptors", "depth_m")}
+        return replace(self, **parts)
 
 
 @dataclass(frozen=True, eq=False)

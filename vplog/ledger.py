@@ -35,7 +35,7 @@ def verify_in_parts(
     threads: int,
     progress: Callable[[int, int], None],
 ) -> Closures:
-    """The ledger of `loops.verify.verify`, whose row depends on its two frames and the calibration alone.
+    """The ledger of `loops.verify.verify_between`, whose row depends on its two frames and the calibration alone.
 
     A part has all candidates of some map frames, whose landmarks are made once all the same.
     """

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from vplog import geometry
 from vplog.boxes import boxes_of, references_of, windows_of
-from vplog.loops import chance, undistort
+from vplog.loops import undistort
 from vplog.loops.matching import match_features
+from vplog.loops.verify_epipolar import agreeing
 from vplog.places.hybrid import HybridState
 
 if TYPE_CHECKING:
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 SHOWN = 4
 """References that are shown of a closure: more colours are not told apart."""
-_SAMPLE, _MODELS = 7, 3
-"""Matches that fix an epipolar geometry, in up to so many ways: Hartley & Zisserman 2004, section 11.1.2."""
 _SAME_SPOT_M = 1e-6
 """Two cameras nearer than this differ by a turn alone."""
 
@@ -68,16 +66,9 @@ def find_agreement(
         agrees = _on_epipolar_lines(here, there, row, camera, settings.metric.ransac_px)
         model = f"the ledger's pose (verification also asks for a known position, and counted {row['inliers']})"
         return Agreement(here, there, agrees, model)
-    s, nobody = settings.epipolar, np.zeros(len(here), bool)
-    mask = None
-    if len(here) > _SAMPLE:
-        _, mask = cv2.findFundamentalMat(there, here, cv2.USAC_MAGSAC, s.max_error_px, 0.99, s.rounds)
-    agrees = nobody if mask is None else np.asarray(mask).ravel().astype(bool)
-    # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
-    share = 2.0 * s.max_error_px * np.hypot(query.width, query.height) / (query.width * query.height)
-    alarms = chance.log10_false_alarms(len(here), int(agrees.sum()), _SAMPLE, _MODELS, share)
-    if alarms > s.log10_false_alarms:
-        return Agreement(here, there, nobody, "")
+    agrees, by_chance = agreeing(here, there, query.width, query.height, settings.epipolar)
+    if by_chance:
+        return Agreement(here, there, np.zeros(len(here), bool), "")
     return Agreement(here, there, agrees, "the epipolar geometry that most agree with")
 
 

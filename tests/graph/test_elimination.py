@@ -158,7 +158,7 @@ def test_a_matrix_that_is_not_positive_definite_is_refused(wrong: float) -> None
     diagonal = matrix.diagonal.copy()
     diagonal[17] *= wrong
     with pytest.raises(GraphError, match="does not constrain"):
-        Cholesky.of(Elimination.of(30, matrix.a, matrix.b), replace(matrix, diagonal=diagonal))
+        Cholesky.of(Elimination.of(30, matrix.a, matrix.b), matrix._replace(diagonal=diagonal))
 
 
 @each_graph

@@ -11,11 +11,13 @@ from vplog import geometry
 from vplog.data import Camera, Features, Keyframes
 from vplog.loops import undistort
 from vplog.loops.propose import Proposals
+from vplog.loops.verify import drive_of, verify_between
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
-    from vplog.data import Floats
+    from vplog.data import Closures, Floats
+    from vplog.loops.verify import VerifySettings
 
 BODY_FROM_CAMERA = geometry.pose(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, -0.1, 0.5])
@@ -103,3 +105,18 @@ def proposals(pairs: Sequence[tuple[int, int]]) -> Proposals:
     return Proposals(
         rows[:, 0], rows[:, 1], rank, np.linspace(1, 0, count, dtype=np.float32), np.zeros(count, np.int32)
     )
+
+
+def verify(
+    found: Proposals,
+    frames: Keyframes,
+    lens: Camera,
+    features: Callable[[int], Features],
+    settings: VerifySettings,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    baseline_m: float | None = None,
+) -> Closures:
+    """The ledger of the proposals of one drive."""
+    alone = drive_of(frames, lens, features, settings, baseline_m)
+    return verify_between(found, alone, alone, threads, progress)

@@ -11,9 +11,9 @@ import pytest
 
 from vplog import geometry
 from vplog.data import Camera, Features, Keyframes, Verdict
-from vplog.loops.verify import VerifySettings, verify
+from vplog.loops.verify import VerifySettings
 
-from .scene import proposals
+from .scene import proposals, verify
 
 DATA = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "drives"
 REVISITS, OPPOSITE = [(787, 64), (789, 66), (811, 90)], [(700, 290), (705, 287)]

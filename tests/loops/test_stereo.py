@@ -8,9 +8,9 @@ import pytest
 from vplog import geometry
 from vplog.data import Features, Verdict
 from vplog.loops.stereo import StereoSettings, stereo_depth
-from vplog.loops.verify import VerifySettings, verify
+from vplog.loops.verify import VerifySettings
 
-from .scene import Scene, camera, empty, keyframes, pose, proposals, scene, view
+from .scene import Scene, camera, empty, keyframes, pose, proposals, scene, verify, view
 
 LENS = replace(camera(), matrix=np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))
 BASELINE_M = 0.5

@@ -10,10 +10,10 @@ from vplog import geometry
 from vplog.data import Camera, Closures, Features, Keyframes, Verdict
 from vplog.errors import LogError
 from vplog.loops.landmarks import LandmarkSettings
-from vplog.loops.verify import VerifySettings, verify
+from vplog.loops.verify import VerifySettings
 from vplog.loops.verify_metric import MetricSettings
 
-from .scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, view
+from .scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, verify, view
 
 EXACT = VerifySettings(landmarks=LandmarkSettings(pixel_sigma=NOISE_PX, depth_share=0.0))
 COLUMNS = ("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread", "reverse_inliers")

@@ -8,10 +8,9 @@ from vplog.data import Verdict
 from vplog.loops import verify_direction
 from vplog.loops.candidate import VerifySettings
 from vplog.loops.landmarks import LandmarkSettings
-from vplog.loops.verify import verify
 from vplog.loops.verify_direction import DirectionSettings
 
-from .scene import NOISE_PX, camera, keyframes, pose, proposals, scene, view
+from .scene import NOISE_PX, camera, keyframes, pose, proposals, scene, verify, view
 
 KEEP = VerifySettings(landmarks=LandmarkSettings(pixel_sigma=NOISE_PX), direction=DirectionSettings(keep=True))
 

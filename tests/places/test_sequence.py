@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from tests.places.sequence_matrix import match_sequences
 from vplog.data import Ranking
-from vplog.places.sequence import SequenceSettings, match_sequences, rank_places, sequence_rows
+from vplog.places.sequence import SequenceSettings, rank_places, sequence_rows
 
 
 def by_definition(scores: np.ndarray, stops: np.ndarray, chosen: SequenceSettings) -> tuple[np.ndarray, np.ndarray]:

@@ -37,15 +37,10 @@ RIGHT_INFO = "/camera/right/camera_info"
 ODOMETRY = "/odom"
 GPS = "/gps/fix"
 TF_STATIC = "/tf_static"
+_IMAGE_TYPE, _CALIBRATION_TYPE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 TYPES = {
-    IMAGE: "sensor_msgs/msg/CompressedImage",
-    CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
-    DEPTH: "sensor_msgs/msg/CompressedImage",
-    DEPTH_INFO: "sensor_msgs/msg/CameraInfo",
-    LEFT: "sensor_msgs/msg/CompressedImage",
-    LEFT_INFO: "sensor_msgs/msg/CameraInfo",
-    RIGHT: "sensor_msgs/msg/CompressedImage",
-    RIGHT_INFO: "sensor_msgs/msg/CameraInfo",
+    **dict.fromkeys((IMAGE, DEPTH, LEFT, RIGHT), _IMAGE_TYPE),
+    **dict.fromkeys((CAMERA_INFO, DEPTH_INFO, LEFT_INFO, RIGHT_INFO), _CALIBRATION_TYPE),
     ODOMETRY: "nav_msgs/msg/Odometry",
     GPS: "sensor_msgs/msg/NavSatFix",
     TF_STATIC: "tf2_msgs/msg/TFMessage",
@@ -111,12 +106,7 @@ def _write_truth(path: Path, settings: DemoSettings, scene: Scene) -> None:
 def _write_log(path: Path, settings: DemoSettings, scene: Scene, threads: int) -> None:
     """All messages in the order in which they reach the recorder."""
     with ThreadPoolExecutor(threads) as pool:
-        messages = [
-            *_mounting(scene.camera),
-            *_odometry(settings),
-            *_fixes(settings),
-            *_frames(scene, pool),
-        ]
+        messages = [*_mounting(scene.camera), *_odometry(settings), *_fixes(settings), *_frames(scene, pool)]
     rng = np.random.default_rng([settings.seed, 5])
     delays = rng.integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
     logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
@@ -235,16 +225,16 @@ def _frames(scene: Scene, pool: ThreadPoolExecutor) -> Iterator[tuple[str, int, 
     rest = pool.map(encoded, range(1, len(scene.stamp_ns)))
     for stamp, (left, depth, right) in zip(scene.stamp_ns.tolist(), (first, *rest), strict=True):
         header = _header(stamp, CAMERA_FRAME)
-        compressed = TYPES[IMAGE]
-        topic, calibration = (LEFT, LEFT_INFO) if baseline_m else (IMAGE, CAMERA_INFO)
-        yield topic, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=left)
-        yield calibration, stamp, _calibration(header, scene.camera)
-        if depth is not None:
-            yield DEPTH, stamp, _message(compressed, header=header, format="16UC1; compressedDepth png", data=depth)
-            yield DEPTH_INFO, stamp, _calibration(header, scene.camera)
-        if right is not None:
-            yield RIGHT, stamp, _message(compressed, header=header, format="mono8; jpeg compressed mono8", data=right)
-            yield RIGHT_INFO, stamp, _calibration(header, scene.camera, baseline_m)
+        jpegs = "mono8; jpeg compressed mono8"
+        topics = (LEFT, LEFT_INFO) if baseline_m else (IMAGE, CAMERA_INFO)
+        for (topic, calibration), data, kind, right_m in (
+            (topics, left, jpegs, 0.0),
+            ((DEPTH, DEPTH_INFO), depth, "16UC1; compressedDepth png", 0.0),
+            ((RIGHT, RIGHT_INFO), right, jpegs, baseline_m),
+        ):
+            if data is not None:
+                yield topic, stamp, _message(_IMAGE_TYPE, header=header, format=kind, data=data)
+                yield calibration, stamp, _calibration(header, scene.camera, right_m)
 
 
 def _compressed_depth(depth: Float32s) -> Bytes:
@@ -263,7 +253,7 @@ def _calibration(header: object, camera: Camera, right_m: float = 0.0) -> Any:
     """Of the camera, or of its twin so far to the right: the fourth column of P says how far (CameraInfo)."""
     assert camera.matrix is not None  # noqa: S101 - the demo's camera is calibrated
     return _message(
-        TYPES[CAMERA_INFO],
+        _CALIBRATION_TYPE,
         header=header,
         height=camera.height,
         width=camera.width,

@@ -6,7 +6,7 @@ is found first (z-buffer), then each pixel is shaded once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,15 +45,11 @@ class Light:
         def mix(a: float, b: float) -> float:
             return (1 - share) * a + share * b
 
-        x, y, z = (mix(a, b) for a, b in zip(self.sun, other.sun, strict=True))
+        x, y, z = map(mix, self.sun, other.sun)
         norm = float(np.sqrt(x * x + y * y + z * z))
-        return Light(
-            (x / norm, y / norm, z / norm),
-            mix(self.ambient, other.ambient),
-            mix(self.gain, other.gain),
-            mix(self.gamma, other.gamma),
-            mix(self.gradient, other.gradient),
-        )
+        _, *mine = astuple(self)
+        _, *theirs = astuple(other)
+        return Light((x / norm, y / norm, z / norm), *map(mix, mine, theirs))
 
 
 def render(

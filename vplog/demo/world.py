@@ -5,7 +5,7 @@ The world's axes and distances are those of route.py.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -48,13 +48,8 @@ class Quads:
         return len(self.corner)
 
     def __add__(self, other: Quads) -> Quads:
-        return Quads(
-            np.concatenate([self.corner, other.corner]),
-            np.concatenate([self.right, other.right]),
-            np.concatenate([self.down, other.down]),
-            np.concatenate([self.texture, other.texture]),
-            np.concatenate([self.mask, other.mask]),
-        )
+        names = [field.name for field in fields(Quads)]
+        return Quads(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +133,11 @@ class _Shapes:
         self.quad(np.array([*corners[3], top]), np.array([*(2 * long), 0]), np.array([*(-2 * wide), 0]), faces[2])
 
     def quads(self) -> Quads:
-        rows = self._rows
-        return Quads(
-            np.array([r[0] for r in rows], np.float64).reshape(-1, 3),
-            np.array([r[1] for r in rows], np.float64).reshape(-1, 3),
-            np.array([r[2] for r in rows], np.float64).reshape(-1, 3),
-            np.array([r[3] for r in rows], np.int32),
-            np.array([r[4] for r in rows], np.int32),
+        corner, right, down = (
+            np.array([row[side] for row in self._rows], np.float64).reshape(-1, 3) for side in range(3)
         )
+        texture, mask = (np.array([row[which] for row in self._rows], np.int32) for which in (3, 4))
+        return Quads(corner, right, down, texture, mask)
 
 
 def build_world(settings: DemoSettings) -> World:

@@ -13,11 +13,7 @@ from vplog.data import EdgeKind, PoseGraph, Verdict
 from vplog.errors import GraphError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes
 
 AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 """Rows and columns of (6, 6) matrices that a graph of this dimension uses."""

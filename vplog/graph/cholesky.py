@@ -9,7 +9,7 @@ in one fixed order, whatever the threads.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,8 +28,7 @@ _BY_THREAD = 4
 OPEN = "The graph does not constrain all its poses. Check the information of its edges."
 
 
-@dataclass(frozen=True, eq=False)
-class Blocks:
+class Blocks(NamedTuple):
     """A symmetric matrix of n x n blocks (d, d)."""
 
     diagonal: Floats
@@ -62,13 +61,11 @@ class Cholesky:
         begin = np.concatenate([[0], np.cumsum(wide * (wide + below))])
         values = np.empty(begin[-1])
         children = np.bincount(shape.parent[shape.parent >= 0], minlength=len(wide))
-        form = (shape.first, shape.start, shape.rows, shape.place)
+        form, subtrees = shape.form, shape.subtrees
         listed = by_supernode(shape.place, shape.first, matrix.a, matrix.b)
-        blocks = (*listed, matrix.diagonal, matrix.a, matrix.b, matrix.other)
-        subtrees = shape.subtrees
         handed: dict[int, tuple[Floats, int]] = {}  # a matrix, and how many of its first rows and columns are done with
         with Workers() as workers:
-            tasks = [(*run, *form, shape.parent, children, begin, values, *blocks) for run in subtrees.runs]
+            tasks = [(*run, form, children, begin, values, listed, matrix) for run in subtrees.runs]
             for good, left, roots in workers.each(eliminate_run, tasks):
                 if not good:
                     raise GraphError(OPEN)
@@ -76,9 +73,9 @@ class Cholesky:
                     handed[root] = left[end - below[root] ** 2 : end].reshape(below[root], below[root]), 0
             for node, own in zip(subtrees.top, subtrees.children, strict=True):
                 front = np.empty((wide[node] + below[node], wide[node] + below[node]))
-                fill(node, front, *form, *blocks)
+                fill(node, front, form, listed, matrix)
                 for child in reversed(own):
-                    to = rows_of_child(node, child, *form[:3], size)
+                    to = rows_of_child(node, child, form, size)
                     parts = workers.ranges(0, len(to), -(-SHARED // size), _BY_THREAD)
                     workers.each(gather, [(front, to, size, *handed[child], *part) for part in parts])
                     del handed[child]
@@ -95,7 +92,7 @@ class Cholesky:
         moved = np.empty(right.shape)
         moved[shape.place] = right
         flat = moved.reshape(-1, right.shape[2])
-        root = (shape.first, shape.start, shape.rows, self.begin, self.size, self.values, flat)
+        root = (shape.form, self.begin, self.size, self.values, flat)
         with Workers() as workers:
             tasks = [(*run, after, *root) for run, after in zip(subtrees.runs, subtrees.after, strict=True)]
             for after, more in zip(subtrees.after, workers.each(forward_run, tasks), strict=True):

@@ -7,11 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Ints
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Ints
 
 
 def largest_clique(joined: Bools, most_steps: int) -> tuple[Ints, bool]:

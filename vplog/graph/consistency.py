@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
@@ -20,11 +20,7 @@ from vplog.graph.marginals import edge_covariances
 from vplog.graph.normal import half_chi2_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Int32s, Ints, PoseGraph, Solution
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph, Solution
 
 _SURE = 0.999999
 """Probability with which odometry as good as its noise says passes keep_odometry_if_worse: 4.9 sigma of one edge."""
@@ -248,7 +244,7 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
         return solution
     try:
-        checks = max(round(_redundancy(graph, kept, solution.world_from_body, odometry)), 1)
+        checks = max(round(redundancy(Factors.of(graph), kept, solution.world_from_body, np.flatnonzero(odometry))), 1)
     except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
         checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))
     bound = chi2_quantile(_SURE, checks)
@@ -256,21 +252,33 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
         bound = chi2_quantile(_SURE, known_to) / known_to * checks
     if chi2 <= bound:
         return solution
-    return replace(
+    return odometry_kept(
+        graph,
         solution,
-        world_from_body=odometry_chain(graph)[0],
-        weight=np.where(odometry, 1.0, 0.0),
-        error_before=0.0,
-        error_after=0.0,
-        reason=f"Odometry was kept: {closures} closures bend it to a chi-square of {chi2:.4g} where its noise "
-        f"allows {bound:.4g}, so some are false or the noise is too small.",
+        f"{closures} closures bend it to a chi-square of {chi2:.4g} where its noise allows {bound:.4g}, so some are "
+        "false or the noise is too small.",
     )
 
 
-def _redundancy(graph: PoseGraph, weight: Floats, poses: Floats, edges: Bools) -> float:
-    """Degrees of freedom with which the rest of the weighted graph checks these edges (E,)."""
-    rows = np.flatnonzero(edges)
-    left_open = edge_covariances(Factors.of(graph), weight, poses, rows)
+def odometry_kept(graph: PoseGraph, solution: Solution, why: str) -> Solution:
+    """The poses of the odometry alone, without any loop."""
+    return replace(
+        solution,
+        world_from_body=odometry_chain(graph)[0],
+        weight=np.where(is_loop(graph), 0.0, 1.0),
+        error_before=0.0,
+        error_after=0.0,
+        reason=f"Odometry was kept: {why}",
+    )
+
+
+def redundancy(factors: Factors, weight: Floats, poses: Floats, rows: Ints, weighted: Any = None) -> float:
+    """Degrees of freedom with which the rest of the weighted edges (E,), or of `weighted`, checks edges `rows`.
+
+    An edge's own less the trace of its information times what the solution leaves open of it (Foerstner 1979).
+    """
+    graph = factors.graph
+    left_open = edge_covariances(factors, weight, poses, rows, weighted)
     return degrees_of_freedom(graph) * len(rows) - float(np.einsum("eij,eji->", informed(graph)[rows], left_open))
 
 

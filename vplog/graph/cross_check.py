@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 from pydantic import Field
 
-from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_chain
-from vplog.graph.dcs import DcsSettings
-from vplog.graph.geman_mcclure import GemanMcClureSettings
+from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_kept
+from vplog.graph.robust_kernels import DcsSettings, GemanMcClureSettings
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -47,13 +44,10 @@ def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSett
         if keep_odometry_if_worse(graph, other) is other:
             return solution
         said.append(f"{kernel.kind} {int((other.weight[loops] > 0.5).sum())}")
-    return replace(
+    return odometry_kept(
+        graph,
         solution,
-        world_from_body=odometry_chain(graph)[0],
-        weight=np.where(loops, 0.0, 1.0),
-        error_before=0.0,
-        error_after=0.0,
-        reason=f"Odometry was kept: the methods disagree about the {count} verified closures. The solve keeps {kept}, "
-        f"{' and '.join(said)}, and these bend the odometry further than its noise allows: as a body the closures are "
-        "false, or the noise is too small.",
+        f"the methods disagree about the {count} verified closures. The solve keeps {kept}, {' and '.join(said)}, and "
+        "these bend the odometry further than its noise allows: as a body the closures are false, or the noise is too "
+        "small.",
     )

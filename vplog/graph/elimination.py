@@ -14,6 +14,7 @@ import gtsam
 import numba
 import numpy as np
 
+from vplog.graph.fronts import Form
 from vplog.graph.subtrees import Subtrees
 
 if TYPE_CHECKING:
@@ -61,6 +62,11 @@ class Elimination:
         rows = _structure(n, first, neighbours, columns, parents, start)
         keys = np.sort(np.repeat(np.arange(len(size)) * n, size) + rows)  # by supernode, then row
         return cls(place, columns, parents, start, keys % n)
+
+    @property
+    def form(self) -> Form:
+        """The same for compiled loops."""
+        return Form(self.first, self.start, self.rows, self.place, self.parent)
 
     @cached_property
     def subtrees(self) -> Subtrees:
@@ -201,29 +207,29 @@ def _supernodes(parent: Ints, count: Ints, relaxed: float, small: int) -> tuple[
 def _structure(n: int, first: Ints, neighbours: Ints, columns: Ints, parents: Ints, start: Ints) -> Ints:
     """The rows of each supernode below its columns, in no order: its own and what its children hand on."""
     rows = np.empty(start[-1], np.int64)
-    filled = start[:-1].copy()
     seen = np.full(n, -1, np.int64)
     child = np.full(len(parents), -1, np.int64)
     sibling = np.full(len(parents), -1, np.int64)
     for node in range(len(parents)):
-        end = columns[node + 1]
+        end, count = columns[node + 1], start[node]
         for column in range(columns[node], end):
-            for at in range(first[column], first[column + 1]):
-                row = neighbours[at]
-                if row >= end and seen[row] != node:
-                    seen[row] = node
-                    rows[filled[node]] = row
-                    filled[node] += 1
+            count = _add_rows(node, end, neighbours[first[column] : first[column + 1]], seen, rows, count)
         below = child[node]
         while below >= 0:
-            for at in range(start[below], start[below + 1]):
-                row = rows[at]
-                if row >= end and seen[row] != node:
-                    seen[row] = node
-                    rows[filled[node]] = row
-                    filled[node] += 1
+            count = _add_rows(node, end, rows[start[below] : start[below + 1]], seen, rows, count)
             below = sibling[below]
         if parents[node] >= 0:
             sibling[node] = child[parents[node]]
             child[parents[node]] = node
     return rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_rows(node: int, end: int, more: Ints, seen: Ints, rows: Ints, count: int) -> int:
+    """Put those of the rows `more` from `end` on that a supernode does not have yet behind its others in `rows`."""
+    for row in more:
+        if row >= end and seen[row] != node:
+            seen[row] = node
+            rows[count] = row
+            count += 1
+    return count

@@ -16,11 +16,7 @@ from vplog.graph.build import informed, parts
 from vplog.graph.elimination import Elimination
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints, PoseGraph
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Ints, PoseGraph
 
 GAUGE_SIGMA = 1e-6
 """rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""

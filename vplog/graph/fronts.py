@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -11,6 +11,20 @@ from vplog.graph.dense import eliminate_front
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints
+    from vplog.graph.cholesky import Blocks
+
+    Listed = tuple[Ints, Ints, Ints]
+    """As of by_supernode()."""
+
+
+class Form(NamedTuple):
+    """An Elimination for compiled loops."""
+
+    first: Ints
+    start: Ints
+    rows: Ints
+    place: Ints
+    parent: Ints
 
 
 @numba.njit(cache=True, nogil=True)
@@ -67,22 +81,11 @@ def by_supernode(place: Ints, first: Ints, a: Int32s | Ints, b: Int32s | Ints) -
 
 
 @numba.njit(cache=True, nogil=True)
-def fill(
-    node: int,
-    front: Floats,
-    first: Ints,
-    start: Ints,
-    rows: Ints,
-    place: Ints,
-    pose: Ints,
-    begin: Ints,
-    edges: Ints,
-    diagonal: Floats,
-    a: Int32s | Ints,
-    b: Int32s | Ints,
-    other: Floats,
-) -> None:
+def fill(node: int, front: Floats, form: Form, listed: Listed, matrix: Blocks) -> None:
     """Put the blocks of a matrix in the columns of a supernode into the upper triangle of its front."""
+    first, start, rows, place, _ = form
+    pose, begin, edges = listed
+    diagonal, a, b, other = matrix
     size = diagonal.shape[1]
     wide = first[node + 1] - first[node]
     for i in range(len(front)):
@@ -92,8 +95,7 @@ def fill(
         for i in range(size):
             for j in range(i, size):
                 front[at + i, at + j] += diagonal[row, i, j]
-    for listed in range(begin[node], begin[node + 1]):
-        edge = edges[listed]
+    for edge in edges[begin[node] : begin[node + 1]]:
         one, two = place[a[edge]], place[b[edge]]
         low, high = min(one, two), max(one, two)
         if high < first[node + 1]:
@@ -110,8 +112,9 @@ def fill(
 
 
 @numba.njit(cache=True, nogil=True)
-def rows_of_child(node: int, child: int, first: Ints, start: Ints, rows: Ints, size: int) -> Ints:
+def rows_of_child(node: int, child: int, form: Form, size: int) -> Ints:
     """Where in the front of a supernode the rows below one of its children are."""
+    first, start, rows, _, _ = form
     wide = first[node + 1] - first[node]
     handed = start[child + 1] - start[child]
     to = np.empty(handed, np.int64)
@@ -153,29 +156,14 @@ def keep(front: Floats, values: Floats) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def eliminate_run(
-    low: int,
-    end: int,
-    first: Ints,
-    start: Ints,
-    rows: Ints,
-    place: Ints,
-    parent: Ints,
-    children: Ints,
-    begin: Ints,
-    values: Floats,
-    pose: Ints,
-    listed: Ints,
-    edges: Ints,
-    diagonal: Floats,
-    a: Int32s | Ints,
-    b: Int32s | Ints,
-    other: Floats,
+    low: int, end: int, form: Form, children: Ints, begin: Ints, values: Floats, listed: Listed, matrix: Blocks
 ) -> tuple[bool, Floats, Ints]:
     """R of supernodes low:end, whole subtrees, in `values`, and what is left for others to take.
 
     Whether they are positive definite; what each root of the subtrees hands on, one after the other; and these roots.
     """
-    size = diagonal.shape[1]
+    first, start, _, _, parent = form
+    size = matrix.diagonal.shape[1]
     below, most = np.empty(len(parent), np.int64), 0
     for node in range(low, end):
         below[node] = (start[node + 1] - start[node]) * size
@@ -188,13 +176,13 @@ def eliminate_run(
         eliminated = (first[node + 1] - first[node]) * size
         length = eliminated + below[node]
         front = room[: length * length].reshape(length, length)
-        fill(node, front, first, start, rows, place, pose, listed, edges, diagonal, a, b, other)
+        fill(node, front, form, listed, matrix)
         for _ in range(children[node]):
             count -= 1
             child = waiting[count]
             used -= below[child] ** 2
             handed = stack[used : used + below[child] ** 2].reshape(below[child], below[child])
-            to = rows_of_child(node, child, first, start, rows, size)
+            to = rows_of_child(node, child, form, size)
             gather(front, to, size, handed, 0, 0, len(to))
         if not eliminate_front(front, eliminated):
             return False, stack[:0].copy(), waiting[:0].copy()

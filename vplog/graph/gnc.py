@@ -32,17 +32,13 @@ from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_kept
 from vplog.graph.pcm import PcmSettings
+from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.scrutiny import Scrutiny
-from vplog.graph.truncated import truncated_weights
 from vplog.graph.workers import Workers
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints, PoseGraph, Solution
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 
 _AT_ONCE = 3
 """Stages that a large graph takes as one, of one least squares step. Drives of 12 000 poses keep the same closures as

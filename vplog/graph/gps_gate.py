@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.graph.consistency import is_loop, odometry_chain
+from vplog.graph.consistency import is_loop, odometry_chain, odometry_kept
 from vplog.graph.satellites import chi2_of_fixes, world_from_enu
 
 if TYPE_CHECKING:
@@ -23,18 +22,14 @@ def keep_odometry_if_further(graph: PoseGraph, solution: Solution, fixes: Fixes)
     loops = is_loop(graph)
     if not (solution.weight[loops] > 0.5).any():
         return solution
-    chain = odometry_chain(graph)[0]
-    alone, solved = median_sigma(chain, fixes), median_sigma(solution.world_from_body, fixes)
+    alone, solved = median_sigma(odometry_chain(graph)[0], fixes), median_sigma(solution.world_from_body, fixes)
     if solved <= alone:
         return solution
-    return replace(
+    return odometry_kept(
+        graph,
         solution,
-        world_from_body=chain,
-        weight=np.where(loops, 0.0, 1.0),
-        error_before=0.0,
-        error_after=0.0,
-        reason=f"Odometry was kept: with {int((solution.weight[loops] > 0.5).sum())} closures the GPS fixes are "
-        f"{solved:.2g} sigma off by the median, and {alone:.2g} without, so some are false.",
+        f"with {int((solution.weight[loops] > 0.5).sum())} closures the GPS fixes are {solved:.2g} sigma off by the "
+        f"median, and {alone:.2g} without, so some are false.",
     )
 
 

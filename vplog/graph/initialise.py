@@ -79,14 +79,9 @@ def _chordal_large(factors: Factors, weight: Floats) -> Floats:
 def _apart(factors: Factors, weight: Floats, firmness: Floats, difference: Floats) -> Floats:
     """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first is 0."""
     graph = factors.graph
-    n = len(graph.world_from_body)
     diagonal = _ends(graph, firmness)
     diagonal[0] += firmness.max() * _HELD
-    tension = firmness[:, None] * difference
-    right = np.empty((n, tension.shape[1]))
-    for column, one in enumerate(np.ascontiguousarray(tension.T)):
-        right[:, column] = np.bincount(graph.b, one, n) - np.bincount(graph.a, one, n)
-    right[0] = 0.0
+    right = _pull(graph, firmness[:, None] * difference)
     matrix = Blocks(diagonal[:, None, None], graph.a, graph.b, -firmness[:, None, None])
     return Cholesky.of(factors.elimination(weight > 0), matrix).solve(right[:, None, :])[:, 0]
 
@@ -95,6 +90,16 @@ def _ends(graph: PoseGraph, firmness: Floats) -> Floats:
     """(N,) sum of the firmness of the edges at each pose."""
     n = len(graph.world_from_body)
     return np.asarray(np.bincount(graph.a, firmness, n) + np.bincount(graph.b, firmness, n), np.float64)
+
+
+def _pull(graph: PoseGraph, tension: Floats) -> Floats:
+    """(N, k) what tensions (E, k) of the edges add up to at their ends, the first pose being held."""
+    n = len(graph.world_from_body)
+    result = np.empty((n, tension.shape[1]))
+    for column, along in enumerate(tension.T):
+        result[:, column] = np.bincount(graph.b, along, n) - np.bincount(graph.a, along, n)
+    result[0] = 0.0
+    return result
 
 
 def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
@@ -182,15 +187,6 @@ def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Float
     n, k = start.shape
     a, b = graph.a, graph.b
 
-    def pull(tension: Floats) -> Floats:
-        """What tensions (E, k) of the edges add up to at their ends, the first pose being held."""
-        result = np.empty((n, k))
-        for column in range(k):
-            along = tension[:, column]
-            result[:, column] = np.bincount(b, along, n) - np.bincount(a, along, n)
-        result[0] = 0.0
-        return result
-
     chain = np.bincount(np.maximum(a, b), np.where(np.abs(a - b) == 1, firmness, 0.0), n)[1:, None]
     chain = np.where(chain > 0, chain, firmness.mean())
 
@@ -199,13 +195,13 @@ def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Float
         return np.concatenate([np.zeros((1, k)), np.cumsum(flow / chain, axis=0)])
 
     values = np.array(start)
-    residual = pull(firmness[:, None] * (difference - values[b] + values[a]))
+    residual = _pull(graph, firmness[:, None] * (difference - values[b] + values[a]))
     direction = step = precondition(residual)
     energy = first = (residual * step).sum(0)
     for _ in range(steps):
         if (energy <= _LINEAR_TOLERANCE**2 * first).all():
             break
-        back = pull(firmness[:, None] * (direction[b] - direction[a]))
+        back = _pull(graph, firmness[:, None] * (direction[b] - direction[a]))
         along = (direction * back).sum(0)
         length = np.divide(energy, along, out=np.zeros(k), where=along > 0)
         values = values + length * direction

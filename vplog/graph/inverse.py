@@ -19,6 +19,7 @@ from vplog.graph.workers import Workers
 if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints
     from vplog.graph.cholesky import Cholesky
+    from vplog.graph.fronts import Form
 
 
 def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tuple[Floats, Floats, Floats]:
@@ -37,7 +38,7 @@ def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tupl
     handed = np.flatnonzero((shape.parent >= 0) & needed)
     children = handed[np.argsort(shape.parent[handed], kind="stable")]
     child = np.searchsorted(shape.parent[children], np.arange(len(wide) + 1))
-    form, wanted = (shape.first, shape.start, shape.rows, size), (asked, low, high, kept)
+    form, wanted = shape.form, (asked, low, high, kept)
     known: dict[int, Floats] = {}
     with Workers() as workers:
         for node in reversed(shape.subtrees.top):
@@ -49,17 +50,17 @@ def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tupl
                 front[wide[node] :, wide[node] :] = known.pop(node)
             root = factor.values[factor.begin[node] : factor.begin[node + 1]].reshape(wide[node], length)
             invert_together(front, root, workers)
-            note(node, front, *form, *wanted)
+            note(node, front, form, size, wanted)
             tasks = []
             for below_it in children[child[node] : child[node + 1]].tolist():
                 known[below_it] = np.empty((below[below_it], below[below_it]))
-                tasks.append((front, rows_of_child(node, below_it, *form), size, known[below_it]))
+                tasks.append((front, rows_of_child(node, below_it, form, size), size, known[below_it]))
             workers.each(hand_down, tasks)
         given = [
             np.concatenate([np.empty(0), *(known.pop(root).ravel() for root in roots.tolist() if root in known)])
             for roots in shape.subtrees.roots
         ]
-        tree = (*form, factor.begin, factor.values, needed, shape.parent, child, children, below, *wanted)
+        tree = (form, size, factor.begin, factor.values, needed, (child, children, below), wanted)
         tasks = [(*run, roots, *tree) for run, roots in zip(shape.subtrees.runs, given, strict=True)]
         workers.each(invert_run, tasks)
     result = np.empty_like(kept)
@@ -92,7 +93,7 @@ def joint_inverse(factor: Cholesky, nodes: Ints) -> Floats:
     unit = np.zeros((len(columns) * size, len(nodes) * size))
     for k, at in enumerate(np.searchsorted(columns, place).tolist()):
         unit[at * size : (at + 1) * size, k * size : (k + 1) * size] = np.eye(size)
-    _onward(along, begin, columns, shape.first, shape.start, shape.rows, factor.begin, size, factor.values, unit)
+    _onward(along, begin, columns, shape.form, factor.begin, size, factor.values, unit)
     result = np.zeros((len(nodes) * size, len(nodes) * size))
     _squared(unit, result)
     return result
@@ -100,18 +101,10 @@ def joint_inverse(factor: Cholesky, nodes: Ints) -> Floats:
 
 @numba.njit(cache=True, nogil=True)
 def _onward(
-    along: Ints,
-    begun: Ints,
-    columns: Ints,
-    first: Ints,
-    start: Ints,
-    rows: Ints,
-    begin: Ints,
-    size: int,
-    values: Floats,
-    unit: Floats,
+    along: Ints, begun: Ints, columns: Ints, form: Form, begin: Ints, size: int, values: Floats, unit: Floats
 ) -> None:
     """R^-T of the columns of `unit`, in place, by the supernodes `along`, whose columns are `columns`."""
+    first, start, rows, _, _ = form
     for k in range(len(along)):
         node, at = along[k], begun[k]
         wide = first[node + 1] - first[node]

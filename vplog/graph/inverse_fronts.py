@@ -11,8 +11,14 @@ from vplog.graph.dense import AT_ONCE, STRIP, take_away
 from vplog.graph.fronts import found, rows_of_child
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
+    from vplog.data import Bools, Floats, Ints
+    from vplog.graph.fronts import Form
     from vplog.graph.workers import Workers
+
+    Wanted = tuple[Ints, Ints, Ints, Floats]
+    """Which pairs each supernode has, (S + 1,), their columns (K,), (K,), and room for their blocks (3, K, d, d)."""
+    Tree = tuple[Ints, Ints, Ints]
+    """Where the children of each supernode begin, (S + 1,), these, and how many rows each hands down, (S,)."""
 
 SHARED = 1024
 """Rows from which on a front is worth sharing between threads: eight of them then take four milliseconds of one."""
@@ -102,19 +108,10 @@ def _gained(root: Floats, begun: int, end: int, gain: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def note(
-    node: int,
-    front: Floats,
-    first: Ints,
-    start: Ints,
-    rows: Ints,
-    size: int,
-    asked: Ints,
-    low: Ints,
-    high: Ints,
-    result: Floats,
-) -> None:
+def note(node: int, front: Floats, form: Form, size: int, wanted: Wanted) -> None:
     """Keep the blocks that are asked of a supernode."""
+    first, start, rows, _, _ = form
+    asked, low, high, result = wanted
     wide = first[node + 1] - first[node]
     for pair in range(asked[node], asked[node + 1]):
         one = (low[pair] - first[node]) * size
@@ -141,10 +138,9 @@ def hand_down(front: Floats, to: Ints, size: int, handed: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _most_waiting(
-    low: int, end: int, given: int, needed: np.ndarray, parent: Ints, child: Ints, children: Ints, below: Ints
-) -> int:
+def _most_waiting(low: int, end: int, given: int, needed: Bools, parent: Ints, tree: Tree) -> int:
     """Most numbers that are handed down and not taken yet at any time, `given` of them at first."""
+    child, children, below = tree
     used = most = given
     for node in range(end - 1, low - 1, -1):
         if needed[node]:
@@ -158,35 +154,20 @@ def _most_waiting(
 
 @numba.njit(cache=True, nogil=True)
 def invert_run(
-    low: int,
-    end: int,
-    given: Floats,
-    first: Ints,
-    start: Ints,
-    rows: Ints,
-    size: int,
-    begin: Ints,
-    values: Floats,
-    needed: np.ndarray,
-    parent: Ints,
-    child: Ints,
-    children: Ints,
-    below: Ints,
-    asked: Ints,
-    one: Ints,
-    two: Ints,
-    result: Floats,
-) -> None:
+    low: int, end: int, given: Floats, form: Form, size: int, begin: Ints, values: Floats, needed: Bools, tree: Tree,
+    wanted: Wanted,
+) -> None:  # fmt: skip
     """Supernodes low:end that are needed, whole subtrees, from the last to the first.
 
     `given` is the inverse at the rows below each of their roots that are needed, one after the other.
     """
-    most = 0
+    first, parent, most = form.first, form.parent, 0
+    child, children, below = tree
     for node in range(low, end):
         if needed[node]:
             most = max(most, (first[node + 1] - first[node]) * size + below[node])
     room = np.empty(most * most)
-    stack = np.empty(_most_waiting(low, end, len(given), needed, parent, child, children, below))
+    stack = np.empty(_most_waiting(low, end, len(given), needed, parent, tree))
     stack[: len(given)] = given
     used = len(given)
     for node in range(end - 1, low - 1, -1):
@@ -200,9 +181,9 @@ def invert_run(
             for i in range(left):
                 front[wide + i, wide:] = stack[used + i * left : used + (i + 1) * left]
         invert_front(front, values[begin[node] : begin[node + 1]].reshape(wide, length))
-        note(node, front, first, start, rows, size, asked, one, two, result)
+        note(node, front, form, size, wanted)
         for at in range(child[node], child[node + 1]):
             count = below[children[at]]
-            to = rows_of_child(node, children[at], first, start, rows, size)
+            to = rows_of_child(node, children[at], form, size)
             hand_down(front, to, size, stack[used : used + count * count].reshape(count, count))
             used += count * count

@@ -18,13 +18,9 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints
+    from vplog.data import Bools, Floats, Ints
     from vplog.graph.refine import Refined
     from vplog.stages import Optimiser
-
-    Bools = NDArray[np.bool_]
 
 
 class JoinSettings(Settings):

@@ -182,18 +182,13 @@ def group_costs(
         moved = geometry.adjoint(geometry.between(poses[b], poses[b[near]]))[:, axes][:, :, axes]
         round_ = moved @ np.linalg.inv(information[middle[near]]) @ np.swapaxes(moved, 1, 2)
         for here, there in ((b, b[near]), (a, a[near])):
-            later = np.maximum(here, there)
-            moved = geometry.adjoint(geometry.between(poses[b], poses[later]))[:, axes][:, :, axes]
-            leg = chain.covariance(np.minimum(here, there), later)
-            round_ = round_ + moved @ leg @ np.swapaxes(moved, 1, 2)
+            round_ = round_ + _leg(chain, poses, b, here, there)
         joined = (chain.part[a] == chain.part[a[near]]) & (chain.part[b] == chain.part[b[near]])
         least = np.where(joined, np.minimum(least, _quadratic(force, own + round_)), least)
     at = np.array([place[len(place) // 2] for place in places])
     legs = np.linalg.inv(information[loops[member]])
     for here, there in ((graph.b[loops[member]], b[whose]), (graph.a[loops[member]], a[whose])):
-        later = np.maximum(here, there)
-        moved = geometry.adjoint(geometry.between(poses[graph.b[loops[member]]], poses[later]))[:, axes][:, :, axes]
-        legs = legs + moved @ chain.covariance(np.minimum(here, there), later) @ np.swapaxes(moved, 1, 2)
+        legs = legs + _leg(chain, poses, graph.b[loops[member]], here, there)
     soft = np.add.reduceat(back @ np.linalg.inv(legs) @ at_middle, first, axis=0)
     root = np.swapaxes(np.linalg.cholesky(soft), 1, 2)
     leverage, turn = np.linalg.eigh(root @ pull.covariance[at] @ np.swapaxes(root, 1, 2))
@@ -202,6 +197,13 @@ def group_costs(
     alone = _quadratic(pull.force[member], np.asarray(np.linalg.inv(information[loops[member]]), np.float64))
     among = np.add.reduceat(alone, first) - _quadratic(force, own)
     return np.minimum(least, left) + np.maximum(among, 0.0)
+
+
+def _leg(chain: OdometryChain, poses: Floats, end: Int32s, here: Int32s, there: Int32s) -> Floats:
+    """(G, d, d) noise of the odometry between each two poses, in the frames of `end`."""
+    later = np.maximum(here, there)
+    moved = geometry.adjoint(geometry.between(poses[end], poses[later]))[:, chain.axes][:, :, chain.axes]
+    return moved @ chain.covariance(np.minimum(here, there), later) @ np.swapaxes(moved, 1, 2)
 
 
 def _quadratic(force: Floats, covariance: Floats) -> Floats:

@@ -17,6 +17,7 @@ from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
+    from vplog.graph.factors import Fit
 
 
 class LmSettings(Settings):
@@ -41,10 +42,14 @@ def solve_kept(
     factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float, found: str
 ) -> Solution:
     """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
-    graph = factors.graph
     fit = descend(factors, weight, start, max_iterations, tolerance)
-    end = "converged" if fit.converged else "stopped at the limit"
     by = f" by sparse elimination, as for all of {LARGE_POSES} poses or more," if is_large(start) else ""
+    return as_solution(factors.graph, weight, fit, f"{found}Least squares{by}")
+
+
+def as_solution(graph: PoseGraph, weight: Floats, fit: Fit, found: str) -> Solution:
+    """The fit of the weighted edges (E,) as a Solution; its reason is `found` and how the descent ended."""
+    end = "converged" if fit.converged else "stopped at the limit"
     return Solution(
         world_from_body=fit.world_from_body,
         weight=weight,
@@ -52,7 +57,7 @@ def solve_kept(
         error_after=half_chi2(graph, weight, fit.world_from_body),
         iterations=fit.iterations,
         converged=fit.converged,
-        reason=f"{found}Least squares{by} {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
+        reason=f"{found} {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
     )
 
 

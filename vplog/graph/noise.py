@@ -12,11 +12,7 @@ from vplog.errors import GraphError
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints, Odometry
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Ints, Odometry
 
 _UNKNOWN_VARIANCE = 1e3
 """m^2 or rad^2; drivers write 1e3, 99999, 1e6 or more on an axis that they do not measure."""

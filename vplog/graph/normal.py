@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import atan2, cos, sin, sqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -16,11 +16,38 @@ if TYPE_CHECKING:
 
     from vplog.data import Floats, Int32s, Ints, PoseGraph
 
+    Terms = Callable[[Ints, int, int, "_Edges", Floats, "_Sums"], None]
+
 
 _LEAST_SHARE = 1024
 """Poses or edges that a thread takes at least, half a millisecond."""
 _BY_THREAD = 4
 """Shares for each thread, so that none waits long for another that was held up."""
+
+
+class _Edges(NamedTuple):
+    """The edges of a graph for compiled loops."""
+
+    a: Int32s
+    b: Int32s
+    measured: Floats
+    """(E, 4, 4)."""
+    information: Floats
+    """(E, d, d)."""
+    weight: Floats
+
+
+class _Sums(NamedTuple):
+    """What the edges are added up to, zero at first."""
+
+    half: Floats
+    """(E,) half the chi-square."""
+    diagonal: Floats
+    """(n, d, d), or empty where nothing but half the chi-square is asked for, as are those below."""
+    other: Floats
+    """(E, d, d)."""
+    slope: Floats
+    """(n, d)."""
 
 
 def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[Blocks, Floats, float]:
@@ -32,42 +59,35 @@ def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[B
     """
     size = 3 if graph.dimension == 2 else 6
     n, edges = len(poses), len(graph.a)
-    diagonal, slope = np.zeros((n, size, size)), np.zeros((n, size))
-    other, half = np.empty((edges, size, size)), np.empty(edges)
-    terms, given = _terms(graph, weight, poses)
+    sums = _Sums(np.zeros(edges), np.zeros((n, size, size)), np.zeros((edges, size, size)), np.zeros((n, size)))
+    terms, given = _terms(graph, weight)
     with Workers() as workers:
         # each thread adds to its own poses alone, edge by edge in their order; an edge between two threads' is for both
         ranges = workers.ranges(0, n, _LEAST_SHARE, _BY_THREAD)
         begin, listed = _by_range(np.array([low for low, _ in ranges] + [n]), graph.a, graph.b)
-        workers.each(
-            terms,
-            [
-                (listed[begin[at] : begin[at + 1]], low, high, *given, half, diagonal, other, slope)
-                for at, (low, high) in enumerate(ranges)
-            ],
-        )
-    return Blocks(diagonal, graph.a, graph.b, other), slope, float(half.sum())
+        parts = zip(begin[:-1], begin[1:], ranges, strict=True)
+        workers.each(terms, [(listed[first:last], *part, given, poses, sums) for first, last, part in parts])
+    return Blocks(sums.diagonal, graph.a, graph.b, sums.other), sums.slope, float(sums.half.sum())
 
 
 def half_chi2_of(graph: PoseGraph, weight: Floats, poses: Floats, edges: Ints | None = None) -> Floats:
     """Half the weighted chi-square of each edge (E,), or of those named, at `poses`."""
-    terms, given = _terms(graph, weight, poses)
-    half, none = np.zeros(len(graph.a)), np.empty((0, 0, 0))
-    wanted = np.arange(len(half)) if edges is None else np.asarray(edges, np.int64)
+    terms, given = _terms(graph, weight)
+    none = np.empty((0, 0, 0))
+    sums = _Sums(np.zeros(len(graph.a)), none, none, np.empty((0, 0)))
+    wanted = np.arange(len(graph.a)) if edges is None else np.asarray(edges, np.int64)
     with Workers() as workers:
         parts = workers.ranges(0, len(wanted), _LEAST_SHARE, _BY_THREAD)
-        tasks = [(wanted[low:high], 0, len(poses), *given, half, none, none, np.empty((0, 0))) for low, high in parts]
-        workers.each(terms, tasks)
-    return half if edges is None else half[edges]
+        workers.each(terms, [(wanted[low:high], 0, len(poses), given, poses, sums) for low, high in parts])
+    return sums.half if edges is None else sums.half[edges]
 
 
-def _terms(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[Callable[..., None], tuple[Any, ...]]:
+def _terms(graph: PoseGraph, weight: Floats) -> tuple[Terms, _Edges]:
     """What adds up the edges of the graph, and what it needs to know of them."""
     planar = graph.dimension == 2
     information = graph.information[:, 2:5, 2:5] if planar else graph.information  # yaw, x, y
-    given = (graph.a_from_b, information, weight, poses)
-    given = tuple(np.ascontiguousarray(one, np.float64) for one in given)
-    return _planar if planar else _spatial, (graph.a, graph.b, *given)
+    given = (np.ascontiguousarray(one, np.float64) for one in (graph.a_from_b, information, weight))
+    return _planar if planar else _spatial, _Edges(graph.a, graph.b, *given)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -98,33 +118,16 @@ def _by_range(ends: Ints, a: Int32s, b: Int32s) -> tuple[Ints, Ints]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _planar(
-    edges: Ints,
-    low: int,
-    high: int,
-    a: Int32s,
-    b: Int32s,
-    measured: Floats,
-    information: Floats,
-    weight: Floats,
-    poses: Floats,
-    half: Floats,
-    diagonal: Floats,
-    other: Floats,
-    slope: Floats,
-) -> None:
+def _planar(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sums: _Sums) -> None:
     """Add what these edges say about poses low:high; nothing but half the chi-square where `diagonal` is empty.
 
     What belongs to an edge and not to a pose is told by whoever has its first end.
     """
+    a, b, measured, _, weight = given
     error, move, bend, turned, say = np.empty(3), np.zeros((3, 3)), np.eye(3), np.empty((3, 3)), np.empty((3, 3))
     for at in range(len(edges)):
         edge = int(edges[at])
         if weight[edge] == 0.0:
-            if low <= a[edge] < high:
-                half[edge] = 0.0
-                if len(diagonal):
-                    other[edge] = 0.0
             continue
         one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
         # b seen from a, and that seen from where b was measured
@@ -152,32 +155,16 @@ def _planar(
         bend[1, 1] = bend[2, 2] = 1.0 - curve * turn * turn
         bend[1, 2], bend[2, 1] = -h, h
         _product(bend, move, turned)
-        _add(
-            edge, a[edge], b[edge], low, high, error, turned, bend, information, weight[edge], half, diagonal, other,
-            slope, say,
-        )  # fmt: skip
+        _add(edge, low, high, given, error, turned, bend, sums, say)
 
 
 @numba.njit(cache=True, nogil=True)
-def _spatial(
-    edges: Ints,
-    low: int,
-    high: int,
-    a: Int32s,
-    b: Int32s,
-    measured: Floats,
-    information: Floats,
-    weight: Floats,
-    poses: Floats,
-    half: Floats,
-    diagonal: Floats,
-    other: Floats,
-    slope: Floats,
-) -> None:
+def _spatial(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sums: _Sums) -> None:
     """Add what these edges say about poses low:high; nothing but half the chi-square where `diagonal` is empty.
 
     What belongs to an edge and not to a pose is told by whoever has its first end.
     """
+    a, b, measured, _, weight = given
     error, move, bend, moved, say = (
         np.empty(6), np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     )  # fmt: skip
@@ -186,10 +173,6 @@ def _spatial(
     for at in range(len(edges)):
         edge = int(edges[at])
         if weight[edge] == 0.0:
-            if low <= a[edge] < high:
-                half[edge] = 0.0
-                if len(diagonal):
-                    other[edge] = 0.0
             continue
         one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
         for i in range(3):  # b seen from a
@@ -217,10 +200,7 @@ def _spatial(
             )
         _bend(error, bend, ad, square, fourth)
         _product(bend, move, moved)
-        _add(
-            edge, a[edge], b[edge], low, high, error, moved, bend, information, weight[edge], half, diagonal, other,
-            slope, say,
-        )  # fmt: skip
+        _add(edge, low, high, given, error, moved, bend, sums, say)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -298,28 +278,14 @@ def _bend(error: Floats, bend: Floats, ad: Floats, square: Floats, fourth: Float
 
 @numba.njit(cache=True, nogil=True)
 def _add(  # noqa: PLR0912 (one loop nest, compiled)
-    edge: int,
-    a: int,
-    b: int,
-    low: int,
-    high: int,
-    error: Floats,
-    by_a: Floats,
-    by_b: Floats,
-    information: Floats,
-    weight: float,
-    half: Floats,
-    diagonal: Floats,
-    other: Floats,
-    slope: Floats,
-    say: Floats,
+    edge: int, low: int, high: int, given: _Edges, error: Floats, by_a: Floats, by_b: Floats, sums: _Sums, say: Floats
 ) -> None:
     """Half the chi-square of one edge, which moves with its ends as `by_a` and `by_b` (d, d) say; its share of the
     normal equations of poses low:high is added."""
-    size = len(error)
-    believed = information[edge]
+    size, a, b = len(error), given.a[edge], given.b[edge]
+    believed, weight = given.information[edge], given.weight[edge]
+    half, diagonal, other, slope = sums
     if low <= a < high:
-        half[edge] = 0.0
         for i in range(size):
             for j in range(size):
                 half[edge] += 0.5 * weight * error[i] * believed[i, j] * error[j]
@@ -341,6 +307,5 @@ def _add(  # noqa: PLR0912 (one loop nest, compiled)
                 for k in range(size):
                     diagonal[node, i, j] += say[i, k] * by[k, j]
                 if end == 0:
-                    other[edge, i, j] = 0.0
                     for k in range(size):
                         other[edge, i, j] += say[i, k] * by_b[k, j]

@@ -21,11 +21,7 @@ from vplog.graph.lm import solve_kept
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Ints, PoseGraph, Solution
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Ints, PoseGraph, Solution
 
 _PAIRS = 1 << 12
 """Pairs of closures that are compared at once: some megabytes."""

@@ -14,22 +14,17 @@ import numpy as np
 from pydantic import Field
 
 from vplog.errors import GraphError
-from vplog.graph.consistency import chi2_quantile, is_loop, residual_sigma
+from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, redundancy, residual_sigma
 from vplog.graph.descent import descend
 from vplog.graph.factors import Factors, least_squares
-from vplog.graph.marginals import edge_covariances
 from vplog.graph.satellites import Fixes, believe, chi2_of_fixes, with_fixes, world_from_enu
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from typing import Any
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, PoseGraph, Solution
+    from vplog.data import Bools, Floats, PoseGraph, Solution
     from vplog.graph.satellites import GpsSettings
-
-    Bools = NDArray[np.bool_]
 
 _STEP = 1e-4
 """Of the scale, for differences: far above rounding, far below what any drive tells."""
@@ -139,24 +134,18 @@ def _misjudged(
 ) -> float:
     """By what factor the odometry's covariance is too small: its chi-square over its share of the redundancy.
 
-    Variance components (Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1979): the
-    redundancy of an edge is its degrees of freedom less the trace of its information times what the solution leaves
-    open of it.
+    Variance components: Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1979.
     """
     graph, edges = factors.graph, np.flatnonzero(odometry)
-    size = 3 if graph.dimension == 2 else 6
-    axes = [2, 3, 4] if graph.dimension == 2 else slice(None)
-    information = graph.information[edges][:, axes][:, :, axes]
     try:
-        open_ = edge_covariances(factors, weight, poses, edges, weighted)
-        redundancy = size * len(edges) - float(np.einsum("eij,eji->", information, open_))
+        checks = redundancy(factors, weight, poses, edges, weighted)
     except GraphError:
         # noise so large that rounding decides: all that the constraints could check, so that the next round has less
-        redundancy = float(size * min(np.count_nonzero(weight[~odometry]), len(edges)))
-    if redundancy < least_redundancy:
+        checks = float(degrees_of_freedom(graph) * min(np.count_nonzero(weight[~odometry]), len(edges)))
+    if checks < least_redundancy:
         return 1.0
     chi2 = float((residual_sigma(graph, poses)[edges] ** 2).sum())
-    return max(chi2, 1e-9) / redundancy
+    return max(chi2, 1e-9) / checks
 
 
 def _scale_step(

@@ -14,16 +14,12 @@ from vplog.errors import GraphError
 from vplog.geodesy import local_enu
 from vplog.graph.consistency import chi2_quantile
 from vplog.graph.factors import least_squares
-from vplog.graph.truncated import truncated_weights
+from vplog.graph.robust_kernels import truncated_weights
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Gps, Ints, Keyframes, Odometry
+    from vplog.data import Bools, Floats, Gps, Ints, Keyframes, Odometry
     from vplog.graph.factors import Factors
-
-    Bools = NDArray[np.bool_]
 
 _FREE = 1e2
 """m and rad; holds the first pose so weakly that the fixes alone say where the graph is."""

@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from vplog.graph.cauchy import CauchySettings
 from vplog.graph.consistency import KNOWN_TO, keep_odometry_if_worse
-from vplog.graph.dcs import DcsSettings
-from vplog.graph.geman_mcclure import GemanMcClureSettings
 from vplog.graph.gnc import GncSettings
 from vplog.graph.lm import LmSettings
 from vplog.graph.pcm import PcmSettings
+from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
 
 if TYPE_CHECKING:
     from vplog.data import PoseGraph, Solution

@@ -11,25 +11,18 @@ from vplog.graph.fronts import found
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
+    from vplog.graph.fronts import Form
 
 
 @numba.njit(cache=True, nogil=True)
 def forward_run(
-    low: int,
-    end: int,
-    later: Ints,
-    first: Ints,
-    start: Ints,
-    rows: Ints,
-    begin: Ints,
-    size: int,
-    values: Floats,
-    right: Floats,
+    low: int, end: int, later: Ints, form: Form, begin: Ints, size: int, values: Floats, right: Floats
 ) -> Floats:
     """R^-T at the columns of supernodes low:end, whole subtrees, in `right` (n d, c), in place.
 
     What (k d, c) this adds to the rows `later` (k,) after them, increasing.
     """
+    first, start, rows, _, _ = form
     begun, after, columns = first[low], first[end], right.shape[1]
     own = (after - begun) * size
     whole = np.zeros((own + len(later) * size, columns))
@@ -72,10 +65,9 @@ def add_rows(right: Floats, rows: Ints, size: int, more: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def back_run(
-    low: int, end: int, first: Ints, start: Ints, rows: Ints, begin: Ints, size: int, values: Floats, right: Floats
-) -> None:
+def back_run(low: int, end: int, form: Form, begin: Ints, size: int, values: Floats, right: Floats) -> None:
     """R^-1 at the columns of supernodes low:end, in `right` (n d, c), in place, where all after them are done."""
+    first, start, rows, _, _ = form
     columns = right.shape[1]
     for node in range(end - 1, low - 1, -1):
         at, wide = first[node] * size, (first[node + 1] - first[node]) * size

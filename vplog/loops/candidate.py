@@ -20,11 +20,11 @@ from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from vplog.data import Camera, Features, Floats, Keyframes
+    from vplog.loops.landmarks import FeaturesOf
 
-    FeaturesOf = Callable[[int], Features]
 
 _ANY_POSE = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
 """Metric settings under which a pose is found wherever chance does not explain it."""

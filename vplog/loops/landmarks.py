@@ -7,7 +7,7 @@ that measure disparity have one constant error in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,7 +79,7 @@ def landmarks_of(
     settings: LandmarkSettings,
 ) -> Landmarks:
     """The landmarks of keyframe `row`: from depth where its features have any, else from motion."""
-    own = _strongest(features(row), match.features)
+    own = features(row).rows(slice(match.features))  # those that matching looks at
     rays = undistort.rays(camera, own.points)
     if np.isfinite(own.depth_m).any():
         return from_depth(rays, own.depth_m.astype(np.float64), undistort.focal_px(camera), settings)
@@ -252,14 +252,3 @@ def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, seen: n
     slope = np.where(seen[..., None], translation[..., :2] - observed * translation[..., 2:], 0.0)
     offset = np.where(seen[..., None], observed * turned[..., 2:] - turned[..., :2], 0.0)
     return (slope * offset).sum(axis=(0, 2)) / np.maximum((slope**2).sum(axis=(0, 2)), 1e-12)
-
-
-def _strongest(features: Features, count: int) -> Features:
-    """The first `count` features: those that matching looks at."""
-    return replace(
-        features,
-        points=features.points[:count],
-        sizes=features.sizes[:count],
-        descriptors=features.descriptors[:count],
-        depth_m=features.depth_m[:count],
-    )

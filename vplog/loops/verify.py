@@ -19,31 +19,16 @@ from vplog.loops.landmarks import for_stereo
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from vplog.data import Camera, Features, Floats, Int32s, Ints, Keyframes
+    from vplog.data import Camera, Floats, Int32s, Ints, Keyframes
+    from vplog.loops.landmarks import FeaturesOf
     from vplog.loops.propose import Proposals
 
-    FeaturesOf = Callable[[int], Features]
     Progress = Callable[[int, int], None]
 
-__all__ = ["Drive", "VerifySettings", "calibration_share", "drive_of", "verify", "verify_between"]
+__all__ = ["Drive", "VerifySettings", "calibration_share", "drive_of", "verify_between"]
 _LOG = logging.getLogger(__name__)
 _SUSPICIOUS_SHARE = 0.05
 """Disagreement of camera and odometry that is worth a word: five times a careful calibration's error."""
-
-
-def verify(
-    proposals: Proposals,
-    keyframes: Keyframes,
-    camera: Camera,
-    features: FeaturesOf,
-    settings: VerifySettings,
-    threads: int = 1,
-    progress: Progress | None = None,
-    baseline_m: float | None = None,
-) -> Closures:
-    """The ledger of the `proposals` of one drive, one row each, in their order: `drive_of`, then `verify_between`."""
-    drive = drive_of(keyframes, camera, features, settings, baseline_m)
-    return verify_between(proposals, drive, drive, threads, progress)
 
 
 def drive_of(

@@ -14,7 +14,7 @@ from vplog.loops.verify_metric import Pose
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.data import Float32s
+    from vplog.data import Bools, Float32s
 
 _SAMPLE = 7
 """Matches that fix a fundamental matrix."""
@@ -39,20 +39,24 @@ class EpipolarSettings(Settings):
 
 def solve(query: Float32s, match: Float32s, width: int, height: int, settings: EpipolarSettings) -> Pose:
     """The verdict on matched pixels (K, 2) of two images of `width` x `height` px: at best `no_calibration`."""
-    if len(query) <= _SAMPLE:
-        return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
-    fundamental, mask = cv2.findFundamentalMat(
-        match, query, cv2.USAC_MAGSAC, settings.max_error_px, 0.99, settings.rounds
-    )
-    if fundamental is None or mask is None or fundamental.shape != (3, 3):
-        return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
-    inlier = mask.ravel().astype(bool)
+    inlier, by_chance = agreeing(query, match, width, height, settings)
     count = int(inlier.sum())
-    # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
-    share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)
-    alarms = chance.log10_false_alarms(len(query), count, _SAMPLE, _MODELS, share)
-    if count < settings.min_inliers or alarms > settings.log10_false_alarms:
+    if by_chance or count < settings.min_inliers:
         return Pose(Verdict.TOO_FEW_INLIERS, count, 0.0)
     spread = float(np.prod(np.ptp(query[inlier] / [width, height], axis=0)))
     verdict = Verdict.NO_CALIBRATION if spread >= settings.min_spread else Verdict.POOR_SPREAD
     return Pose(verdict, count, spread)
+
+
+def agreeing(
+    query: Float32s, match: Float32s, width: int, height: int, settings: EpipolarSettings
+) -> tuple[Bools, bool]:
+    """(K,) which matches agree with the epipolar geometry of most, and whether so many may do so by chance."""
+    mask = None
+    if len(query) > _SAMPLE:
+        _, mask = cv2.findFundamentalMat(match, query, cv2.USAC_MAGSAC, settings.max_error_px, 0.99, settings.rounds)
+    agrees = np.zeros(len(query), bool) if mask is None else np.asarray(mask).ravel().astype(bool)
+    # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
+    share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)
+    alarms = chance.log10_false_alarms(len(query), int(agrees.sum()), _SAMPLE, _MODELS, share)
+    return agrees, alarms > settings.log10_false_alarms

@@ -27,7 +27,7 @@ from vplog.errors import LibraryError
 from vplog.places import expected_votes, stored
 from vplog.places.code_lists import BLOCK, CodeLists, build_lists
 from vplog.places.code_search import CodeIndex
-from vplog.places.columns import check_type, check_values
+from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
 from vplog.places.once import Once
 from vplog.places.relearn import relearn
@@ -200,7 +200,7 @@ class BobbState:
         return 8 * self.settings.references * (2 + 1 + self.settings.boxes)
 
     @property
-    def arrow_type(self) -> pa.DataType:
+    def arrow_type(self) -> pa.StructType:
         s = self.settings
         return pa.struct(
             [
@@ -298,11 +298,7 @@ class BobbState:
         )
 
     def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
-        columns = [
-            pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), part.type.list_size)
-            for values, part in zip(self._arrays(descriptors), self.arrow_type, strict=True)
-        ]
-        return pa.StructArray.from_arrays(columns, fields=list(self.arrow_type))
+        return struct_of_lists(self.arrow_type, *self._arrays(descriptors))
 
     def from_arrow(self, column: pa.Array) -> list[Place]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""

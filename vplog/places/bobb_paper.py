@@ -19,8 +19,8 @@ from pydantic import Field, PositiveFloat, model_validator
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp, stored
-from vplog.places.columns import check_type, check_values
-from vplog.places.relearn import relearn
+from vplog.places.columns import check_type, check_values, struct_of_lists
+from vplog.places.relearn import RelearnedSettings
 from vplog.places.search import BoxIndex
 from vplog.places.shared import Shared, list_shared
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference
 
 
-class PaperBobbSettings(lib.WordSettings):
+class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     """Bag of bounding boxes with the paper's numbers (section IV)."""
 
     kind: Literal["bobb_paper"] = "bobb_paper"
@@ -76,10 +76,6 @@ class PaperBobbSettings(lib.WordSettings):
         with ThreadPoolExecutor(threads) as pool:
             patterns = list(pool.map(lambda row: _prepare(library, row, self), range(len(library))))
         return PaperBobbState(self, library, patterns)
-
-    def load(self, folder: Path, threads: int) -> PaperBobbState:
-        """A library saved by `PaperBobbState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(PaperBobbSettings, folder, threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +164,7 @@ class PaperBobbState:
         return math.ceil(math.log2(math.comb(len(self.library), s.references))) + s.references * s.boxes * per_box
 
     @property
-    def arrow_type(self) -> pa.DataType:
+    def arrow_type(self) -> pa.StructType:
         s = self.settings
         return pa.struct(
             [
@@ -211,16 +207,18 @@ class PaperBobbState:
         )  # fmt: skip
 
     def index(self, descriptors: Sequence[Place]) -> BoxIndex:
+        return BoxIndex(*self._arrays(descriptors), len(self.library), self.settings.grid)
+
+    def _arrays(self, places: Sequence[Place]) -> tuple[Int32s, Bytes]:
         s = self.settings
-        references = np.array([place.references for place in descriptors], np.int32).reshape(-1, s.references)
-        boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1, s.references, s.boxes, 4)
-        return BoxIndex(references, boxes, len(self.library), s.grid)
+        return (
+            np.array([place.references for place in places], np.int32).reshape(-1, s.references),
+            np.array([place.boxes for place in places], np.uint8).reshape(-1, s.references, s.boxes, 4),
+        )
 
     def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> Shared:
         """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
-        s = self.settings
-        references = np.array([place.references for place in places], np.int64).reshape(-1, s.references)
-        boxes = np.array([place.boxes for place in places], np.int64).reshape(-1, s.references, s.boxes, 4)
+        references, boxes = (part.astype(np.int64) for part in self._arrays(places))
 
         def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
             mine, theirs = boxes[rows, ranks][:, :, None], boxes[others, other_ranks][:, None]
@@ -232,14 +230,7 @@ class PaperBobbState:
         return list_shared(references, query, match, compare)
 
     def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
-        s = self.settings
-        references = np.array([place.references for place in descriptors], np.int32).reshape(-1)
-        boxes = np.array([place.boxes for place in descriptors], np.uint8).reshape(-1)
-        columns = [
-            pa.FixedSizeListArray.from_arrays(pa.array(references), s.references),
-            pa.FixedSizeListArray.from_arrays(pa.array(boxes), s.references * s.boxes * 4),
-        ]
-        return pa.StructArray.from_arrays(columns, fields=list(self.arrow_type))
+        return struct_of_lists(self.arrow_type, *self._arrays(descriptors))
 
     def from_arrow(self, column: pa.Array) -> list[Place]:
         """The places of a table's column. Raises LibraryError where it is of another kind or library."""

@@ -15,16 +15,13 @@ import pyarrow as pa
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places import stored
 from vplog.places.columns import check_type, check_values, words_by_place
 from vplog.places.dense import best_rows
-from vplog.places.relearn import keep_references, relearn
+from vplog.places.relearn import ReferencesState, RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
-from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -43,7 +40,7 @@ _PLACE = pa.list_(
 )
 
 
-class BovfSettings(Settings):
+class BovfSettings(RelearnedSettings):
     """Bag of visual features: tf-idf, cosine, inverted file."""
 
     kind: Literal["bovf"] = "bovf"
@@ -76,10 +73,6 @@ class BovfSettings(Settings):
         idf = np.log(len(kept) / np.maximum(holders, 1)).astype(np.float32)
         return BovfState(self, kept, vocabulary, idf)
 
-    def load(self, folder: Path, threads: int) -> BovfState:
-        """A library saved by `BovfState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(BovfSettings, folder, threads)
-
 
 @dataclass(frozen=True, eq=False)
 class Words:
@@ -92,7 +85,7 @@ class Words:
 
 
 @dataclass(frozen=True, eq=False)
-class BovfState:
+class BovfState(ReferencesState):
     """Words with their weights. Shared freely between threads."""
 
     settings: BovfSettings
@@ -100,11 +93,6 @@ class BovfState:
     vocabulary: Vocabulary
     idf: Float32s
     """(V,)."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
-
-    hash: str = ""
 
     @property
     def _most_words(self) -> int:
@@ -152,9 +140,6 @@ class BovfState:
         if not np.all(counts):
             raise LibraryError("The descriptors name a word zero times; compute them again with `vplog run`.")
         return [Words(words[place], counts[place]) for place in places]
-
-    def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
 
 
 class WordIndex:

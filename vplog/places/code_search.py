@@ -25,9 +25,8 @@ from vplog.places.code_lists import BLOCK, MOST_ROWS, STEPS, CodeLists, build_li
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Bytes, Float32s, Ints, Uint16s
+    from vplog.data import Bools, Bytes, Float32s, Ints, Uint16s
 
-    Bools = NDArray[np.bool_]
     Pairing = Literal["best", "same", "both"]
 
 _PAIRINGS = {"best": (1, 0), "same": (0, 1), "both": (1, 1)}

@@ -42,3 +42,12 @@ def words_by_place(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: 
     if not np.all(rising):
         raise LibraryError("The descriptors name a word twice or out of order; compute them again with `vplog run`.")
     return [slice(a, b) for a, b in zip(start.tolist(), stop.tolist(), strict=True)]
+
+
+def struct_of_lists(arrow_type: pa.StructType, *arrays: NDArray) -> pa.Array:
+    """A column of structs of fixed-size lists from the values (N, ...) of each."""
+    columns = [
+        pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), part.type.list_size)
+        for values, part in zip(arrays, arrow_type, strict=True)
+    ]
+    return pa.StructArray.from_arrays(columns, fields=list(arrow_type))

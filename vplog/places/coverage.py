@@ -15,13 +15,13 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import faiss
 import numba
 import numpy as np
 
-from vplog.places.library import l1_distance
+from vplog.places.library import WordSettings, hnsw, l1_distance
 from vplog.references import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
 
 if TYPE_CHECKING:
@@ -129,16 +129,8 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -
     if len(pool) == 0:
         nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)
         return Explanations(np.zeros(len(descriptors) + 1, np.int64), *nothing, len(candidates))
-    # the graph of vplog/places/library.py, with its default settings
-    index: Any = faiss.index_factory(pool.shape[1], "HNSW16_SQ8_direct")
-    index.train(pool[:1].astype(np.float32))
-    index.hnsw.efConstruction, index.hnsw.efSearch = 40, 16
-    before = faiss.omp_get_max_threads()
-    faiss.omp_set_num_threads(1)  # the order of insertion decides the graph
-    try:
-        index.add(pool.astype(np.float32))
-    finally:
-        faiss.omp_set_num_threads(before)
+    settings = WordSettings()
+    index = hnsw(pool.astype(np.float32), settings.hnsw_links, settings.hnsw_ef_construction, settings.hnsw_ef_search)
 
     def explained_by(row: int) -> tuple[Ints, Float32s]:
         found = descriptors[row]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -10,6 +10,7 @@ import pyarrow as pa
 from vplog.data import Ranking
 from vplog.errors import LibraryError
 from vplog.places.columns import check_type, check_values
+from vplog.places.relearn import ReferencesState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,6 +56,24 @@ def thumbnail_of(features: Features) -> Bytes:
             "again, or use a recogniser of features: bobb, bovf, vlad."
         )
     return features.thumbnail
+
+
+class VectorState(ReferencesState):
+    """A state whose places are vectors of one length."""
+
+    arrow_type: Any
+    """A fixed-size list of numbers."""
+
+    @property
+    def bits(self) -> int:
+        return self.arrow_type.list_size * self.arrow_type.value_type.bit_width
+
+    def to_arrow(self, descriptors: Sequence[NDArray]) -> pa.Array:
+        return vectors_to_arrow(descriptors, self.arrow_type)
+
+    def from_arrow(self, column: pa.Array) -> list[Any]:
+        """The places of a table's column. Raises LibraryError where it is of another kind or length."""
+        return vectors_from_arrow(column, self.arrow_type)
 
 
 def vectors_to_arrow(vectors: Sequence[NDArray], arrow_type: pa.FixedSizeListType) -> pa.Array:

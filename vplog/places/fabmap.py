@@ -20,32 +20,28 @@ from pydantic import Field, model_validator
 
 from vplog.data import Ranking
 from vplog.errors import LibraryError
-from vplog.places import stored
 from vplog.places.chow_liu import learn_tree
 from vplog.places.columns import check_type, check_values, words_by_place
 from vplog.places.fabmap_calibration import calibrate
 from vplog.places.fabmap_model import Evidence, Model, average_place, log_likelihood_table, log_mean
-from vplog.places.relearn import keep_references, relearn
+from vplog.places.relearn import ReferencesState, RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
-from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from vplog.data import Features, Float32s, Floats, Reference
+    from vplog.data import Bools, Features, Float32s, Floats, Reference
 
     Words = NDArray[np.uint16]
-    Bools = NDArray[np.bool_]
 
 _WORD_BYTES, _PLACE_BYTES = 2, 4
 """In a table: a word's number in two bytes; where a place's list begins in four."""
 _PLACE = pa.list_(pa.field("item", pa.uint16(), nullable=False))
 
 
-class FabmapSettings(Settings):
+class FabmapSettings(RelearnedSettings):
     """FAB-MAP 2.0: Chow-Liu tree, one image a place, inverted index, posterior over places and a new one."""
 
     kind: Literal["fabmap"] = "fabmap"
@@ -104,13 +100,9 @@ class FabmapSettings(Settings):
         samples = Evidence([images[row] for row in drawn], model) if self.new_place == "sampled" else None
         return FabmapState(self, kept, vocabulary, model, samples, weight, new_place_nats)
 
-    def load(self, folder: Path, threads: int) -> FabmapState:
-        """A library saved by `FabmapState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(FabmapSettings, folder, threads)
-
 
 @dataclass(frozen=True, eq=False)
-class FabmapState:
+class FabmapState(ReferencesState):
     """Words, their tree and what evidence is worth. Shared freely between threads."""
 
     settings: FabmapSettings
@@ -123,11 +115,6 @@ class FabmapState:
     """Exponent of the likelihood, 1 for the papers' own."""
     new_place_nats: float
     """Added to the log likelihood of a new place, 0 for the papers' own."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
-
-    hash: str = ""
 
     @property
     def _most_words(self) -> int:
@@ -164,9 +151,6 @@ class FabmapState:
         check_values(column)
         words = column.flatten().to_numpy()
         return [words[place] for place in words_by_place(column, words, len(self.vocabulary))]
-
-    def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
 
 
 class FabmapIndex:

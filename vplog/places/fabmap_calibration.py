@@ -13,11 +13,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Floats, Reference
+    from vplog.data import Bools, Floats, Reference
     from vplog.places.fabmap_model import Model
 
     Words = NDArray[np.uint16]
-    Bools = NDArray[np.bool_]
 
 _LEAST_IMAGES = 10
 """A drive with fewer images tells nothing of how much to trust the evidence."""

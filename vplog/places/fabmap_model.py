@@ -15,11 +15,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Floats
+    from vplog.data import Bools, Floats
     from vplog.places.chow_liu import ChowLiuTree
 
     Words = NDArray[np.uint16]
-    Bools = NDArray[np.bool_]
 
 _UNSEEN, _SEEN, _AVERAGE = 0, 1, 2
 """What is known of a word at a place: its one image lacks it, has it, or there is no image."""

@@ -14,14 +14,11 @@ import pyarrow as pa
 from pydantic import Field
 
 from vplog.data import THUMBNAIL_SIDE
-from vplog.places import stored
-from vplog.places.dense import VectorIndex, thumbnail_of, vectors_from_arrow, vectors_to_arrow
-from vplog.places.relearn import keep_references, relearn
-from vplog.settings import Settings
+from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
+from vplog.places.relearn import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -37,7 +34,7 @@ _RADIAL, _ANGULAR = 3.5, 16.0
 """Falloff of a filter along frequency, and along angle for 32 orientations; fewer orientations are wider."""
 
 
-class GistSettings(Settings):
+class GistSettings(RelearnedSettings):
     """The spatial envelope of the whole image. It learns nothing: the references only go into the library."""
 
     kind: Literal["gist"] = "gist"
@@ -53,13 +50,9 @@ class GistSettings(Settings):
         """Nothing to learn. Raises LibraryError where there is no reference."""
         return GistState(self, keep_references(references))
 
-    def load(self, folder: Path, threads: int) -> GistState:
-        """A library saved by `GistState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(GistSettings, folder, threads)
-
 
 @dataclass(frozen=True, eq=False)
-class GistState:
+class GistState(VectorState):
     """The filters. Shared freely between threads."""
 
     settings: GistSettings
@@ -67,11 +60,9 @@ class GistState:
 
     def __post_init__(self) -> None:
         s = self.settings
-        object.__setattr__(self, "hash", stored.references_hash(self.references, s))
         object.__setattr__(self, "_low_pass", _low_pass(THUMBNAIL_SIDE + 2 * _PREFILTER_PAD))
         object.__setattr__(self, "_filters", gabor_filters(THUMBNAIL_SIDE + 2 * _PAD, s.scales, s.orientations))
 
-    hash: str = ""
     _low_pass: Float32s = None  # pyright: ignore[reportAssignmentType]
     _filters: Float32s = None  # pyright: ignore[reportAssignmentType]
 
@@ -79,11 +70,6 @@ class GistState:
     def _length(self) -> int:
         s = self.settings
         return s.scales * s.orientations * s.blocks**2
-
-    @property
-    def bits(self) -> int:
-        """Two bytes a filter and block."""
-        return 16 * self._length
 
     @property
     def arrow_type(self) -> pa.FixedSizeListType:
@@ -115,16 +101,6 @@ class GistState:
 
     def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
         return VectorIndex(np.array(descriptors, np.float32).reshape(-1, self._length), _nearness)
-
-    def to_arrow(self, descriptors: Sequence[NDArray[np.float16]]) -> pa.Array:
-        return vectors_to_arrow(descriptors, self.arrow_type)
-
-    def from_arrow(self, column: pa.Array) -> list[NDArray[np.float16]]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or length."""
-        return vectors_from_arrow(column, self.arrow_type)
-
-    def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
 
 
 def _low_pass(side: int) -> Float32s:

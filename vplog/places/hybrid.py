@@ -10,7 +10,7 @@ image representation, ACM MM 2013), with where a feature lies in the image as tw
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import faiss
@@ -19,18 +19,15 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from vplog.places import stored
 from vplog.places.bobb import BobbSettings
 from vplog.places.columns import check_type, check_values
 from vplog.places.dense import best_rows, vectors_from_arrow, vectors_to_arrow
 from vplog.places.matches import keypoints_of, patches_of
-from vplog.places.relearn import relearn
+from vplog.places.relearn import ReferencesState, RelearnedSettings
 from vplog.places.vocabulary import ROOT_STEPS
-from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -54,7 +51,7 @@ _MOST_REFERENCES = 500
 """References whose scores are compared with each other's, spread evenly: a quarter of a million pairs."""
 
 
-class HybridSettings(Settings):
+class HybridSettings(RelearnedSettings):
     """Boxes of BoBB and signs of a few words: 96 + 64 bytes."""
 
     kind: Literal["hybrid"] = "hybrid"
@@ -90,10 +87,6 @@ class HybridSettings(Settings):
         with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
             places = list(pool.map(lambda row: state.describe(kept[row].features), rows))
         return HybridState(self, kept, bobb, words, _balance(state.index(places), places, self.share))
-
-    def load(self, folder: Path, threads: int) -> HybridState:
-        """A library saved by `HybridState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(HybridSettings, folder, threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +222,7 @@ class Described:
 
 
 @dataclass(frozen=True, eq=False)
-class HybridState:
+class HybridState(ReferencesState):
     """A library, indexed, and its words. Shared freely between threads."""
 
     settings: HybridSettings
@@ -238,10 +231,6 @@ class HybridState:
     words: Words
     share: float
     """0..1: part of the words in a score."""
-    hash: str = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
 
     @property
     def _signs_type(self) -> pa.FixedSizeListType:
@@ -284,9 +273,6 @@ class HybridState:
         boxes = self.bobb.from_arrow(column.field("boxes"))
         signs = vectors_from_arrow(column.field("signs"), self._signs_type)
         return [Described(b, s) for b, s in zip(boxes, signs, strict=True)]
-
-    def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
 
 
 class HybridIndex:

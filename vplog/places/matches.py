@@ -139,14 +139,7 @@ class Matcher:
 def large_enough(features: Features, settings: WeighedMatchSettings) -> Features:
     """The strongest features of those that are large enough."""
     least = settings.least_size * np.sqrt(features.width * features.height)
-    rows = np.flatnonzero(features.sizes >= least)[: settings.features]
-    return replace(
-        features,
-        points=features.points[rows],
-        sizes=features.sizes[rows],
-        descriptors=features.descriptors[rows],
-        depth_m=features.depth_m[rows],
-    )
+    return features.rows(np.flatnonzero(features.sizes >= least)[: settings.features])
 
 
 def shares(features: Features) -> Float32s:

@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError
 from vplog.places import stored
+from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from vplog.data import Reference
+
+
+class RelearnedSettings(Settings):
+    """Settings of a recogniser that is saved as its references."""
+
+    def load(self, folder: Path, threads: int) -> Any:
+        """A library saved by its state. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(type(self), folder, threads)
+
+
+class ReferencesState:
+    """A state that follows from settings and references: its hash, and how it is saved."""
+
+    settings: Any
+    references: list[Reference]
+
+    @cached_property
+    def hash(self) -> str:
+        return stored.references_hash(self.references, self.settings)
+
+    def save(self, folder: Path) -> None:
+        stored.save_references(self.references, self.settings, folder)
 
 
 def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:

@@ -16,13 +16,13 @@ import numba
 import numpy as np
 from pydantic import Field, model_validator
 
-from vplog.data import Ranking
+from vplog.places.dense import best_rows
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from vplog.data import Float32s, Int32s, Ints
+    from vplog.data import Float32s, Int32s, Ints, Ranking
     from vplog.stages import PlaceIndex
 
     Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
@@ -110,22 +110,6 @@ def sequence_rows(
             yield from list(mapped(match, range(first, min(first + _BLOCK, count))))
 
 
-def match_sequences(scores: Float32s, settings: SequenceSettings, stops: Ints | None = None) -> Float32s:
-    """(Q, M) scores of sequences from (Q, M) scores of single views, as `sequence_rows`; unchanged for length 1.
-
-    NaN at and above stops[q] in row q; without stops every row may match.
-    """
-    stops = np.full(len(scores), scores.shape[1]) if stops is None else stops
-    result = np.full(scores.shape, np.nan, np.float32)
-    if settings.length == 1:
-        rows = (scores[query, :stop] for query, stop in enumerate(stops))
-    else:
-        rows = (row for row, _ in sequence_rows(lambda query: scores[query, : stops[query]], stops, settings))
-    for query, row in enumerate(rows):
-        result[query, : len(row)] = row
-    return result
-
-
 def rank_places(
     index: PlaceIndex, descriptors: Sequence[object], stops: Ints, k: int, settings: SequenceSettings, threads: int = 1
 ) -> Iterator[tuple[Ranking, Int32s]]:
@@ -138,8 +122,8 @@ def rank_places(
             lambda query: index.scores(descriptors[query], int(stops[query])), stops, settings, threads
         )
         for score, support in rows:
-            best = _best_rows(score, k)
-            yield Ranking(best, score[best]), support[best]
+            best = best_rows(np.maximum(score, 0.0), k)
+            yield best, support[best.rows]
         return
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         for first in range(0, len(stops), _BLOCK):
@@ -156,13 +140,6 @@ def _mapping(threads: int) -> Iterator[Mapping]:
         return
     with ThreadPoolExecutor(threads) as pool:
         yield pool.map
-
-
-def _best_rows(score: Float32s, k: int) -> Int32s:
-    rows = np.flatnonzero(score > 0)
-    if len(rows) > k:  # everything as good as the k-th, so that ties do not depend on the partition
-        rows = rows[score[rows] >= -np.partition(-score[rows], k - 1)[k - 1]]
-    return rows[np.lexsort((rows, -score[rows]))][:k].astype(np.int32)
 
 
 def _usual(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, mapped: Mapping) -> Float32s:

@@ -35,11 +35,7 @@ _MAX_FEATURES = 50_000_000
 
 def strongest(reference: Reference, count: int) -> Reference:
     """The reference with at most its `count` strongest features."""
-    f = reference.features
-    cut = replace(
-        f, points=f.points[:count], sizes=f.sizes[:count], descriptors=f.descriptors[:count], depth_m=f.depth_m[:count]
-    )
-    return replace(reference, features=cut)
+    return replace(reference, features=reference.features.rows(slice(count)))
 
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:

@@ -13,14 +13,11 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.data import THUMBNAIL_SIDE
-from vplog.places import stored
-from vplog.places.dense import VectorIndex, thumbnail_of, vectors_from_arrow, vectors_to_arrow
-from vplog.places.relearn import keep_references, relearn
-from vplog.settings import Settings
+from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
+from vplog.places.relearn import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from vplog.data import Bytes, Features, Reference
 
@@ -32,7 +29,7 @@ _LEAST_DEVIATION = 1.0
 """Grey levels; a patch that varies less is the camera's noise, which must not be blown up to the size of a texture."""
 
 
-class ThumbnailSettings(Settings):
+class ThumbnailSettings(RelearnedSettings):
     """SeqSLAM's image comparison. It learns nothing: the references only go into the library."""
 
     kind: Literal["thumbnail"] = "thumbnail"
@@ -42,27 +39,13 @@ class ThumbnailSettings(Settings):
         """Nothing to learn. Raises LibraryError where there is no reference."""
         return ThumbnailState(self, keep_references(references))
 
-    def load(self, folder: Path, threads: int) -> ThumbnailState:
-        """A library saved by `ThumbnailState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(ThumbnailSettings, folder, threads)
-
 
 @dataclass(frozen=True, eq=False)
-class ThumbnailState:
+class ThumbnailState(VectorState):
     """Nothing but what to save. Shared freely between threads."""
 
     settings: ThumbnailSettings
     references: list[Reference]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
-
-    hash: str = ""
-
-    @property
-    def bits(self) -> int:
-        """A byte a pixel."""
-        return 8 * _WIDTH * _HEIGHT
 
     @property
     def arrow_type(self) -> pa.FixedSizeListType:
@@ -79,16 +62,6 @@ class ThumbnailState:
 
     def index(self, descriptors: Sequence[Bytes]) -> VectorIndex:
         return VectorIndex(np.array(descriptors, np.uint8).reshape(-1, _WIDTH * _HEIGHT), _likeness)
-
-    def to_arrow(self, descriptors: Sequence[Bytes]) -> pa.Array:
-        return vectors_to_arrow(descriptors, self.arrow_type)
-
-    def from_arrow(self, column: pa.Array) -> list[Bytes]:
-        """The places of a table's column. Raises LibraryError where it is of another kind."""
-        return vectors_from_arrow(column, self.arrow_type)
-
-    def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,15 +16,12 @@ import pyarrow as pa
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places import stored
-from vplog.places.dense import VectorIndex, vectors_from_arrow, vectors_to_arrow
-from vplog.places.relearn import keep_references, relearn
+from vplog.places.dense import VectorIndex, VectorState
+from vplog.places.relearn import RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift
-from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -34,7 +31,7 @@ _MAX_PCA_REFERENCES = 2000
 """Images that the PCA looks at, spread evenly over the references: its time grows with their cube, 1 s for these."""
 
 
-class VladSettings(Settings):
+class VladSettings(RelearnedSettings):
     """Vector of locally aggregated descriptors, whitened by PCA."""
 
     kind: Literal["vlad"] = "vlad"
@@ -65,13 +62,9 @@ class VladSettings(Settings):
             raw = np.array(list(pool.map(lambda row: aggregate(kept[row].features, self.features, vocabulary), rows)))
         return VladState(self, kept, vocabulary, Whitening.learn(raw, self.dimensions, self.shrinkage))
 
-    def load(self, folder: Path, threads: int) -> VladState:
-        """A library saved by `VladState.save`. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(VladSettings, folder, threads)
-
 
 @dataclass(frozen=True, eq=False)
-class VladState:
+class VladState(VectorState):
     """Centres and a whitening projection. Shared freely between threads."""
 
     settings: VladSettings
@@ -80,19 +73,9 @@ class VladState:
     whitening: Whitening | None
     """None keeps vectors as they are."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hash", stored.references_hash(self.references, self.settings))
-
-    hash: str = ""
-
     @property
     def _length(self) -> int:
         return self.vocabulary.centres.size if self.whitening is None else len(self.whitening.projection)
-
-    @property
-    def bits(self) -> int:
-        """Two bytes a dimension."""
-        return 16 * self._length
 
     @property
     def arrow_type(self) -> pa.FixedSizeListType:
@@ -107,16 +90,6 @@ class VladState:
 
     def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
         return VectorIndex(np.array(descriptors, np.float32).reshape(-1, self._length), _products)
-
-    def to_arrow(self, descriptors: Sequence[NDArray[np.float16]]) -> pa.Array:
-        return vectors_to_arrow(descriptors, self.arrow_type)
-
-    def from_arrow(self, column: pa.Array) -> list[NDArray[np.float16]]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or length."""
-        return vectors_from_arrow(column, self.arrow_type)
-
-    def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
 
 
 def aggregate(features: Features, count: int, vocabulary: Vocabulary) -> Float32s:

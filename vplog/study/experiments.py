@@ -6,6 +6,7 @@ Numbers of figures are those of Tanaka et al., Mining Visual Phrases for Long-Te
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import SettingsError
@@ -57,13 +58,7 @@ def boxed(bench: Bench, plan: Plan) -> list[str]:
 
 def pairs(bench: Bench, plan: Plan) -> dict[str, Any]:
     """Fig. 5: every method on every pair of drives, with a library from the map."""
-    trials = [
-        Trial(name, library, query, other)
-        for query, other in bench.pairs
-        for name in plan.methods
-        for library in plan.libraries(other)
-    ]
-    rows = _rows(bench, "pairs", trials)
+    rows = _rows(bench, "pairs", _every(bench, plan.methods, plan.libraries))
     return {"rows": rows, "mean": _mean(rows, ("method",))}
 
 
@@ -101,14 +96,8 @@ def sizes(bench: Bench, plan: Plan) -> dict[str, Any]:
     left_out = [size for size in plan.sizes if size > least]
     if not fitting:
         raise SettingsError(f"--sizes {','.join(map(str, plan.sizes))}: the shortest drive has only {least} frames.")
-    trials = [
-        Trial(name, library, query, other)
-        for size in fitting
-        for query, other in bench.pairs
-        for name in names
-        for library in plan.libraries(other, size)
-    ]
-    rows = _rows(bench, "sizes", trials)
+    trials = (_every(bench, names, lambda drive, size=size: plan.libraries(drive, size)) for size in fitting)
+    rows = _rows(bench, "sizes", chain.from_iterable(trials))
     found: dict[str, Any] = {"rows": rows, "mean": _mean(rows, ("method", "size"))}
     if left_out:
         found["left_out"] = f"Sizes {left_out} are more than the {least} frames of the shortest drive."
@@ -117,14 +106,8 @@ def sizes(bench: Bench, plan: Plan) -> dict[str, Any]:
 
 def library(bench: Bench, plan: Plan) -> dict[str, Any]:
     """Fig. 8: libraries from every drive, for every pair."""
-    trials = [
-        Trial(name, drawn, query, other)
-        for query, other in bench.pairs
-        for name in boxed(bench, plan)
-        for drive in range(len(bench.names))
-        for drawn in plan.libraries(drive)
-    ]
-    rows = _rows(bench, "library", trials)
+    drawn = [library for drive in range(len(bench.names)) for library in plan.libraries(drive)]
+    rows = _rows(bench, "library", _every(bench, boxed(bench, plan), lambda _: drawn))
     for row in rows:
         row["from"] = {row["query"]: "query", row["map"]: "map"}.get(row["library"], "other")
     return {"rows": rows, "mean": _mean(rows, ("method", "from"))}
@@ -135,13 +118,7 @@ def ablations(bench: Bench, plan: Plan) -> dict[str, Any]:
     names = [BASE, *(departure.method for departure in DEPARTURES)]
     for name in names:
         bench.methods[name] = read_method(name, plan.pipeline)
-    trials = [
-        Trial(name, drawn, query, other)
-        for query, other in bench.pairs
-        for name in names
-        for drawn in plan.libraries(other)
-    ]
-    rows = _rows(bench, "ablations", trials)
+    rows = _rows(bench, "ablations", _every(bench, names, plan.libraries))
     found = {(row["method"], row["query"], row["map"]): row for row in rows}
     base = {row["method"]: row for row in _mean(rows, ("method",))}
     table = []
@@ -185,6 +162,16 @@ NUMBERS: dict[str, Callable[[Bench, Plan], dict[str, Any]]] = {
     "ablations": ablations,
 }
 """Experiments by name."""
+
+
+def _every(bench: Bench, methods: Iterable[str], libraries: Callable[[int], list[Library]]) -> list[Trial]:
+    """Each method on each pair of drives, with each of the libraries for its map."""
+    return [
+        Trial(method, library, query, other)
+        for query, other in bench.pairs
+        for method in methods
+        for library in libraries(other)
+    ]
 
 
 def _rows(bench: Bench, stage: str, trials: Iterable[Trial]) -> list[Row]:
