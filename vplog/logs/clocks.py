@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 LEAST_JUMP_NS = 1_000_000_000
 """ns; stamps and log times part by less than a second when a computer is busy, and by hours when a clock is set."""
+LATE_NS = 2_000_000_000
+"""ns that messages may be later than others of the log: slow estimators, and links that send again what was lost."""
 _PERIODS = 10
 """A jump is also longer than so many periods of the topic: slow topics may be late by one."""
 _LEAST_RUN = 5
@@ -129,7 +131,7 @@ def on_one_clock(
     stamp_ns, kept = header_ns.copy(), np.zeros(len(header_ns), bool)
     for run, skew in zip(runs, skews, strict=True):
         clock = min(counts, key=lambda known: (abs(known - skew), known))
-        if abs(clock - skew) > limit:  # too short to be a clock, and on none
+        if not -limit <= skew - clock <= max(limit, LATE_NS):  # too short to be a clock, and on none
             continue
         shift = 0 if clock == chosen else (skew if run.stop - run.start >= least else clock) - chosen
         shifted = [int(header_ns[run].min()) + shift, int(header_ns[run].max()) + shift]
@@ -137,4 +139,7 @@ def on_one_clock(
         if shift and kept[run.start]:
             stamp_ns[run] += shift
     jumps = [before - behind for before, behind in pairwise(clocks) if before != behind]
-    return Repaired(stamp_ns, kept, chosen, jumps, int((apart & steady & ~log_steady).sum()), counts)
+    late_ns, set_at = log_ns - header_ns, np.flatnonzero(apart & steady & ~log_steady) + 1
+    least_ns = np.minimum.reduceat(late_ns, [0, *set_at])  # of a burst the last message is as late as ever
+    log_jumps = int((np.abs(np.diff(least_ns)) > limit).sum())
+    return Repaired(stamp_ns, kept, chosen, jumps, log_jumps, counts)

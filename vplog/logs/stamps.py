@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
+from vplog.logs.clocks import LATE_NS, LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
 from vplog.logs.containers import Notes, plural
 from vplog.logs.losses import runs_of
 
@@ -29,8 +29,6 @@ _MOST_STEPS = 20
 """Steps back of the recorder's clock that are undone; it is set a few times in a drive."""
 _STANDING = 10
 """A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
-_LATE_NS = 2 * 10**9
-"""ns that header stamps of one topic may be further from the log times than those of others: slow estimators."""
 _GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
@@ -234,7 +232,7 @@ def _on_common(stamp_ns: Ints, skew_ns: int, common: Clock | None, topic: str, n
 
     Where they do, they may be right and only recorded late: that is for the reader to decide.
     """
-    if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= _LATE_NS:
+    if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= LATE_NS:
         return stamp_ns
     shift = skew_ns - common.skew_ns
     first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
