@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from vplog.data import Ints
+    from vplog.data import Floats, Ints
 
 LEAST_JUMP_NS = 1_000_000_000
 """ns; stamps and log times part by less than a second when a computer is busy, and by hours when a clock is set."""
@@ -31,6 +31,8 @@ _LEVEL = 30
 """Messages before and behind a step by which the skew is known: a burst is over by then."""
 _TWICE = 1.5
 """Messages of a time that was passed twice, against those of one that was passed once: between 1 and 2."""
+_ONWARD = 3
+"""Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 _MOST_CLOCKS = 20
 """A clock is set a few times in a drive; what jumps to more values than these is none."""
 
@@ -63,11 +65,12 @@ class Repaired:
     """Messages by the skew of the clock that they came on."""
 
 
-def steps_back(times_ns: Ints, *others: np.ndarray) -> tuple[Ints, Ints]:
+def steps_back(times_ns: Ints, other_ns: Ints, content: Floats | None = None) -> tuple[Ints, Ints]:
     """Rows of times (M,) in the order of receipt before which their clock was set back, and by how many ns.
 
-    `others` (M,) tell messages apart: what comes again with the same time and the same others was written twice.
+    `other_ns` and `content` (M,) tell messages apart: what comes again with the same of each was written twice.
     """
+    others = [other_ns] if content is None else [other_ns, content]
     step = np.diff(times_ns)
     period = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     rows = np.flatnonzero(-step >= (_STEP_PERIODS - 1) * period) + 1 if period else np.zeros(0, np.int64)
@@ -81,8 +84,25 @@ def steps_back(times_ns: Ints, *others: np.ndarray) -> tuple[Ints, Ints]:
     before, behind = np.split(times_ns[around], 2, axis=1)
     advance = np.median(behind, axis=1) - np.median(before, axis=1)
     stays = advance < _LEAST_RUN * period - size / 2  # a message that is late alone leaves the median
-    told = stays & (found > _TWICE * size / period)
+    twice = found > _TWICE * size / period
+    if content is not None:
+        twice |= _over_a_gap(times_ns, rows, content, max(LEAST_JUMP_NS, _PERIODS * period))
+    told = stays & twice
     return rows[told], size[told]
+
+
+def _over_a_gap(times_ns: Ints, rows: Ints, content: Floats, limit_ns: float) -> np.ndarray:
+    """(R,) bool: clocks that were set back by more than had passed since they were set, so that no time comes twice.
+
+    Between parts of a recording that lie in another order the content does not lead on, or they leave no gap.
+    """
+    bounds = np.union1d(np.append(rows, 0), np.flatnonzero(np.diff(times_ns) > limit_ns) + 1)
+    first, last = (extreme.reduceat(times_ns, bounds) for extreme in (np.minimum, np.maximum))
+    part = np.searchsorted(bounds, rows)
+    _, at, again = np.unique(times_ns, return_index=True, return_inverse=True)
+    step = np.abs(np.diff(content))
+    onward = (at[again[rows]] == rows) & (step[rows - 1] <= _ONWARD * np.quantile(step, 0.9))
+    return onward & (first[part - 1] - last[part] > limit_ns)
 
 
 def header_steps_back(header_ns: Ints, log_ns: Ints) -> Ints:

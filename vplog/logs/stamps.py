@@ -199,8 +199,8 @@ def _mend_log_times(topics: list[Stamps], notes: Notes) -> None:
 def _first_step(one: Stamps) -> tuple[int, int, int, int] | None:
     """Log time before the first step back, the period, log time behind the step, and its size; None where is none."""
     log_ns, header_ns = np.array(one.log_ns, np.int64), np.array(one.header_ns, np.int64)
-    content = [np.array(one.content)] if len(one.content) == len(log_ns) else []
-    rows, sizes = steps_back(log_ns, header_ns, *content)
+    content = np.array(one.content) if len(one.content) == len(log_ns) else None
+    rows, sizes = steps_back(log_ns, header_ns, content)
     if not len(rows):
         return None
     row, size = int(rows[0]), int(sizes[0])

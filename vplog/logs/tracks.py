@@ -28,9 +28,10 @@ _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UNKNOWN = [float("nan")] * 36
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
-_BACK_AND_FORTH = 1.5
-"""A path by header stamps that is so many times that by log times is out of order; one that is sorted rightly is
-shorter."""
+_LONGER = 0.02
+"""A path by header stamps that is longer by this share than by log times is out of order: sorted rightly it is
+shorter, but for noise, whose share is within _SIGMAS of the root of the steps' squares."""
+_SIGMAS = 3.0
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -136,10 +137,9 @@ class PoseTrack:
         _, by_header = self.stamps.order(self.topic, Notes())
         if (np.diff(by_header) < 0).any():
             _, by_log = self.stamps.by_log_times(self.topic, Notes(), "")
-            ways = [
-                float(np.linalg.norm(np.diff(position[rows], axis=0), axis=1).sum()) for rows in (by_header, by_log)
-            ]
-            if ways[0] > _BACK_AND_FORTH * ways[1]:
+            steps, log_steps = (np.linalg.norm(np.diff(position[rows], axis=0), axis=1) for rows in (by_header, by_log))
+            noise_m = _SIGMAS * float(np.linalg.norm(log_steps))
+            if steps.sum() - log_steps.sum() > max(_LONGER * log_steps.sum(), noise_m):
                 why = "has header stamps by which it moves back and forth"
                 return self.stamps.by_log_times(self.topic, notes, why)
         return self.stamps.order(self.topic, notes)
