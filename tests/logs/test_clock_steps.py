@@ -245,8 +245,7 @@ def test_odometry_that_is_interleaved_for_a_moment_is_ordered_by_log_times(seed:
     for stamp_ns, time_ns, x in zip(
         after(true_ns, true_ns, steps).tolist(), log_ns.tolist(), (true_ns - START_NS) / SECOND, strict=True
     ):
-        pose = np.array([x, 0, 0]), np.array([0, 0, 0, 1.0])
-        track.add(PoseMessage(stamp_ns, "odom", "base_link", *pose, None), time_ns)
+        track.add(PoseMessage(stamp_ns, "odom", "base_link", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), None), time_ns)
     odometry = track.finish(Notes())
     assert odometry is not None
     way = np.abs(np.diff(odometry.odom_from_body[:, 0, 3])).sum()

@@ -160,6 +160,6 @@ def on_one_clock(
             stamp_ns[run] += shift
     jumps = [before - behind for before, behind in pairwise(clocks) if before != behind]
     late_ns, set_at = log_ns - header_ns, np.flatnonzero(apart & steady & ~log_steady) + 1
-    least_ns = np.minimum.reduceat(late_ns, [0, *set_at])  # of a burst the last message is as late as ever
+    least_ns = np.minimum.reduceat(late_ns, np.append(0, set_at))  # of a burst the last message is as late as ever
     log_jumps = int((np.abs(np.diff(least_ns)) > limit).sum())
     return Repaired(stamp_ns, kept, chosen, jumps, log_jumps, counts)
