@@ -66,13 +66,10 @@ class Stamps:
         self.header_ns.extend(header_ns)
         self.log_ns.extend([min(time_ns, _LAST_NS) for time_ns in log_ns])
 
-    def clock(self) -> Clock | None:
-        """The clock of the header stamps; None where they follow none."""
+    def skew_ns(self) -> int | None:
+        """Log time less header stamp, the median; None where the header stamps follow no clock."""
         found = self._on_one_clock()
-        if found is None or not found.kept.any():
-            return None
-        kept = found.stamp_ns[found.kept]
-        return Clock(found.skew_ns, int(kept.min()), int(kept.max()))
+        return found.skew_ns if found is not None and found.kept.any() else None
 
     def rate_hz(self) -> float | None:
         """Messages a second between the first and the last; None where there is no such time."""
