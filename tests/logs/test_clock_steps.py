@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from vplog import logs
 from vplog.logs.containers import Notes
+from vplog.logs.messages import PoseMessage
 from vplog.logs.stamps import Stamps, find_steps_back, share_clock
+from vplog.logs.tracks import PoseTrack
 
 from .drives import LATENCY_NS, START_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros1, write_ros2
 
@@ -194,7 +196,9 @@ def write(fmt: str, path: Path, messages: list[Any]) -> Path:
 
 
 @pytest.mark.parametrize("fmt", ["mcap", "sqlite3", "bag", "protobuf", "json"])
-@pytest.mark.parametrize(("header_s", "log_s"), [(3.0, 3.0), (0.8, 0.0), (0.8, 0.8), (3.0, 0.0), (0.0, 3.0)])
+@pytest.mark.parametrize(
+    ("header_s", "log_s"), [(3.0, 3.0), (0.8, 0.0), (0.8, 0.8), (3.0, 0.0), (0.0, 3.0), (3600.0, 3600.0)]
+)
 def test_odometry_is_not_interleaved(fmt: str, header_s: float, log_s: float, tmp_path: Path) -> None:
     """In every format, though the times are on a grid, so that those that come again are the very same."""
     count = 100
@@ -209,6 +213,43 @@ def test_odometry_is_not_interleaved(fmt: str, header_s: float, log_s: float, tm
     said = " ".join(log.warnings)
     assert "set back by" in said or "was set by" in said or "log times jump" in said
     assert "Lost" not in said
+
+
+@given(seeds, st.floats(2.0, 3600.0))
+def test_a_clock_is_set_back_by_more_than_had_passed(seed: int, size_s: float) -> None:
+    """The motion leads on where it was; behind a part that is missing, of a recording in another order, it does not."""
+    rng = np.random.default_rng(seed)
+    true_ns, log_ns = topic(rng, 30, rng.uniform(10, 60))
+    steps = [(START_NS + 12 * SECOND, int((30 + size_s) * SECOND))]
+    found = stamps(after(true_ns, true_ns, steps), after(log_ns, log_ns, steps))
+    found.content = array("d", (true_ns / SECOND).tolist())
+    _, rows, said = ordered(found)
+    np.testing.assert_array_equal(rows[0], np.arange(len(true_ns)))
+    assert any("set back" in line for line in said)
+    parts = np.array_split(np.arange(len(true_ns)), 4)
+    mixed = np.concatenate([parts[3], parts[0], parts[1]])
+    found = stamps(true_ns[mixed], log_ns[mixed])
+    found.content = array("d", (true_ns[mixed] / SECOND).tolist())
+    times, _, said = ordered(found)
+    np.testing.assert_array_equal(times[0], np.sort(true_ns[mixed]))
+    assert not [line for line in said if "set" in line]
+
+
+@given(seeds, st.floats(0.3, 0.6))
+def test_odometry_that_is_interleaved_for_a_moment_is_ordered_by_log_times(seed: int, size_s: float) -> None:
+    """A step too small to be told from a busy computer, and one that is undone together with it."""
+    rng = np.random.default_rng(seed)
+    true_ns, log_ns = topic(rng, 60, rng.uniform(30, 60))
+    steps = [(START_NS + 30 * SECOND, -int(size_s * SECOND)), (START_NS + 36 * SECOND, -700 * SECOND)]
+    track = PoseTrack("/odom")
+    for stamp_ns, time_ns, x in zip(
+        after(true_ns, true_ns, steps).tolist(), log_ns.tolist(), (true_ns - START_NS) / SECOND, strict=True
+    ):
+        track.add(PoseMessage(stamp_ns, "odom", "base_link", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), None), time_ns)
+    odometry = track.finish(Notes())
+    assert odometry is not None
+    way = np.abs(np.diff(odometry.odom_from_body[:, 0, 3])).sum()
+    assert way <= 1.02 * (true_ns[-1] - true_ns[0]) / SECOND
 
 
 @given(seeds)

@@ -62,7 +62,8 @@ def test_stray_stamps_are_told_and_nothing_else(count: int, data: st.DataObject)
     rows = [6 * row for row in stray]
     header_ns = true_ns.copy()
     for row in rows:
-        header_ns[row] += data.draw(steps)
+        step = data.draw(steps)
+        header_ns[row] += step + step // 4  # by less than 2 s a message may be late
     header_ns = np.maximum(header_ns, 1)
     found = on_one_clock(header_ns, log_ns)
     assert found is not None
@@ -112,6 +113,22 @@ def test_stamps_that_are_none_give_way_to_the_log_times(header: object, said: st
     stamp_ns, _ = stamps(header(true_ns), log_ns).order("/t", notes := Notes())  # type: ignore[operator]
     np.testing.assert_array_equal(stamp_ns, log_ns)
     assert said in notes.lines[0]
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.2, 3.0), st.booleans())
+def test_links_that_stall_lose_nothing_and_are_no_clock_that_was_set(seed: int, stall_s: float, again: bool) -> None:
+    """Messages wait for the link, or are sent again one by one, by less than 2 s."""
+    rng = np.random.default_rng(seed)
+    true_ns = START_NS + int(rng.uniform(0.005, 0.1) * SECOND) * np.arange(400)
+    ends_ns = START_NS + (np.cumsum(rng.uniform(0.05, stall_s, 2000)) * SECOND).astype(np.int64)
+    log_ns = ends_ns[np.searchsorted(ends_ns, true_ns)] + 1000 * np.arange(400)
+    if again:
+        log_ns = true_ns + (rng.random(400) < 0.1) * rng.integers(0, int(1.9 * SECOND), 400)
+    received = log_ns <= max(true_ns[-1], ends_ns[0])
+    order = np.argsort(log_ns[received], kind="stable")
+    stamp_ns, _ = stamps(true_ns[received][order], log_ns[received][order]).order("/t", notes := Notes())
+    np.testing.assert_array_equal(stamp_ns, true_ns[received])
+    assert not [line for line in notes.lines if "jump" in line or "Lost" in line]
 
 
 def test_what_is_dropped_is_counted_and_placed() -> None:

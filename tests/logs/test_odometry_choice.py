@@ -110,6 +110,22 @@ def test_what_commands_a_robot_is_taken_only_where_it_is_asked_for(tmp_path: Pat
     assert logs.open(path, TopicChoice(odometry="/move_base/goal")).odometry() is not None
 
 
+def test_a_name_does_not_decide_against_what_was_measured(tmp_path: Path) -> None:
+    """Odometry that moves a body may be called as a command is; a worse source never wins over a command silently."""
+    few, still = poses("/amcl_pose", AMCL, OTHER[FOUR], STAMPS[FOUR]), np.repeat(OTHER[:1], COUNT, axis=0)
+    named = poses("/reference_pose", ODOMETRY, WALK)
+    for name, others in {"alone": [], "few": [few], "still": [poses("/pose", POSE, still)]}.items():
+        log = logs.open(drive(tmp_path / name, named, *others))
+        assert source(log) == "/reference_pose"
+        assert "/reference_pose is by its name where the robot is to be" in " ".join(log.warnings)
+    assert source(logs.open(drive(tmp_path / "both", named, poses("/pose", POSE, OTHER)))) == "/pose"
+    log = logs.open(drive(tmp_path / "word", poses("/preferences/planet/odom", ODOMETRY, WALK)))
+    assert source(log) == "/preferences/planet/odom" and "by its name" not in " ".join(log.warnings)
+    log = logs.open(drive(tmp_path / "goal", poses("/goal", POSE, WALK), few))
+    assert source(log) == "/amcl_pose"
+    assert "--odometry-topic /goal takes it" in " ".join(log.warnings)
+
+
 @pytest.mark.parametrize("asked", [None, "/odom"])
 def test_odometry_of_a_part_of_the_time_is_never_taken_silently(asked: str | None, tmp_path: Path) -> None:
     half = slice(0, COUNT // 2)

@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from vplog.data import Ints
+    from vplog.data import Floats, Ints
 
 LEAST_JUMP_NS = 1_000_000_000
 """ns; stamps and log times part by less than a second when a computer is busy, and by hours when a clock is set."""
+LATE_NS = 2_000_000_000
+"""ns that messages may be later than others of the log: slow estimators, and links that send again what was lost."""
 _PERIODS = 10
 """A jump is also longer than so many periods of the topic: slow topics may be late by one."""
 _LEAST_RUN = 5
@@ -29,6 +31,8 @@ _LEVEL = 30
 """Messages before and behind a step by which the skew is known: a burst is over by then."""
 _TWICE = 1.5
 """Messages of a time that was passed twice, against those of one that was passed once: between 1 and 2."""
+_ONWARD = 3
+"""Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 _MOST_CLOCKS = 20
 """A clock is set a few times in a drive; what jumps to more values than these is none."""
 
@@ -61,11 +65,12 @@ class Repaired:
     """Messages by the skew of the clock that they came on."""
 
 
-def steps_back(times_ns: Ints, *others: np.ndarray) -> tuple[Ints, Ints]:
+def steps_back(times_ns: Ints, other_ns: Ints, content: Floats | None = None) -> tuple[Ints, Ints]:
     """Rows of times (M,) in the order of receipt before which their clock was set back, and by how many ns.
 
-    `others` (M,) tell messages apart: what comes again with the same time and the same others was written twice.
+    `other_ns` and `content` (M,) tell messages apart: what comes again with the same of each was written twice.
     """
+    others = [other_ns] if content is None else [other_ns, content]
     step = np.diff(times_ns)
     period = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     rows = np.flatnonzero(-step >= (_STEP_PERIODS - 1) * period) + 1 if period else np.zeros(0, np.int64)
@@ -79,8 +84,25 @@ def steps_back(times_ns: Ints, *others: np.ndarray) -> tuple[Ints, Ints]:
     before, behind = np.split(times_ns[around], 2, axis=1)
     advance = np.median(behind, axis=1) - np.median(before, axis=1)
     stays = advance < _LEAST_RUN * period - size / 2  # a message that is late alone leaves the median
-    told = stays & (found > _TWICE * size / period)
+    twice = found > _TWICE * size / period
+    if content is not None:
+        twice |= _over_a_gap(times_ns, rows, content, max(LEAST_JUMP_NS, _PERIODS * period))
+    told = stays & twice
     return rows[told], size[told]
+
+
+def _over_a_gap(times_ns: Ints, rows: Ints, content: Floats, limit_ns: float) -> np.ndarray:
+    """(R,) bool: clocks that were set back by more than had passed since they were set, so that no time comes twice.
+
+    Between parts of a recording that lie in another order the content does not lead on, or they leave no gap.
+    """
+    bounds = np.union1d(np.append(rows, 0), np.flatnonzero(np.diff(times_ns) > limit_ns) + 1)
+    first, last = (extreme.reduceat(times_ns, bounds) for extreme in (np.minimum, np.maximum))
+    part = np.searchsorted(bounds, rows)
+    _, at, again = np.unique(times_ns, return_index=True, return_inverse=True)
+    step = np.abs(np.diff(content))
+    onward = (at[again[rows]] == rows) & (step[rows - 1] <= _ONWARD * np.quantile(step, 0.9))
+    return onward & (first[part - 1] - last[part] > limit_ns)
 
 
 def header_steps_back(header_ns: Ints, log_ns: Ints) -> Ints:
@@ -129,7 +151,7 @@ def on_one_clock(
     stamp_ns, kept = header_ns.copy(), np.zeros(len(header_ns), bool)
     for run, skew in zip(runs, skews, strict=True):
         clock = min(counts, key=lambda known: (abs(known - skew), known))
-        if abs(clock - skew) > limit:  # too short to be a clock, and on none
+        if not -limit <= skew - clock <= max(limit, LATE_NS):  # too short to be a clock, and on none
             continue
         shift = 0 if clock == chosen else (skew if run.stop - run.start >= least else clock) - chosen
         shifted = [int(header_ns[run].min()) + shift, int(header_ns[run].max()) + shift]
@@ -137,4 +159,7 @@ def on_one_clock(
         if shift and kept[run.start]:
             stamp_ns[run] += shift
     jumps = [before - behind for before, behind in pairwise(clocks) if before != behind]
-    return Repaired(stamp_ns, kept, chosen, jumps, int((apart & steady & ~log_steady).sum()), counts)
+    late_ns, set_at = log_ns - header_ns, np.flatnonzero(apart & steady & ~log_steady) + 1
+    least_ns = np.minimum.reduceat(late_ns, np.append(0, set_at))  # of a burst the last message is as late as ever
+    log_jumps = int((np.abs(np.diff(least_ns)) > limit).sum())
+    return Repaired(stamp_ns, kept, chosen, jumps, log_jumps, counts)

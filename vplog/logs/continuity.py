@@ -16,17 +16,21 @@ if TYPE_CHECKING:
     from vplog.logs.containers import Notes
 
 _ACCELERATION_M_S2 = 10.0
-"""m/s^2; tyres hold 1 g, and what flies or is carried rarely has more for longer than a sample."""
-_TURN_RAD_S = 12.0
-"""rad/s; two revolutions a second, by which no camera sees anything."""
+"""m/s^2; tyres hold 1 g, and little has more for longer than a moment:"""
+_IMPULSE_M_S = 5.0
+"""m/s; 10 g for 50 ms, as drones and hands that shake a camera."""
+_TURN_RAD_S = 20.0
+"""rad/s; three revolutions a second, as fast as drones flip, by which no camera sees anything."""
 _LEAST_TURN_RAD = 0.1
 """rad; a smaller turn in one step is noise of short periods."""
 _TIMES = 10.0
 """A jump departs so many times further from the motion beside it than nine tenths of the drive's own steps do."""
 _PERIODS = 3.0
 """A jump is also longer than the way of so many periods: stamps that jitter crowd that much motion into one step."""
+_GAP_S = 1.0
+"""s; what is longer between poses is a gap, and says nothing of their period."""
 _BESIDE = 3
-"""Steps on either side whose median speed a step is held against: one or two of them may be jumps themselves."""
+"""Steps on either side whose median velocity a step is held against: one of them may be a jump itself."""
 _LEAST = 4 * _BESIDE
 """Poses; fewer do not tell what is usual."""
 _NAMED = 4
@@ -39,17 +43,18 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
         return np.zeros(0, np.int64)
     seconds = np.diff(stamp_ns) / 1e9
     step = geometry.between(poses[:-1], poses[1:])
-    speed = step[:, :3, 3] / seconds[:, None]
-    departure_m = np.linalg.norm(speed - _beside(speed), axis=1) * seconds
-    least_s = np.maximum(seconds, np.median(seconds))
-    window_s = np.convolve(seconds, np.ones(2 * _BESIDE + 1), "same")
-    usual_m_s, turn = _usual(np.linalg.norm(speed, axis=1)), geometry.angle(step)
+    turns, way = geometry.so3_log(step[:, :3, :3]), step[:, :3, 3]
+    departure_rad, departure_m = (_departure(steps, seconds) for steps in (turns, way))
+    usual_s = np.minimum(seconds, max(_GAP_S, float(np.median(seconds)))).mean()  # the mean: stamps of bursts crowd
+    least_s = np.maximum(seconds, usual_s)
+    window_s = np.convolve(seconds, np.ones(3), "same")
     limits_m = (
-        _ACCELERATION_M_S2 * least_s * window_s / 2, _TIMES * _usual(departure_m), _PERIODS * usual_m_s * least_s
+        least_s * (_ACCELERATION_M_S2 * window_s / 2 + _IMPULSE_M_S), _TIMES * _usual(departure_m),
+        _PERIODS * _usual(np.linalg.norm(way, axis=1) / seconds) * least_s,
     )  # fmt: skip
-    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _usual(turn), _LEAST_TURN_RAD)
+    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _usual(np.linalg.norm(turns, axis=1)), _LEAST_TURN_RAD)
     far = np.all([departure_m > limit for limit in limits_m], axis=0)
-    turned = np.all([turn > limit for limit in limits_rad], axis=0)
+    turned = np.all([departure_rad > limit for limit in limits_rad], axis=0)
     return np.flatnonzero(np.logical_or(far, turned))
 
 
@@ -76,10 +81,20 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
     return replace(odometry, stamp_ns=stamp_ns, odom_from_body=poses, covariance=covariance)
 
 
-def _beside(speed: Floats) -> Floats:
-    """(T, 3) median of each speed and those beside it."""
-    around = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="reflect")
-    return np.asarray(np.median(sliding_window_view(around, 2 * _BESIDE + 1, axis=0), axis=-1))
+def _departure(steps: Floats, seconds: Floats) -> Floats:
+    """(T,) how far each of (T, 3) steps is from those between the medians of the steps before and behind, as velocities
+    or, where the stamps jitter, as they are.
+
+    What speeds up or starts to turn leads from one to the other; a jump is like neither.
+    """
+    found = []
+    for scale in (seconds, np.ones_like(seconds)):
+        rate = steps / scale[:, None]
+        around = np.pad(rate, ((_BESIDE, _BESIDE), (0, 0)), mode="reflect")
+        level = np.median(sliding_window_view(around, _BESIDE, axis=0), axis=-1)
+        ends = level[: len(rate)], level[-len(rate) :]
+        found.append(np.linalg.norm(rate - rate.clip(np.minimum(*ends), np.maximum(*ends)), axis=1) * scale)
+    return np.minimum(*found)
 
 
 def _usual(values: Floats) -> float:

@@ -231,7 +231,7 @@ class Gathered:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
         timed = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
         timed += [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one]
-        return {topic: clock.skew_ns / 1e6 for topic, stamps in timed if (clock := stamps.clock())}
+        return {topic: skew / 1e6 for topic, stamps in timed if (skew := stamps.skew_ns()) is not None}
 
     def rates_hz(self) -> dict[Channel, float | None]:
         """Messages a second of each topic that was read, by its own times."""

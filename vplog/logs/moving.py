@@ -14,7 +14,7 @@ import numpy as np
 from vplog import geometry
 from vplog.data import Odometry
 from vplog.logs.stamps import Stamps
-from vplog.logs.transforms import FARTHEST_M, SMALLEST, clean
+from vplog.logs.transforms import are_usable, clean
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -151,8 +151,7 @@ class MovingFrames:
         link = self._links[edge]
         values = np.array(link.values).reshape(-1, 7)
         stamp_ns, rows = link.stamps.order(f"{topic} {edge[0]} -> {edge[1]}", notes)
-        largest = np.abs(values[rows, 3:]).max(axis=1)
-        usable = (np.abs(values[rows, :3]) < FARTHEST_M).all(axis=1) & (largest > SMALLEST) & (largest < 1 / SMALLEST)
+        usable = are_usable(values[rows])
         values = values[rows[usable]]
         return stamp_ns[usable], geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
 

@@ -37,10 +37,11 @@ _BODIES = ("base_link", "base_footprint", "base", "body", "robot", "chassis", "v
 _TRUTH = re.compile(r"ground_?truth|(^|[/_])gt([/_]|$)|vicon|optitrack|mocap|qualisys", re.IGNORECASE)
 """Names of ground truth and of the systems that measure it."""
 _COMMAND = re.compile(
-    r"goal|set_?point|target|desired|reference|command|(^|[/_])(cmd|ref|plan)([/_]|$)|way_?point|initial_?pose|clicked",
+    "(?<![a-z])(goal|set_?point|target|desired|reference|command|cmd|ref|plan|way_?point|initial_?pose|clicked)s?(?![a-z])",
     re.IGNORECASE,
 )
-"""Names of where a robot is to be, or is told to be."""
+"""Words for where a robot is to be, or is told to be."""
+_COMMANDED, _MAYBE_COMMANDED = "is a command by its name", "may be a command by its name"
 COVERED = 0.9
 """Share of the camera's time that odometry covers in a usual log: recorders start and stop within seconds."""
 _LEAST_HZ = 5.0
@@ -109,16 +110,16 @@ def weigh_sources(read: Gathered, chosen: Selection) -> list[tuple[OdometrySourc
 def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selection, notes: Notes) -> Channel | None:
     """The source to use: the one asked for, else the best. What is lost with it is said."""
     asked = chosen.odometry
-    fit = [one for one in sources if asked or not _COMMAND.search(one[1].topic)]
-    if sources and not fit:
-        names = ", ".join(source.topic for _, source in sources)
+    commands = [one for one, _ in sources if not asked and _COMMANDED in one.evidence]
+    fit = [one for one in sources if one[0] not in commands]
+    if commands and (not fit or commands[0].score > fit[0][0].score):
+        names = ", ".join(source.topic for source in commands)
         notes.add(
             f"{names}: by its name where the robot is to be, not where it is, so not taken as odometry; "
-            f"--odometry-topic {sources[0][1].topic} takes it."
+            f"--odometry-topic {commands[0].topic} takes it."
         )
-        return None
     if not fit:
-        return asked or next(iter(chosen.sources), None)
+        return None if sources else asked or next(iter(chosen.sources), None)
     best, source = fit[0]
     _note_doubts(best, asked is not None, chosen.image is not None, notes)
     return source
@@ -136,6 +137,11 @@ def _note_doubts(source: OdometrySource, asked: bool, pictured: bool, notes: Not
         notes.add(
             f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is a guess, "
             "by a straight line."
+        )
+    if not asked and _MAYBE_COMMANDED in source.evidence:
+        notes.add(
+            f"{source.topic} is by its name where the robot is to be, but moves {source.frames[-1]}, and no other "
+            "source is better; --odometry-file takes one from a file."
         )
     if any(map(_TRUTH.search, (source.topic, *source.frames))):
         notes.add(
@@ -167,8 +173,8 @@ def _named(topic: str, kind: str, frames: list[str]) -> dict[str, float]:
         found[f"moves {child}, not base_link"] = 0.9
     if any(map(_TRUTH.search, (topic, *frames))):
         found["is ground truth by its name"] = _FAINT
-    if _COMMAND.search(topic):
-        found["is a command by its name"] = _FAINT
+    if _COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
+        found |= {_MAYBE_COMMANDED: 0.1} if child else {_COMMANDED: _FAINT}
     return {what: factor for what, factor in found.items() if factor < 1.0}
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
+from vplog.logs.clocks import LATE_NS, LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
 from vplog.logs.containers import Notes, plural
 from vplog.logs.losses import runs_of
 
@@ -29,8 +29,6 @@ _MOST_STEPS = 20
 """Steps back of the recorder's clock that are undone; it is set a few times in a drive."""
 _STANDING = 10
 """A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
-_LATE_NS = 2 * 10**9
-"""ns that header stamps of one topic may be further from the log times than those of others: slow estimators."""
 _GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
@@ -68,13 +66,10 @@ class Stamps:
         self.header_ns.extend(header_ns)
         self.log_ns.extend([min(time_ns, _LAST_NS) for time_ns in log_ns])
 
-    def clock(self) -> Clock | None:
-        """The clock of the header stamps; None where they follow none."""
+    def skew_ns(self) -> int | None:
+        """Log time less header stamp, the median; None where the header stamps follow no clock."""
         found = self._on_one_clock()
-        if found is None or not found.kept.any():
-            return None
-        kept = found.stamp_ns[found.kept]
-        return Clock(found.skew_ns, int(kept.min()), int(kept.max()))
+        return found.skew_ns if found is not None and found.kept.any() else None
 
     def rate_hz(self) -> float | None:
         """Messages a second between the first and the last; None where there is no such time."""
@@ -201,8 +196,8 @@ def _mend_log_times(topics: list[Stamps], notes: Notes) -> None:
 def _first_step(one: Stamps) -> tuple[int, int, int, int] | None:
     """Log time before the first step back, the period, log time behind the step, and its size; None where is none."""
     log_ns, header_ns = np.array(one.log_ns, np.int64), np.array(one.header_ns, np.int64)
-    content = [np.array(one.content)] if len(one.content) == len(log_ns) else []
-    rows, sizes = steps_back(log_ns, header_ns, *content)
+    content = np.array(one.content) if len(one.content) == len(log_ns) else None
+    rows, sizes = steps_back(log_ns, header_ns, content)
     if not len(rows):
         return None
     row, size = int(rows[0]), int(sizes[0])
@@ -234,7 +229,7 @@ def _on_common(stamp_ns: Ints, skew_ns: int, common: Clock | None, topic: str, n
 
     Where they do, they may be right and only recorded late: that is for the reader to decide.
     """
-    if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= _LATE_NS:
+    if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= LATE_NS:
         return stamp_ns
     shift = skew_ns - common.skew_ns
     first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())

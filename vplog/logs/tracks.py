@@ -14,23 +14,23 @@ from vplog import geometry
 from vplog.data import Gps, Odometry
 from vplog.geodesy import local_enu
 from vplog.logs.containers import Notes, plural
+from vplog.logs.odometry_message import Poses
 from vplog.logs.stamps import Stamps
-from vplog.logs.transforms import are_usable, clean, is_usable
+from vplog.logs.transforms import are_usable, clean
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
     from vplog.logs.messages import FixMessage, PoseMessage
-    from vplog.logs.odometry_message import Poses
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
 
-_UNKNOWN = [float("nan")] * 36
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
-_BACK_AND_FORTH = 1.5
-"""A path by header stamps that is so many times that by log times is out of order; one that is sorted rightly is
-shorter."""
+_LONGER = 0.02
+"""A path by header stamps that is longer by this share than by log times is out of order: sorted rightly it is
+shorter, but for noise, whose share is within _SIGMAS of the root of the steps' squares."""
+_SIGMAS = 3.0
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -67,23 +67,12 @@ class PoseTrack:
         """The frame that it moves in."""
 
     def add(self, message: PoseMessage, log_ns: int) -> None:
-        self.child = self.child or clean(message.child)
-        self.parent = self.parent or clean(message.frame)
-        stamp_ns, _, child, position, quaternion, covariance = message
-        if clean(child) != self.child:
-            self._others += 1
-            return
-        if not is_usable(*position, *quaternion):
-            self._dropped += 1
-            return
-        self.stamps.add(stamp_ns, log_ns)
-        self._poses.extend(position)
-        self._poses.extend(quaternion)
-        self._bare = self._bare and covariance is None
-        self._covariances.extend(_UNKNOWN if covariance is None else covariance)
+        stamp_ns, frame, child, position, quaternion, covariance = message
+        known = None if covariance is None else np.array(covariance, np.float64)[None]
+        self.add_all(Poses(np.array([stamp_ns]), frame, child, np.array([[*position, *quaternion]]), known), [log_ns])
 
     def add_all(self, poses: Poses, log_ns: list[int]) -> None:
-        """The same of several messages that name the same frames."""
+        """Add several messages that name the same frames."""
         self.child = self.child or clean(poses.child)
         self.parent = self.parent or clean(poses.frame)
         if clean(poses.child) != self.child:
@@ -136,10 +125,9 @@ class PoseTrack:
         _, by_header = self.stamps.order(self.topic, Notes())
         if (np.diff(by_header) < 0).any():
             _, by_log = self.stamps.by_log_times(self.topic, Notes(), "")
-            ways = [
-                float(np.linalg.norm(np.diff(position[rows], axis=0), axis=1).sum()) for rows in (by_header, by_log)
-            ]
-            if ways[0] > _BACK_AND_FORTH * ways[1]:
+            steps, log_steps = (np.linalg.norm(np.diff(position[rows], axis=0), axis=1) for rows in (by_header, by_log))
+            noise_m = _SIGMAS * float(np.linalg.norm(log_steps))
+            if steps.sum() - log_steps.sum() > max(_LONGER * log_steps.sum(), noise_m):
                 why = "has header stamps by which it moves back and forth"
                 return self.stamps.by_log_times(self.topic, notes, why)
         return self.stamps.order(self.topic, notes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -68,20 +67,13 @@ def clean(frame: str) -> str:
 
 def usable_pose(position: Floats, quaternion: Floats) -> Floats | None:
     """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond FARTHEST_M) or no rotation is set."""
-    if not is_usable(*position.tolist(), *quaternion.tolist()):
+    if not are_usable(np.append(position, quaternion)[None]).all():
         return None
     return geometry.pose(geometry.rotation(quaternion), position)
 
 
 def are_usable(poses: Floats) -> np.ndarray:
-    """(K,) bool: `is_usable` of each row of (K, 7)."""
+    """(K,) bool: whether `usable_pose` of x y z, x y z w in each row of (K, 7) is one."""
     sizes = np.abs(poses)
     placed, largest = (sizes[:, :3] < FARTHEST_M).all(1), sizes[:, 3:].max(1)  # NaN where one is
     return placed & (largest > SMALLEST) & (largest < 1 / SMALLEST)
-
-
-def is_usable(x: float, y: float, z: float, qx: float, qy: float, qz: float, qw: float) -> bool:
-    """Whether `usable_pose` of these is one; plain numbers, since odometry asks for each message."""
-    placed = abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M  # False for NaN
-    finite = math.isfinite(qx + qy + qz + qw)  # a sum beyond the largest float is of numbers that are too large anyway
-    return placed and finite and SMALLEST < max(abs(qx), abs(qy), abs(qz), abs(qw)) < 1 / SMALLEST
