@@ -261,7 +261,7 @@ def test_every_damaged_bit_is_accounted_for(name: str, tmp_path: Path) -> None:
     assert not problems, f"{len(problems)}\n" + "\n".join(problems)
 
 
-@pytest.mark.parametrize("name", ["mcap-lz4", "mcap-zstd", "mcap-beside", "bag-bz2"])
+@pytest.mark.parametrize("name", ["mcap-lz4", "mcap-zstd", "mcap-beside", "mcap-unchunked", "bag-bz2"])
 def test_damage_in_several_places_is_accounted_for(name: str, tmp_path: Path) -> None:
     """Three bits, or a hole of 150 bytes; what lies twice in the file, both damaged, leaves the number open at most."""
     form = FORMATS[name]
@@ -276,7 +276,7 @@ def test_damage_in_several_places_is_accounted_for(name: str, tmp_path: Path) ->
             at = rng.randrange(len(whole) - 150)
             data = bytearray(whole[:at] + bytes(150) + whole[at + 150 :])
         path.write_bytes(data)
-        if found := problem(path, WRITTEN, form._replace(counted=False)):
+        if found := problem(path, WRITTEN, form._replace(counted=False), form.checked):
             problems.append(f"{number}: {found}")
     assert not problems, f"{len(problems)}\n" + "\n".join(problems)
 

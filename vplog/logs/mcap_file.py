@@ -149,7 +149,10 @@ class McapFile:
             self._notes.add(f"{name} is cut or damaged at byte {at}, behind its messages; none is lost.")
         whole = layout.cut_at is None and not layout.gaps
         account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
-        account.settle({name}, recorded, found)
+        unexplained = account.settle({name}, recorded, found)
+        if unexplained and sum(recorded.values()) > sum(lost.values()):  # else it names other topics
+            detail = f"{name} counts more messages than it holds."
+            account.add("damaged_bytes", unexplained, (name, 0), [(start_ns, end_ns)], detail)
 
     def _between(self, position: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
         """The time between the chunk before a damaged place and the one behind it."""
