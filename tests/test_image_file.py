@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import cv2
@@ -63,11 +64,36 @@ def with_sound_checksums(png: bytearray) -> bytes:
     return bytes(png)
 
 
-def png_of(head: bytes, body: bytes) -> bytes:
-    data = bytearray(b"\x89PNG\r\n\x1a\n")
-    for kind, content in ((b"IHDR", head), (b"IDAT", body), (b"IEND", b"")):
-        data += struct.pack(">I", len(content)) + kind + content + bytes(4)
-    return with_sound_checksums(data)
+def chunk(kind: bytes, content: bytes, wrong: int = 0) -> bytes:
+    """With a checksum that is off by `wrong`."""
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content) ^ wrong)
+
+
+def random_png(rng: np.random.Generator, coding: tuple[int, int] = (0, 0), palette: int | None = None) -> bytes:
+    """Of any colour type, depth and filters, interlaced or not, with what encoders leave in and beside the pixels.
+    `coding`: its methods of compression and filters; `palette`: the bytes of a palette, whatever the type."""
+    colour = int(rng.choice([0, 2, 3, 4, 6]))
+    bits = int(rng.choice({0: (1, 2, 4, 8, 16), 3: (1, 2, 4, 8)}.get(colour, (8, 16))))
+    (width, height), interlaced = rng.integers(4, 30, 2).tolist(), int(rng.integers(2))
+    samples = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour]
+    steps = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+    pixels = b""
+    for x, y, dx, dy in steps if interlaced else ((0, 0, 1, 1),):
+        row = (-(-(width - x) // dx) * samples * bits + 7) // 8
+        pixels += b"".join(bytes([rng.integers(5)]) + rng.bytes(row) for _ in range(-(-(height - y) // dy)) if row)
+    body = zlib.compress(pixels + bytes(rng.choice([0, 0, 50])), int(rng.integers(10))) + bytes(rng.choice([0, 0, 8]))
+    at, more = int(rng.integers(len(body))), rng.random(5) < 0.3
+    return b"".join([
+        b"\x89PNG\r\n\x1a\n",
+        chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, *coding, interlaced)),
+        chunk(b"tEXt", b"a\0b", wrong=1) if more[0] else b"",
+        chunk(b"acTL", struct.pack(">II", 1, 0)) if more[1] else b"",
+        chunk(b"PLTE", rng.bytes(3 << bits if palette is None else palette)) if colour == 3 or palette else b"",
+        chunk(b"tRNS", b"\0\1" * samples) if more[2] and colour < 3 else b"",
+        chunk(b"IDAT", body[:at]), chunk(b"IDAT", b"") if more[3] else b"", chunk(b"IDAT", body[at:]),
+        chunk(b"IEND", b"", wrong=int(more[4])),
+        bytes(rng.choice([0, 9])),
+    ])  # fmt: skip
 
 
 def damaged(data: bytes, seed: int) -> bytes:
@@ -112,23 +138,29 @@ def test_four_inks_are_grey_as_opencv_has_them() -> None:
     assert np.abs(decode_image(FILES["inks"]).astype(int) - grey).max() <= 2
 
 
-@pytest.mark.parametrize("colour", [0, 2, 4, 6])
-@pytest.mark.parametrize("bits", [8, 16])
-@pytest.mark.parametrize("size", [(1, 1), (3, 2), (9, 17)])
-def test_an_interlaced_png_is_read(size: tuple[int, int], bits: int, colour: int) -> None:
-    """Seven passes, of which small images lack some."""
-    width, height = size
-    samples = {0: 1, 2: 3, 4: 2, 6: 4}[colour]
-    pixels = RNG.integers(0, 256, (height, width, samples * bits // 8)).astype(np.uint8)
-    steps = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-    rows = [row for x, y, dx, dy in steps for row in pixels[y::dy, x::dx] if row.size]
-    head = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 1)
-    file = png_of(head, zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)))
+@pytest.mark.parametrize("seed", range(100))
+def test_a_png_that_libpng_reads_is_read(seed: int) -> None:
+    file = random_png(np.random.default_rng(seed))
     expected = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     assert expected is not None
     np.testing.assert_array_equal(decode_image(file), expected)
-    with pytest.raises(BadImageError, match="do not unpack to its size"):
-        decode_image(png_of(head, zlib.compress(b"\0" * 5000)))
+
+
+def test_grey_of_a_png_is_of_its_values_alone() -> None:
+    """As that of rgb8 is: the gamma that a program writes beside the pixels is no camera's."""
+    at = FILES["png"].index(b"IDAT") - 4
+    gamma = FILES["png"][:at] + chunk(b"gAMA", struct.pack(">I", 45455)) + FILES["png"][at:]
+    np.testing.assert_array_equal(decode_image(gamma), decode_image(FILES["png"]))
+
+
+def test_nothing_is_printed_of_a_png_of_another_coding(capfd: pytest.CaptureFixture[str]) -> None:
+    """In its header or palette, under sound checksums."""
+    rng = np.random.default_rng(8)
+    for _ in range(100):
+        methods = (int(rng.choice([0, 0, 1])), int(rng.choice([0, 0, 64])))
+        with suppress(BadImageError):
+            decode_image(random_png(rng, methods, int(rng.integers(900))))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_stderr_of_a_command_has_vplogs_lines_alone(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib as stored_zlib
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 import simplejpeg
 
 try:
-    from isal import isal_zlib as zlib
+    from isal import isal_zlib as zlib  # which stores no blocks
 except ImportError:  # no wheel for this processor
     import zlib
 
@@ -42,6 +43,8 @@ _PNM_HEAD = 4096
 """Bytes in which a PNM file must have named its size; comments may stand before it."""
 _PNG_SAMPLES = {0: (1, (1, 2, 4, 8, 16)), 2: (3, (8, 16)), 3: (1, (1, 2, 4, 8)), 4: (2, (8, 16)), 6: (4, (8, 16))}
 """Samples of a px and bits that each may have, by colour type: PNG 1.2, 4.1.1."""
+_PNG_PALETTE = 3
+"""The colour type whose px are numbers of colours in PLTE."""
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 """First column and row of each pass of an interlaced image, and its steps in x and y: PNG 1.2, 8.2."""
 _LAST_FILTER = 4
@@ -132,48 +135,54 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _checked_png(data: bytes) -> bytes:
-    """The file with the chunks that make its pixels alone. Raises BadImageError where libpng would find fault.
+    """The PNG with its pixels unpacked, in one IDAT of stored blocks, and with nothing beside them but its palette.
+    Raises BadImageError where libpng would find fault with either.
 
-    What else a file may hold (colour profile, gamma, text) changes no pixel here, and libpng says much of it.
+    Pixels are grey by their values alone, as those of raw images are: not by the gamma and primaries of a file.
     """
     view = memoryview(data)
-    parts: list[bytes | memoryview] = [PNG]
-    packed: list[memoryview] = []
+    found: dict[bytes, list[memoryview]] = {b"IHDR": [], b"PLTE": [], b"IDAT": []}
     for kind, start, stop in _png_chunks(data):
-        if zlib.crc32(view[start + 4 : stop - 4]) != int.from_bytes(data[stop - 4 : stop], "big"):
-            raise BadImageError("the checksum of its PNG does not match")
-        if kind in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):
-            parts.append(view[start:stop])
-        if kind == b"IDAT":
-            packed.append(view[start + 8 : stop - 4])
-    width, height, bits, colour, _, _, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+        if kind in found:
+            found[kind].append(view[start + 8 : stop - 4])
+            if zlib.crc32(view[start + 4 : stop - 4]) != int.from_bytes(view[stop - 4 : stop], "big"):
+                raise BadImageError("the checksum of its PNG does not match")
+    width, height, bits, colour, compression, filters, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
     samples, depths = _PNG_SAMPLES.get(colour, (0, ()))
-    if bits not in depths or interlaced > 1:
-        raise BadImageError(f"its PNG has {bits} bits in colour type {colour}, which PNG does not know")
+    if bits not in depths or compression or filters or interlaced > 1:
+        raise BadImageError(f"its PNG has {bits} bits in colour type {colour}, or a coding, that PNG does not know")
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
     sizes = [(-(-max(width - x, 0) // dx), -(-max(height - y, 0) // dy)) for x, y, dx, dy in passes]
     rows = [(tall, 1 + -(-wide * samples * bits // 8)) for wide, tall in sizes if wide and tall]
-    if not _deflates_to(b"".join(packed), rows):
-        raise BadImageError("the pixels of its PNG do not unpack to its size")
-    return b"".join(parts)
+    parts = [PNG, view[8:33]]
+    if colour == _PNG_PALETTE:
+        colours = b"".join(found[b"PLTE"])[: 3 << bits]
+        if not colours or len(colours) % 3:
+            raise BadImageError("its PNG has no whole palette")
+        parts.append(_png_chunk(b"PLTE", colours))
+    parts.append(_png_chunk(b"IDAT", stored_zlib.compress(_inflated(b"".join(found[b"IDAT"]), rows), 0)))
+    return b"".join([*parts, _png_chunk(b"IEND", b"")])
 
 
-def _deflates_to(packed: bytes, rows: list[tuple[int, int]]) -> bool:
-    """Whether a zlib stream is whole and holds these rows: for each pass how many, and how many bytes each."""
-    size = sum(count * length for count, length in rows)
-    stream = zlib.decompressobj()
+def _png_chunk(kind: bytes, data: bytes) -> bytes:
+    return b"".join([struct.pack(">I", len(data)), kind, data, struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))])
+
+
+def _inflated(packed: bytes, rows: list[tuple[int, int]]) -> bytes:
+    """The rows of a zlib stream: for each pass how many, and how many bytes each; what more it holds is left out.
+    Raises BadImageError where it is not whole or a row has no filter that PNG knows."""
+    size, at = sum(count * length for count, length in rows), 0
     try:
-        data = np.frombuffer(stream.decompress(packed, size + 1), np.uint8)
+        data = zlib.decompressobj().decompress(packed, size)
     except zlib.error:  # pyright: ignore[reportGeneralTypeIssues]
-        return False
-    if len(data) != size or not stream.eof or stream.unused_data:
-        return False
-    at = 0
-    for count, length in rows:
-        if int(data[at : at + count * length : length].max()) > _LAST_FILTER:
-            return False
+        data = b""
+    for count, length in rows if len(data) == size else ():
+        if max(data[at : at + count * length : length]) > _LAST_FILTER:
+            break
         at += count * length
-    return True
+    if at != size:
+        raise BadImageError("the pixels of its PNG do not unpack to its size")
+    return data
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:

@@ -128,6 +128,27 @@ def test_the_first_calibration_that_is_set_is_the_cameras(ros: int, late: int, t
     assert "/cam/camera_info" in line
 
 
+def test_a_calibration_of_nan_is_not_set(tmp_path: Path) -> None:
+    bad = K.copy()
+    bad[0, 2] = np.nan
+    messages = [image(SCENE, i, "/cam/image") for i in range(6)] + [info(K if i else bad, SIZE, i) for i in range(6)]
+    matrix = logs.open(written(tmp_path / "drive", sorted(messages, key=lambda m: m.stamp_ns))).camera().matrix
+    assert matrix is not None
+    np.testing.assert_allclose(matrix, K)
+
+
+def test_calibrations_without_a_stamp_hold_from_their_log_time(tmp_path: Path) -> None:
+    """A lens that zooms, by a driver that stamps nothing."""
+    doubled = np.diag([2, 2, 1]) @ K
+    messages = [image(SCENE, i, "/cam/image") for i in range(8)]
+    messages += [info(K if i < 4 else doubled, SIZE, i) for i in range(8)]
+    for message in messages:
+        message.message.header.stamp.__dict__.update(sec=0, nanosec=0)
+    log = logs.open(written(tmp_path / "drive", sorted(messages, key=lambda m: m.stamp_ns)))
+    zoomed = [not np.array_equal(one, SCENE) for one in decoded(log)]
+    assert zoomed == [False] * 4 + [True] * 4
+
+
 def test_calibrations_that_are_never_set_are_said(tmp_path: Path) -> None:
     messages = [image(SCENE, i, "/cam/image") for i in range(3)] + [info(np.zeros((3, 3)), SIZE, i) for i in range(3)]
     log = logs.open(written(tmp_path / "drive", messages))
@@ -163,6 +184,32 @@ def test_a_window_that_moves_keeps_rays(tmp_path: Path) -> None:
     images = decoded(logs.open(written(tmp_path / "drive", messages)))
     np.testing.assert_array_equal(images[0], SCENE[:90, :120])
     np.testing.assert_array_equal(images[-1][30:, 40:], SCENE[30:90, 40:120])
+
+
+def test_depth_of_another_size_is_left_out_and_counted(tmp_path: Path) -> None:
+    depth = 1000 + 10 * SCENE.astype(np.uint16)
+    depth[:9] = 0
+    messages = [image(SCENE, i, "/cam/image") for i in range(8)]
+    messages += [image(depth if i < 4 else depth[:60].copy(), i, "/cam/depth", "16UC1") for i in range(8)]
+    log: Any = logs.open(written(tmp_path / "drive", sorted(messages, key=lambda m: m.stamp_ns)))
+    with_depth = [frame.decode().depth is not None for frame in log.frames(log.stamps())]
+    assert with_depth == [True] * 4 + [False] * 4
+    assert [(loss.topic, loss.messages) for loss in log.account.losses] == [("/cam/depth", 4)]
+    assert "/cam/depth has 160 x 60 px where the image has 160 x 120" in log.account.sentences[0]
+
+
+def test_levels_of_sixteen_bits_are_one_where_the_first_image_is_damaged(tmp_path: Path) -> None:
+    messages = []
+    for i, gain in enumerate((1, 5, 10, 20)):
+        file = b"no image" * 200 if not i else cv2.imencode(".png", gain * SCENE.astype(np.uint16))[1].tobytes()
+        stamp = START_NS + i * PERIOD_NS
+        message = store(2).types["sensor_msgs/msg/CompressedImage"](
+            header=header(2, stamp, "cam"), format="mono16; png", data=np.frombuffer(file, np.uint8)
+        )
+        messages.append(Written("/cam/image", "sensor_msgs/msg/CompressedImage", stamp, message))
+    log = logs.open(written(tmp_path / "drive", messages))
+    means = [frame.decode().image.mean() for frame in log.frames(log.stamps()[1:])]
+    np.testing.assert_allclose(np.divide(means, means[-1]), [5 / 20, 10 / 20, 1], atol=0.05)
 
 
 def test_images_of_another_shape_are_left_out_and_counted(tmp_path: Path) -> None:

@@ -259,3 +259,38 @@ def test_every_damaged_bit_is_accounted_for(name: str, tmp_path: Path) -> None:
         if found := problem(path, WRITTEN, form, form.checked):
             problems.append(f"bit {bit % 8} of byte {bit // 8}: {found}")
     assert not problems, f"{len(problems)}\n" + "\n".join(problems)
+
+
+@pytest.mark.parametrize("name", ["mcap-lz4", "mcap-zstd", "mcap-beside", "mcap-unchunked", "bag-bz2"])
+def test_damage_in_several_places_is_accounted_for(name: str, tmp_path: Path) -> None:
+    """Three bits, or a hole of 150 bytes; what lies twice in the file, both damaged, leaves the number open at most."""
+    form = FORMATS[name]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    rng, problems = random.Random(11), []
+    for number in range(60):
+        data = bytearray(whole)
+        for bit in rng.sample(range(8 * len(whole)), 3):
+            data[bit // 8] ^= 1 << bit % 8
+        if number % 2:
+            at = rng.randrange(len(whole) - 150)
+            data = bytearray(whole[:at] + bytes(150) + whole[at + 150 :])
+        path.write_bytes(data)
+        if found := problem(path, WRITTEN, form._replace(counted=False), form.checked):
+            problems.append(f"{number}: {found}")
+    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
+
+
+def test_a_bag_that_is_cut_between_two_records_is_cut(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "log.bag", "LZ4")
+    whole = path.read_bytes()
+    at = whole.index(b"index_pos=") + len(b"index_pos=")
+    index_at = int.from_bytes(whole[at : at + 8], "little")
+    ends = [field.offset for field in FIELDS[".bag"](whole) if field.name.endswith("header_length")]
+    assert len(ends) > 10
+    for end in (end for end in ends if end < index_at):
+        path.write_bytes(whole[:end])
+        notes = Notes()
+        container, _ = open_container(path, notes)
+        container.contents()
+        assert [loss.reason for loss in notes.account.losses] == ["cut"], end

@@ -95,39 +95,43 @@ class RecordedFrame:
     def decode(self) -> Frame:
         """Raises LogError with topic and stamp where the bytes are not an image.
 
-        Without its depth or right image, where that does not decode, the frame is still one.
+        Without its depth or right image, where that does not decode or does not fit, the frame is still one.
         """
+        image, affine = self._image()
+        if self.pair is not None:
+            return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
+        depth = None if self.depth is None else self._registered(self.depth, image)
+        depth = None if depth is None else _warped_depth(depth, affine, self.camera)
+        return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth)
+
+    def _image(self) -> tuple[Bytes, Floats | None]:
+        """The image, and what leads from its px to the camera's. Raises LogError."""
+        channel, image = self.image.channel, None
         try:
             image = self.image.grey(self.stamp_ns)
-        except LogError:
-            self._lose(self.image.channel)
-            raise
-        if self.pair is not None:
-            try:
-                _check_size(self.image.channel, image, self.camera)
-            except LogError as error:
-                self._lose(self.image.channel, str(error))
-                raise
-            return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
-        try:
-            affine = affine_to_camera(self.image.channel.topic, image, self.camera, self.calibration, self.notes)
+            if self.pair is None:
+                return image, affine_to_camera(channel.topic, image, self.camera, self.calibration, self.notes)
+            _check_size(channel, image, self.camera)
         except LogError as error:
-            self._lose(self.image.channel, str(error))
+            self._lose(channel, "" if image is None else str(error))
             raise
-        if self.depth is None:
-            return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera))
+        return image, None
+
+    def _registered(self, depth: Encoded, image: Bytes) -> Float32s | None:
+        """The depth of the image's px; None, and counted, where it does not decode or has another size."""
         try:
-            depth = self.depth.depth_m(self.stamp_ns)
+            found = depth.depth_m(self.stamp_ns)
         except LogError:
-            self._lose(self.depth.channel)
-            return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera))
-        if depth.shape != image.shape:
-            raise LogError(
-                f"{self.depth.channel.topic} at {self.stamp_ns} ns is {size_of(depth)} px, but the image is "
-                f"{size_of(image)} px. Depth must be registered to the image; choose another with --depth-topic."
-            )
-        image, depth = warped(image, affine, self.camera), _warped_depth(depth, affine, self.camera)
-        return Frame(self.stamp_ns, self.camera, image, depth)
+            self._lose(depth.channel)
+            return None
+        if found.shape == image.shape:
+            return found
+        self._lose(
+            depth.channel,
+            f"{depth.channel.topic} has {size_of(found)} px where the image has {size_of(image)}; depth must be "
+            "registered to the image: choose another with --depth-topic.",
+        )
+        return None
 
     def _right(self, pair: Pair) -> Bytes | None:
         if self.right is None:

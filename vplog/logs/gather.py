@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -123,7 +123,7 @@ class Calibrations:
         if self.unset and self.found and self.channel:
             notes.add(
                 f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
-                f"{'is' if self.unset == 1 else 'are'} not set (K is zero); the first that is set is taken."
+                f"{'is' if self.unset == 1 else 'are'} not set (K is zero or NaN); the first that is set is taken."
             )
         return self.found or ([self._first] if self._first else [])
 
@@ -246,7 +246,7 @@ class Gathered:
             return
         match decode(channel, message.data):
             case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
-                known.add(calibration, message.data)
+                known.add(replace(calibration, stamp_ns=calibration.stamp_ns or message.log_ns), message.data)
             case PoseMessage() as pose if channel in self.poses:
                 self.poses[channel].add(pose, message.log_ns)
             case FixMessage() as fix if self.fixes:

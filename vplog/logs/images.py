@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import cv2
 import numpy as np
 
-from vplog.image_file import PNG, BadImageError, decode_image
+from vplog.image_file import PNG, BadImageError, decode_image, image_size
 from vplog.logs.messages import BadMessageError
 
 if TYPE_CHECKING:
@@ -146,8 +146,9 @@ def spread(count: int) -> int:
 
 
 def drive_levels(messages: Iterator[ImageMessage]) -> Levels | None:
-    """The levels of images that speak for a drive; None, and only one is looked at, where it has not 16 bits."""
-    first = next(messages, None)
+    """The levels of images that speak for a drive; None, and only the first whole one is looked at, where it has not
+    16 bits."""
+    first = next((message for message in messages if not message.compressed or image_size(message.data)), None)
     return levels_of(chain([first], messages)) if first is not None and sixteen_bits(first) else None
 
 

@@ -127,7 +127,7 @@ class Account:
             (reason, key, lost)
             for reason in _HOW_MANY_OPEN
             for key, lost in self._found.get((reason, ""), {}).items()
-            if key[0] in files
+            if key[0] in files and (lost.messages is None or reason in _OUTSIDE)  # else `found` has them
         ]
         if not left_open:
             return short

@@ -86,8 +86,8 @@ class McapFile:
                 data = self._data(number)
                 walk = Walk(number, len(data), self._channels, self._define, None, cut=chunk.cut)
                 times += walk.whole(data).log_ns
-                counts.append(walk.seen)
-                self._account_for_chunk(chunk, walk)
+                damaged = self._account_for_chunk(chunk, walk) or not data
+                counts.append(walk.seen | Counter(chunk.counts) if damaged else walk.seen)
             times = [min(times), max(times)] if times else []
         return _total(counts), times
 
@@ -149,7 +149,10 @@ class McapFile:
             self._notes.add(f"{name} is cut or damaged at byte {at}, behind its messages; none is lost.")
         whole = layout.cut_at is None and not layout.gaps
         account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
-        account.settle({name}, recorded, found)
+        unexplained = account.settle({name}, recorded, found)
+        if unexplained and sum(recorded.values()) > sum(lost.values()):  # else it names other topics
+            detail = f"{name} counts more messages than it holds."
+            account.add("damaged_bytes", unexplained, (name, 0), [(start_ns, end_ns)], detail)
 
     def _between(self, position: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
         """The time between the chunk before a damaged place and the one behind it."""
@@ -193,12 +196,13 @@ class McapFile:
             self._doubtful.discard((opcode, number))
         return news
 
-    def _account_for_chunk(self, chunk: Chunk, walk: Walk) -> None:
-        """What a chunk is short of that was walked."""
+    def _account_for_chunk(self, chunk: Chunk, walk: Walk) -> bool:
+        """Account for what a chunk is short of that was walked; whether it is damaged."""
         key, account, seen = (self._name, chunk.start), self._notes.account, walk.seen
         known = {i: n for i, n in chunk.counts.items() if i in self._channels}
         fewer = not self._sound[walk.number] and seen.total() < sum(chunk.counts.values())
-        if walk.end and not chunk.cut and (walk.position < walk.end or fewer):
+        damaged = walk.end > 0 and not chunk.cut and (walk.position < walk.end or fewer)
+        if damaged:
             short = topics_of({i: n - seen[i] for i, n in known.items()}, self._channels)
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
             last_ns = chunk.first_ns if walk.last_ns is None else walk.last_ns
@@ -206,6 +210,7 @@ class McapFile:
             account.add("damaged_chunk", short if chunk.counts else None, key, [span], detail)
         elif walk.unknown:
             account.add("unknown_channel", {"": walk.unknown}, key, [(chunk.first_ns, chunk.last_ns)])
+        return damaged
 
     def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
         """Not where its indexes name only channels that are known and not wanted."""

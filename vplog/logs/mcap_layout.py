@@ -268,9 +268,10 @@ class _Walk:
                 chunk.counts[channel_id] = (length - 6) // _ENTRY
         elif opcode == Opcode.STATISTICS and 46 <= length <= _MAX_DEFINITION:  # 42 bytes of totals, then id and count
             data = self.at(start, length)
-            (size,) = struct.unpack_from("<I", data, 42)
+            total, size = struct.unpack_from("<Q34xI", data)
             entries = struct.iter_unpack("<HQ", data[46 : 46 + min(size, length - 46) // 10 * 10])
-            self.layout.recorded = {channel_id: count for channel_id, count in entries if 0 < count <= self._length}
+            counts = {channel_id: count for channel_id, count in entries if count}
+            self.layout.recorded = counts if sum(counts.values()) == total <= self._length else {}
         elif opcode == Opcode.CHUNK_INDEX and 64 <= length <= _MAX_DEFINITION:
             self._add_index(self.at(start, length))
 

@@ -58,8 +58,8 @@ class CalibrationMessage:
 
     @property
     def is_set(self) -> bool:
-        """Not so where a driver has no calibration: ROS has zeros then (sensor_msgs/CameraInfo)."""
-        return bool(self.matrix[0, 0] > 0 or self.projection[0, 0] > 0)
+        """Not so where a driver has no calibration: ROS has zeros then (sensor_msgs/CameraInfo), others NaN."""
+        return any(np.isfinite(k).all() and k[0, 0] > 0 for k in (self.matrix, self.projection))
 
 
 class PoseMessage(NamedTuple):

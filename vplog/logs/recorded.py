@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -144,10 +145,16 @@ class RecordedLog:
 
     def _calibration_at(self, stamp_ns: int) -> CalibrationMessage | None:
         """The calibration in force at a stamp, where it is another than the camera's."""
-        found = self._content.calibrations[1:]
-        if not found or self._beside_log.camera(self._image_channel().topic) is not None:
-            return None
-        return max((c for c in found if c.stamp_ns <= stamp_ns), key=lambda c: c.stamp_ns, default=None)
+        found = self._later_calibrations
+        row = bisect_right(found, stamp_ns, key=lambda calibration: calibration.stamp_ns)
+        return found[row - 1] if row else None
+
+    @cached_property
+    def _later_calibrations(self) -> list[CalibrationMessage]:
+        """Those that change the camera's, by stamp: a lens in focus has one for every image."""
+        if self._beside_log.camera(self._image_channel().topic) is not None:
+            return []
+        return sorted(self._content.calibrations[1:], key=lambda calibration: calibration.stamp_ns)
 
     def _codec(self, channel: Channel | None) -> str:
         return next((candidate.codec for candidate in self._candidates if candidate.channel == channel), "")

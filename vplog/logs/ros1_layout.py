@@ -97,11 +97,11 @@ class _Walk:
         """By offset of their record: chunks as the bag's index lists them."""
         self._indexing: Chunk | None = None
         """The chunk whose index records come by."""
-        self._index_at = 0
+        self._index_at = self._chunk_count = 0
         self._search = Search(file, length)
 
     def records(self, position: int) -> None:
-        while position < self._length:
+        while position < self._length or position == len(MAGIC):
             header, start, stop = self._head(position)
             inside = header is not None and number(header, b"op") == _CHUNK
             if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
@@ -118,7 +118,7 @@ class _Walk:
                 stop = self._stop(header, start, stop, found)
             self._record(number(header, b"op"), header, position, start, stop)
             position = stop
-        if position > self._length:
+        if position > self._length or (self._index_at > self._length and not self._infos):
             self.layout.cut_at = self._length
 
     def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> int:
@@ -153,6 +153,7 @@ class _Walk:
         layout = self.layout
         found = {chunk.record: chunk for chunk in layout.chunks}
         skipped = {chunk.record: chunk for chunk in layout.missing}
+        listed = len(self._infos) == self._chunk_count
         for offset, info in sorted(self._infos.items()):
             if (chunk := found.get(offset)) is not None:
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
@@ -162,15 +163,18 @@ class _Walk:
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif any(start <= offset < stop for start, stop in layout.gaps):  # else the index is what is damaged
+            elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
+                skipped.pop(gaps[0], None)  # by the index records behind it, the last chunk in the gap
                 skipped[offset] = info
+            else:
+                listed = False
         layout.chunks.sort(key=lambda chunk: chunk.start)
         for chunk in layout.chunks:
             chunk.counts = {} if chunk.doubtful else chunk.counts
         layout.missing = [
             chunk
             for offset, chunk in sorted(skipped.items())
-            if chunk.counts or offset in self._infos or not self._infos
+            if offset in self._infos or not self._infos or (chunk.counts and not listed)
         ]
         if layout.cut_at is not None and self._index_at and layout.cut_at >= self._index_at and not layout.missing:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at
@@ -244,6 +248,7 @@ class _Walk:
             self._connect(header, self.at(start, min(stop - start, _MAX_CONNECTION)))
         elif op == _BAG:
             self._index_at = max(number(header, b"index_pos"), 0)
+            self._chunk_count = number(header, b"chunk_count")
 
     def _add_info(self, header: dict[bytes, bytes], data: bytes) -> None:
         position, span = number(header, b"chunk_pos"), (time_ns(header, b"start_time"), time_ns(header, b"end_time"))
