@@ -37,7 +37,7 @@ class TruthOptions:
     align: str = "se3"
     """Of the ATE: a name of `trajectory.ALIGNMENTS`."""
     truth_offset_s: float | None = None
-    """s added to the stamps of the truth, for every figure; None finds it for the closures alone."""
+    """s added to the stamps of the truth, as evo's --t_offset (0)."""
 
     @property
     def place(self) -> closures.PlaceCriterion:
@@ -86,13 +86,12 @@ def evaluate_poses(
     settings = _recorded(record, folder, dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
     camera = _camera(folder)
-    of_body = body_truth(known, before, camera, options.truth_offset_s is None)
-    figures = _trajectories(before, after, known, of_body, options)
+    of_body = body_truth(known, before, camera)
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
     found = {
         "truth": without_secrets(truth),
-        "truth_is": _about(of_body, options),
-        **figures,
+        "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
+        **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
         "residuals": asdict(residuals.score_residuals(keyframes, ledger, of_body)),
     }
@@ -120,17 +119,6 @@ def _trajectories(
     return {**named, "interpolated": interpolated}
 
 
-def _about(truth: BodyTruth, options: TruthOptions) -> dict[str, Any]:
-    """What the truth was found to be, as plain values."""
-    return {
-        "frame": truth.frame,
-        "body_from_truth": None if truth.body_from_truth is None else truth.body_from_truth.tolist(),
-        "offset_s": truth.offset_s if options.truth_offset_s is None else options.truth_offset_s,
-        "offset_found": options.truth_offset_s is None and truth.offset_s != 0.0,
-        "oriented": truth.oriented,
-    }
-
-
 def _camera(folder: Path) -> Floats | None:
     """body_from_camera (4, 4), None where the run was written without."""
     path = folder / "result.mcap"
@@ -138,64 +126,48 @@ def _camera(folder: Path) -> Floats | None:
 
 
 def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
-    """A joint run."""
-    members = []
-    for found in _recorded(record, folder, list, "maps"):
-        file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
-        members.append({name: folder / name / file for name in _recorded(found, folder, list, "drives")})
-    folders = {name: folder / name for drives in members for name in drives}
-    return evaluate_together(folder, folders, members, [folder / "joins.parquet"], truth, options)
+    """A joint run: drives by themselves, each map of several as one trajectory, and the closures between drives.
 
-
-def evaluate_together(
-    whose: Path,
-    folders: dict[str, Path],
-    maps: list[dict[str, Path]],
-    joins: list[Path],
-    truth: str,
-    options: TruthOptions,
-) -> dict[str, Any]:
-    """Drives by themselves, each map of several as one trajectory, and the closures between drives.
-
-    `folders` are the run folders by drive, `maps` the tables of trajectories in one frame, `joins` those of closures.
     Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
     """
     if truth == "gps":
-        raise TruthError(f"{whose} holds several drives; hold each against its own GPS: vplog evaluate {whose}/DRIVE")
+        raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
     known = _read_truth(truth, options)
     drives: dict[str, Evaluation] = {}
     uncovered: dict[str, str] = {}
-    for name, folder in folders.items():
-        try:
-            drives[name] = evaluate_poses(folder, run_record.read_finished_run(folder), truth, options, known)
-        except TruthError as error:
-            uncovered[name] = str(error)
-    if not drives:
-        raise TruthError(next(iter(uncovered.values()), f"{whose} holds no drive."))
-    found = []
-    for members in maps:
-        parts = [tables.read_trajectory(path)[0] for name, path in members.items() if name in drives]
-        if parts:
+    maps = []
+    for found in _recorded(record, folder, list, "maps"):
+        names = _recorded(found, folder, list, "drives")
+        for name in names:
+            try:
+                own = run_record.read_finished_run(folder / name)
+                drives[name] = evaluate_poses(folder / name, own, truth, options, known)
+            except TruthError as error:
+                uncovered[name] = str(error)
+        names = [name for name in names if name in drives]
+        if names:
+            file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
+            parts = [tables.read_trajectory(folder / name / file)[0] for name in names]
             stamps, rows = np.unique(np.concatenate([part.stamp_ns for part in parts]), return_index=True)
             whole = Trajectory(stamps, np.concatenate([part.world_from_body for part in parts])[rows])
-            whole, _ = trajectory.at_truth(whole, known)
-            own = [{"drive": name, **drives[name].record} for name in members if name in drives]
-            found.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known, alignment=options.align))})
-    between = [pair for path in joins for pair in _joins(path, folders, drives, options.place)]
-    return {"truth": without_secrets(truth), "maps": found, "joins": between, "uncovered": uncovered}
+            ate = trajectory.ate(trajectory.at_truth(whole, known)[0], known, alignment=options.align)
+            own = [{"drive": name, **drives[name].record} for name in names]
+            maps.append({"drives": own, "ate_after": asdict(ate)})
+    if not drives:
+        raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
+    joins = _joins(folder, drives, options.place)
+    return {"truth": without_secrets(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
 
 
-def _joins(
-    path: Path, folders: dict[str, Path], drives: dict[str, Evaluation], place: closures.PlaceCriterion
-) -> list[dict[str, Any]]:
-    """The closures between each two drives of a table, as those of one are judged."""
+def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
+    """The closures between each two drives, as those of one are judged."""
     found = []
-    for (later, earlier), ledger in tables.read_joins(path).items():
+    for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():
         if later in drives and earlier in drives:
             query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
             bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
             oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
-            cameras = _camera(folders[later]), _camera(folders[earlier])
+            cameras = _camera(folder / later), _camera(folder / earlier)
             judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
             counts = closures.count_closures(ledger, judged)
             criterion = closures.criterion_of(bounds, place)

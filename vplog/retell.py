@@ -9,6 +9,7 @@ import numpy as np
 
 from vplog import geometry, logs
 from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
+from vplog.evaluate.closures import in_words
 from vplog.evaluation import TruthOptions, evaluate, evaluate_poses
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
@@ -74,6 +75,7 @@ def judge(
     return Judged(
         Path(shown(truth)).name,
         found.record,
+        in_words(found.record["closures"]),
         path,
         judged.right,
         judged.right | judged.wrong,
