@@ -169,8 +169,8 @@ def _ate(difference: Floats, alignment: str, scale: float = 1.0) -> Ate:
 def drift(estimate: Trajectory, truth: Trajectory) -> Drift:
     """Mean relative pose error over segments of the truth's path, per 100 m of it.
 
-    As KITTI's kit: segments of 100, 200, .. 800 m, all that fit, from starts 10 m apart, each weighs the same. A drive
-    shorter than 100 m has segments of 1 to 8 times the largest power of ten that fits, from starts at tenths of it.
+    As KITTI's kit: segments of 100, 200, .. 800 m, all that fit, from every tenth pose, each weighs the same. A drive
+    shorter than 100 m has segments of 1 to 8 times the largest power of ten that fits.
     """
     here, there = associate(estimate, truth)
     estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
@@ -178,10 +178,10 @@ def drift(estimate: Trajectory, truth: Trajectory) -> Drift:
     if not path_m[-1] > _LEAST_PATH_M:
         return Drift(None, None, [], 0)
     unit_m = min(100.0, 10.0 ** np.floor(np.log10(path_m[-1])))
-    starts = np.unique(np.searchsorted(path_m, np.arange(0.0, path_m[-1], unit_m / 10.0)))
+    starts = np.arange(0, len(path_m), 10)
     errors, lengths = [], []
     for length_m in unit_m * np.arange(1, 9):
-        last = np.searchsorted(path_m, path_m[starts] + length_m)
+        last = np.searchsorted(path_m, path_m[starts] + length_m, side="right")
         first, last = starts[last < len(path_m)], last[last < len(path_m)]
         if len(first):
             wrong = geometry.between(
