@@ -95,7 +95,8 @@ def export(arguments: argparse.Namespace) -> None:
 def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
     from vplog.evaluation import TruthOptions
 
-    return TruthOptions(arguments.distance_m, arguments.heading_deg, arguments.align, arguments.truth_offset_s)
+    names = ("distance_m", "heading_deg", "align", "truth_offset_s")
+    return TruthOptions(**{name: value for name in names if (value := getattr(arguments, name)) is not None})
 
 
 def _add_truth_options(sub: argparse.ArgumentParser) -> None:
@@ -103,7 +104,7 @@ def _add_truth_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--heading-deg", type=positive, metavar="DEG", help="and their optical axes turned by less (default: 45)"
     )
-    sub.add_argument("--align", choices=_ALIGNMENTS, default="se3", help="alignment of the ATE (default: se3)")
+    sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
     sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help="add to the truth's stamps (default: 0)")
 
 

@@ -12,6 +12,7 @@ from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, gps, residuals, trajectory
 from vplog.evaluate.body_truth import body_truth
 from vplog.evaluate.closure_pose import pose_bounds
+from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.record import reopened
@@ -28,21 +29,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TruthOptions:
-    """How a run is held against the truth; None takes the default."""
+    """How a run is held against the truth."""
 
-    distance_m: float | None = None
-    """m between frames of one place (6)."""
-    heading_deg: float | None = None
-    """Degrees between their optical axes (45)."""
+    distance_m: float = DISTANCE_M
+    """m between frames of one place."""
+    heading_deg: float = HEADING_DEG
+    """Degrees between their optical axes."""
     align: str = "se3"
     """Of the ATE: a name of `trajectory.ALIGNMENTS`."""
-    truth_offset_s: float | None = None
-    """s added to the stamps of the truth, as evo's --t_offset (0)."""
+    truth_offset_s: float = 0.0
+    """s added to the stamps of the truth, as evo's --t_offset."""
 
     @property
     def place(self) -> closures.PlaceCriterion:
-        given = {"distance_m": self.distance_m, "heading_deg": self.heading_deg}
-        return closures.PlaceCriterion(**{name: value for name, value in given.items() if value is not None})
+        return closures.PlaceCriterion(self.distance_m, self.heading_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,23 +100,20 @@ def evaluate_poses(
 
 def _read_truth(truth: str, options: TruthOptions) -> Trajectory:
     known = read_truth(truth)
-    return Trajectory(known.stamp_ns + round((options.truth_offset_s or 0.0) * 1e9), known.world_from_body)
+    return Trajectory(known.stamp_ns + round(options.truth_offset_s * 1e9), known.world_from_body)
 
 
 def _trajectories(
     before: Trajectory, after: Trajectory, known: Trajectory, of_body: BodyTruth, options: TruthOptions
 ) -> dict[str, Any]:
     """ATE and RPE against the truth as it is given, as evo has them, and the drift against that of the body."""
-    found: dict[str, Any] = {"ate": {}, "rpe": {}, "drift": {}}
-    interpolated = False
+    found: dict[str, Any] = {}
     for when, one in (("before", before), ("after", after)):
-        compared, interpolated = trajectory.at_truth(one, known)
-        shifted, _ = trajectory.at_truth(one, of_body.trajectory)
-        found["ate"][when] = asdict(trajectory.ate(compared, known, alignment=options.align))
-        found["rpe"][when] = asdict(trajectory.rpe(compared, known))
-        found["drift"][when] = asdict(trajectory.drift(shifted, of_body.trajectory))
-    named = {f"{name}_{when}": value for name, both in found.items() for when, value in both.items()}
-    return {**named, "interpolated": interpolated}
+        compared, found["interpolated"] = trajectory.at_truth(one, known)
+        found[f"ate_{when}"] = asdict(trajectory.ate(compared, known, alignment=options.align))
+        found[f"rpe_{when}"] = asdict(trajectory.rpe(compared, known))
+        found[f"drift_{when}"] = asdict(trajectory.drift(compared, of_body.trajectory))
+    return found
 
 
 def _camera(folder: Path) -> Floats | None:
@@ -169,9 +166,8 @@ def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCri
             oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
             cameras = _camera(folder / later), _camera(folder / earlier)
             judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
-            counts = closures.count_closures(ledger, judged)
-            criterion = closures.criterion_of(bounds, place)
-            found.append({"query_drive": later, "match_drive": earlier, **counts, "criterion": criterion})
+            counts = closures.count_closures(ledger, judged, place)
+            found.append({"query_drive": later, "match_drive": earlier, **counts})
     return found
 
 
@@ -187,12 +183,11 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
 def _against_gps(
     folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions
 ) -> dict[str, Any]:
-    for option in ("distance_m", "heading_deg", "truth_offset_s"):
-        if getattr(options, option) is not None:
-            name = option.replace("_", "-")
-            raise TruthError(
-                f"--truth gps takes no --{name}: fixes judge no closure. Give a TUM file, or leave it out."
-            )
+    if options != TruthOptions(align=options.align):
+        raise TruthError(
+            "--truth gps takes no --distance-m, --heading-deg or --truth-offset-s: fixes judge no closure and are in "
+            "the log's clock. Give a TUM file, or leave them out."
+        )
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")

@@ -108,7 +108,7 @@ def test_positions_alone_judge_places() -> None:
     flat[:, :3, :3] = np.eye(3)
     score, found, truth = judged(drive, Trajectory(drive.truth.stamp_ns, flat))
     assert not truth.oriented
-    assert not found.pose.posed.any()
+    assert not found.posed.any()
     assert score.by_place == score.accepted
     np.testing.assert_array_equal(found.right, found.at_place)
 
@@ -127,8 +127,8 @@ def outcome(error: np.ndarray, sigma: tuple[float, float], metres: float, unsure
     )
     line = np.linspace([0.0, 0.0, 0.0], [metres, 0.0, 0.0], 10)
     at = known(poses, unsure_m)
-    errors = pose_errors(found, at, at, pose_bounds(line))
-    return "right" if errors.right[0] else "wrong" if errors.wrong[0] else "not judged"
+    _, right, wrong, _ = pose_errors(found, at, at, pose_bounds(line))
+    return "right" if right[0] else "wrong" if wrong[0] else "not judged"
 
 
 def off(metres: float, degrees: float) -> np.ndarray:
@@ -184,6 +184,6 @@ def test_closures_without_metres_are_held_to_their_direction() -> None:
             scale=["none"] * len(closures),
             information=closures.information / 1e12,  # in no metres: a claim that widens nothing
         )
-        found = pose_errors(told, at, at, bounds, (camera, camera))
-        assert (found.right == right).all()
-        assert (found.wrong == ~found.right).all()
+        _, found, wrong, _ = pose_errors(told, at, at, bounds, (camera, camera))
+        assert (found == right).all()
+        assert (wrong == ~found).all()

@@ -5,22 +5,19 @@ rotation vector r and a translation t, each with the block C of the claimed cova
 
     e' (b^2 I + k^2 C)^-1 e <= 1   and   |e| <= 2 b
 
-* b of a translation is .04 m sqrt(L / 1 m), 2 m at most, with L the length of the drive. What integrates motion,
-  odometry or the truth itself, is off by a random walk, so by a root of what was travelled, and two visits of a place
-  are known no better: KITTI's own poses differ by .9 m between two passes of a street over a loop of 1 km, hand-held
-  ones by some cm over some metres. .04 m is .4 % after 100 m, the best odometries of KITTI's table. Satellites bound
-  the truth of long drives to metres: the 2 m. L is the path, but no more than once around the drive (pi times its
-  diagonal): who goes round and round in a room stays in the room.
+* b of a translation is .04 m sqrt(L / 1 m), 2 m at most. What integrates motion, odometry or the truth itself, is off
+  by a random walk, and two visits of a place are known no better: KITTI's own poses differ by .9 m between two passes
+  of a street over a loop of 1 km, hand-held ones by some cm over some metres. .04 m is .4 % after 100 m, the best
+  odometries of KITTI's table; satellites bound the truth of long drives to the 2 m. L is the path, but no more than
+  once around the drive (pi times its diagonal): who goes round and round in a room stays in the room.
 * b of a rotation is 5 degrees whatever the drive: half of the turn that makes another keyframe.
-* k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain.
-* 2 b bounds that in turn: a claim to know nothing does not make a wrong closure right. It is 4 m at most, on a drive of
-  kilometres: less than to the next lane but one, or to the next aisle.
-* Where the truth is interpolated it is uncertain by `TruthAt.error`. A closure that is out of bounds by less than this
-  is not judged, for it may be either; nor is one with an end that the truth does not cover.
+* k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain. 2 b bounds that in
+  turn: a claim to know nothing does not make a wrong closure right.
+* Where the truth is interpolated or noisy it is uncertain by `TruthAt.error`. A closure that is out of bounds by less
+  than this is not judged, for it may be either; nor is one with an end that the truth does not cover.
 
 A closure that is good in metres and claims to be better is over-confident, not false: it is counted beside. A claim
 does not tighten the bounds, since a truth that is off between two visits would make right closures false.
-
 Of a closure without metres turn and direction are judged: the step between the cameras has its length from the truth.
 """
 
@@ -81,29 +78,18 @@ def pose_bounds(*drives: Floats) -> PoseBounds:
     return PoseBounds(min(_WALK_M * float(np.sqrt(length_m)), _MOST_M), length_m=length_m)
 
 
-@dataclass(frozen=True, eq=False)
-class PoseErrors:
-    """C closures against the truth."""
-
-    posed: Bools
-    """(C,) with a pose, and a truth at both ends."""
-    right: Bools
-    wrong: Bools
-    """Posed ones that are neither right nor wrong are not judged."""
-    overconfident: Bools
-    """(C,) right ones whose error is beyond the claimed covariance (99.9 %), what the truth may be off left out."""
-
-
 def pose_errors(
     closures: Closures,
     query: TruthAt,
     match: TruthAt,
     bounds: PoseBounds,
     cameras: tuple[Floats | None, Floats | None] = (None, None),
-) -> PoseErrors:
+) -> tuple[Bools, Bools, Bools, Bools]:
     """Judge the closures by the truth at the keyframes of their queries and of their matches.
 
-    `cameras` are body_from_camera of queries and of matches, the identity where not known.
+    `cameras` are body_from_camera of queries and of matches, the identity where not known. Four of (C,): with a pose
+    and a truth at both ends; right; wrong, which not judged ones are not either; right but further off than the claimed
+    covariance and the truth's error allow (99.9 %).
     """
     posed = np.isfinite(closures.match_from_query).all((1, 2))
     posed &= query.known[closures.query] & match.known[closures.match]
@@ -127,9 +113,9 @@ def pose_errors(
         inside &= _within(error, covariance, bounds.b[part])
         maybe &= _within(left, covariance, bounds.b[part])
         honest &= _normalised(left, covariance) <= _CHI
-    found = PoseErrors(posed, *(np.zeros(len(closures), bool) for _ in range(3)))
-    found.right[rows], found.wrong[rows], found.overconfident[rows] = inside, ~maybe, inside & ~honest
-    return found
+    right, wrong, overconfident = (np.zeros(len(closures), bool) for _ in range(3))
+    right[rows], wrong[rows], overconfident[rows] = inside, ~maybe, inside & ~honest
+    return posed, right, wrong, overconfident
 
 
 def _at_true_length(measured: Floats, true: Floats, query_camera: Floats | None, match_camera: Floats | None) -> Floats:

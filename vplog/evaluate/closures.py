@@ -15,7 +15,7 @@ import numpy as np
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import TruthError
-from vplog.evaluate.closure_pose import PoseErrors, pose_bounds, pose_errors
+from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 
@@ -47,7 +47,10 @@ class Judgement:
     """C closures against the truth."""
 
     bounds: PoseBounds
-    pose: PoseErrors
+    posed: Bools
+    """(C,) judged by their pose."""
+    overconfident: Bools
+    """(C,) right ones that are further off than they claim."""
     known: Bools
     """(C,) the truth covers both ends."""
     at_place: Bools
@@ -136,13 +139,10 @@ def judge_closures(
     at_place, opposite = np.zeros(len(closures), bool), np.zeros(len(closures), bool)
     at_place[rows] = (distance <= place.distance_m) & (heading <= place.heading_deg)
     opposite[rows] = (distance <= place.distance_m) & (heading > _OPPOSITE_DEG)
-    if oriented:
-        pose = pose_errors(closures, query, match, bounds, cameras)
-    else:
-        pose = PoseErrors(*(np.zeros(len(closures), bool) for _ in range(4)))
-    by_place = known & ~pose.posed
-    right, wrong = pose.right | by_place & at_place, pose.wrong | by_place & ~at_place
-    return Judgement(bounds, pose, known, at_place, opposite, right, wrong)
+    posed, right, wrong, overconfident = np.array(pose_errors(closures, query, match, bounds, cameras)) & oriented
+    by_place = known & ~posed
+    right, wrong = right | by_place & at_place, wrong | by_place & ~at_place
+    return Judgement(bounds, posed, overconfident, known, at_place, opposite, right, wrong)
 
 
 def score_closures(
@@ -177,7 +177,7 @@ def score_closures(
     return _score(closures, judged, at.known, revisit, place), judged
 
 
-def count_closures(closures: Closures, judged: Judgement) -> dict[str, Any]:
+def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion) -> dict[str, Any]:
     """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
     accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
     right, wrong = accepted & judged.right, accepted & judged.wrong
@@ -189,17 +189,13 @@ def count_closures(closures: Closures, judged: Judgement) -> dict[str, Any]:
         "accepted_false": int(wrong.sum()),
         "not_judged": int((accepted & ~right & ~wrong).sum()),
         "precision": _share(right.sum(), right.sum() + wrong.sum()),
-        "by_place": int((here & ~judged.pose.posed).sum()),
-        "overconfident": int((accepted & judged.pose.overconfident).sum()),
+        "by_place": int((here & ~judged.posed).sum()),
+        "overconfident": int((accepted & judged.overconfident).sum()),
         "same_place": int((accepted & judged.at_place).sum()),
         "place_precision": _share((accepted & judged.at_place).sum(), here.sum()),
         "opposite": int((accepted & judged.opposite).sum()),
+        "criterion": {**asdict(judged.bounds), **asdict(place)},
     }
-
-
-def criterion_of(bounds: PoseBounds, place: PlaceCriterion) -> dict[str, float]:
-    """The bounds as plain values."""
-    return {**asdict(bounds), **asdict(place)}
 
 
 def in_words(closures: dict[str, Any]) -> list[str]:
@@ -219,7 +215,10 @@ def in_words(closures: dict[str, Any]) -> list[str]:
     ]
     for name, text in (
         ("not_judged", "are not judged: the truth has a gap there, or is too coarse to tell"),
-        ("overconfident", "true ones are further off than their covariance claims (99.9 %)"),
+        (
+            "overconfident",
+            "true ones are off by more than they claim (99.9 %): the claim, or the truth between two visits, is off",
+        ),
         ("by_place", "without a pose, or a truth with orientations, are judged by place"),
         ("directions", f"without metres, {closures.get('directions_true')} of them true by turn and direction"),
     ):
@@ -242,7 +241,7 @@ def _score(
     return ClosureScore(
         keyframes=int(covered.sum()),
         outside=int((~covered).sum()),
-        **count_closures(closures, judged),
+        **count_closures(closures, judged, place),
         revisits=int(revisit.sum()),
         revisits_found=len(found),
         recall=_share(len(found), revisit.sum()),
@@ -252,7 +251,6 @@ def _score(
         recall_at_full_precision=by_score[1],
         average_precision_by_inliers=by_inliers[0],
         recall_at_full_precision_by_inliers=by_inliers[1],
-        criterion=criterion_of(judged.bounds, place),
     )
 
 
