@@ -101,7 +101,8 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     if len(rows) < 3 or len(odometry.stamp_ns) < 2:
         return BodyTruth(truth)
     true, moved = truth.world_from_body[rows], _at(odometry, truth.stamp_ns[rows])
-    if _turn_deg(true) < 0.01 and _turn_deg(moved) > _LEAST_TURN_DEG:
+    turned = [geometry.angle(geometry.between(poses[:1], poses)).max() for poses in (true, moved)]
+    if turned[0] < np.radians(0.01) and turned[1] > np.radians(_LEAST_TURN_DEG):
         return BodyTruth(truth, oriented=False)
     frame, truth_from_body = _frame(true, moved, body_from_camera)
     found = BodyTruth(Trajectory(truth.stamp_ns, truth.world_from_body @ truth_from_body), odometry, frame)
@@ -127,10 +128,6 @@ def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:
     """Poses at stamps, held at either end."""
     within = np.clip(stamp_ns, trajectory.stamp_ns[0], trajectory.stamp_ns[-1])
     return geometry.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, within)
-
-
-def _turn_deg(poses: Floats) -> float:
-    return float(np.degrees(geometry.angle(geometry.between(poses[:1], poses)).max()))
 
 
 def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats]:
