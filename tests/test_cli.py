@@ -262,10 +262,10 @@ def test_evaluate_says_by_which_criteria(verb: Verb, drive: Drive, finished: Pat
     assert other["ate_after"]["alignment"] == "Sim(3)"
     assert "within 0.02 m and 2 deg between optical axes" in verb(*narrow).out
     for option in (("--distance-m", 3), ("--heading-deg", 9), ("--truth-offset-s", 1), ("--align", "origin")):
-        assert f"takes no {option[0]}" in verb("evaluate", finished, "--truth", "gps", *option).error
+        assert str(option[0]) in verb("evaluate", finished, "--truth", "gps", *option).error
 
 
-def test_evaluate_with_a_clock_that_is_off_and_a_truth_of_the_camera(
+def test_evaluate_with_a_clock_that_is_said_to_be_off_and_a_truth_of_the_camera(
     verb: Verb, drive: Drive, finished: Path, tmp_path: Path
 ) -> None:
     from vplog import geometry
@@ -280,11 +280,10 @@ def test_evaluate_with_a_clock_that_is_off_and_a_truth_of_the_camera(
     late, of_camera = tmp_path / "late.tum", tmp_path / "camera.tum"
     write_tum(late, Trajectory(true.stamp_ns - 400_000_000, true.world_from_body))
     write_tum(of_camera, Trajectory(true.stamp_ns, true.world_from_body @ camera))
-    found = verb("evaluate", finished, "--truth", late)
-    assert "--truth-offset-s 0.4" in found.err
-    assert f"{plain['closures']['accepted_true']} of them true" in found.out
-    given = verb("evaluate", finished, "--truth", late, "--truth-offset-s", 0.4, "--json").json
-    assert given["ate_after"]["rmse_m"] == pytest.approx(plain["ate_after"]["rmse_m"], abs=1e-6)
+    shifted = verb("evaluate", finished, "--truth", late, "--truth-offset-s", 0.4, "--json").json
+    assert shifted["ate_after"]["rmse_m"] == pytest.approx(plain["ate_after"]["rmse_m"], abs=1e-6)
+    assert shifted["closures"] == plain["closures"]
+    assert verb("evaluate", finished, "--truth", late, "--json").json["ate_after"] != plain["ate_after"]
     found = verb("evaluate", finished, "--truth", of_camera)
     assert "The truth is that of the camera" in found.err
     assert f"{plain['closures']['accepted_true']} of them true" in found.out

@@ -10,10 +10,12 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from vplog import geometry
+from vplog.data import Trajectory
 from vplog.evaluate.truth import read_truth
 from vplog.evaluation import evaluate
 from vplog.record import OWN_LIBRARY
 from vplog.results import tables
+from vplog.results.tum import write_tum
 
 from .joined import QUICK, cut
 
@@ -109,6 +111,18 @@ def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Ca
     assert "as one trajectory" in said
     assert "after to before:" in said
     assert "several drives" in verb("evaluate", joint, "--truth", "gps").error
+
+
+def test_a_drive_that_the_truth_does_not_cover_is_named(
+    joint: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path
+) -> None:
+    first_ns = int(tables.read_trajectory(joint / "after" / "trajectory.parquet")[0].stamp_ns[0])
+    known = read_truth(drive.truth)
+    rows = known.stamp_ns < first_ns
+    write_tum(tmp_path / "short.tum", Trajectory(known.stamp_ns[rows], known.world_from_body[rows]))
+    said = verb("evaluate", joint, "--truth", tmp_path / "short.tum")
+    assert "after is left out" in said.err
+    assert "before: " in said.out
 
 
 def test_verbs_of_one_drive_say_which_there_are(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:

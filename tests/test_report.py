@@ -134,10 +134,10 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
                 if row["verdict"] == "accepted"]  # fmt: skip
     for name, count in (("true", "accepted_true"), ("same place", "same_place")):
         assert sum(row[name] == "yes" for row in accepted) == evaluation["closures"][count] > 0
-    assert f"within {evaluation['closures']['criterion']['translation_m']:.2f} m and 5.0 degrees" in text
+    assert f"within {evaluation['closures']['criterion']['translation_m']:.2f} m and 5 deg" in text
     narrow = ("--distance-m", 0.01, "--heading-deg", 3)
     assert verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "n.html", *narrow).code == 0
-    assert "within 0.0 m and 3.0 degrees" in (tmp_path / "n.html").read_text()
+    assert "within 0.01 m and 3 deg" in (tmp_path / "n.html").read_text()
     assert "give --truth" in verb("report", finished, "-o", tmp_path / "n.html", *narrow).error
     gps = verb("report", finished, "--truth", "gps", "-o", tmp_path / "g.html")
     assert gps.code == 0

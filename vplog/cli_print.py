@@ -162,24 +162,25 @@ def print_joint(out: Path, record: dict[str, Any]) -> None:
 
 
 def print_evaluation(found: dict[str, Any]) -> None:
+    from vplog.evaluate.closures import in_words
+
     for number, one in enumerate(found.get("maps", [])):
         ate = one["ate_after"]
         print_line(f"map {number}", f"ATE rmse {ate['rmse_m']:.6f} m as one trajectory ({ate['alignment']})")
         for drive in one["drives"]:
             before, after = drive["ate_before"]["rmse_m"], drive["ate_after"]["rmse_m"]
-            print(f"  {drive['drive']}: ATE rmse {before:.6f} m before, {after:.6f} m after, by itself")
-            _print_closures(drive["closures"], "    ")
+            print_line(f"  {drive['drive']}:", f"ATE rmse {before:.6f} m before, {after:.6f} m after, by itself")
+            _print_lines("  closures", in_words(drive["closures"]))
     for pair in found.get("joins", []):
         if pair["accepted"] or pair["not_judged"]:
-            print(f"  {pair['query_drive']} to {pair['match_drive']}:")
-            _print_closures(pair, "    ")
+            _print_lines(f"  {pair['query_drive']} to {pair['match_drive']}:", in_words(pair))
     for drive, why in found.get("uncovered", {}).items():
         say(f"warning: {drive} is left out: {why}")
     if "maps" in found:
         return
     warn(_truth_notes(found))
     if found.get("closures"):
-        _print_closures(found["closures"])
+        _print_lines("closures", in_words(found["closures"]))
     residuals = found.get("residuals")
     if residuals and residuals["to_truth"] is not None:
         near = "" if residuals["to_neighbours"] is None else f", {residuals['to_neighbours']:.2f} to its neighbours"
@@ -195,81 +196,31 @@ def print_evaluation(found: dict[str, Any]) -> None:
             line += f"   RPE {rpe['translation_rmse_m']:.4f} m, {rpe['rotation_rmse_deg']:.4f} deg a frame"
         print_line(when, line)
         if drift is not None and drift["segments"]:
-            over = f"{drift['segments']} segments of {drift['lengths_m'][0]:g} to {drift['lengths_m'][-1]:g} m of path"
-            text = f"drift {drift['translation_m']:.2f} m, {drift['rotation_deg']:.2f} deg per 100 m (mean of {over})"
-            print_line("", text)
+            ends = f"{drift['lengths_m'][0]:g} to {drift['lengths_m'][-1]:g} m"
+            what = f"drift {drift['translation_m']:.2f} m, {drift['rotation_deg']:.2f} deg per 100 m"
+            print_line("", f"{what} (mean of {drift['segments']} segments of {ends} of path)")
 
 
 def _truth_notes(found: dict[str, Any]) -> list[str]:
     """What a reader must know of the truth to trust the figures."""
     truth, notes = found.get("truth_is"), []
-    if truth is None:
-        return notes
-    if truth["frame"] != "body":
+    if truth is not None and truth["frame"] != "body":
         what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
-        notes.append(
-            f"The truth is that of {what}: closures and drift are judged in the body's frame, ATE and RPE not."
-        )
-    if truth["offset_found"]:
-        offset = f"{truth['offset_s']:.2f}"
-        notes.append(
-            f"By speed and turning the truth's clock is {offset} s behind the log's: closures and drift are judged "
-            f"with that, ATE and RPE without. For all figures: --truth-offset-s {offset}; for none: --truth-offset-s 0."
-        )
-    if not truth["oriented"]:
+        notes.append(f"The truth is that of {what}: closures and drift are those of the body, ATE and RPE not.")
+    if truth is not None and not truth["oriented"]:
         notes.append(
             "The truth never turns, the odometry does: it holds positions alone. Closures are judged by place, without "
             "heading; for their poses give a truth with orientations."
         )
-    if found["interpolated"]:
-        notes.append(
-            "Few poses have a stamp within 0.01 s of the truth's: they are interpolated at the truth's stamps."
-        )
+    if found.get("interpolated"):
+        notes.append("Few poses have a stamp within 0.01 s of the truth's: poses are interpolated at its stamps.")
     return notes
 
 
-def _print_closures(closures: dict[str, Any], indent: str = "") -> None:
-    """Counts, and the criteria they are by."""
-    share = {
-        name: "none" if closures.get(name) is None else f"{closures[name]:.3f}"
-        for name in ("precision", "place_precision", "recall")
-    }
-    bounds, blank = closures["criterion"], indent
-    print_line(
-        f"{indent}closures",
-        f"{closures['accepted']} accepted, {closures['accepted_true']} of them true, {closures['accepted_false']} "
-        f"false (precision {share['precision']}); {closures['opposite']} in the opposite direction",
-    )
-    if closures["not_judged"]:
-        print_line(
-            blank, f"{closures['not_judged']} are not judged: the truth has a gap there, or is too coarse to tell"
-        )
-    print_line(
-        blank,
-        f"true by pose: within {bounds['translation_m']:.2f} m and {bounds['rotation_deg']:g} deg of the truth, "
-        f"or the claimed covariance, at most {bounds['most']:g} times that: {bounds['length_m']:.0f} m of drive",
-    )
-    if closures["overconfident"]:
-        print_line(
-            blank, f"{closures['overconfident']} true ones are further off than their covariance claims (99.9 %)"
-        )
-    if closures["by_place"]:
-        print_line(blank, f"{closures['by_place']} without a pose in metres are judged by place")
-    print_line(
-        f"{indent}places",
-        f"{closures['same_place']} accepted between frames within {bounds['distance_m']:g} m and "
-        f"{bounds['heading_deg']:g} deg between optical axes (precision {share['place_precision']})",
-    )
-    if "revisits" not in closures:
-        return
-    recall = f"{closures['revisits_found']} of {closures['revisits']} revisits found (recall {share['recall']})"
-    print_line(blank, recall)
-    if closures["directions"]:
-        what = f"{closures['directions_true']} of them true by place, turn and direction"
-        print_line(blank, f"{closures['directions']} closures without metres, {what}")
-    if closures["without_pose"]:
-        what = f"{closures['without_pose_same_place']} of them of one place"
-        print_line(blank, f"{closures['without_pose']} candidates agree without a calibration, {what}")
+def _print_lines(label: str, lines: list[str]) -> None:
+    for line in lines:
+        print_line(label, line)
+        label = ""
 
 
 def print_explanation(told: dict[str, Any]) -> None:

@@ -29,15 +29,10 @@ _BINARY = ("geoparquet", "rrd")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """A run, of one or several drives, or a map against ground truth."""
+    """A run, of one or several drives, against ground truth."""
     from vplog.evaluation import evaluate as evaluate_run
-    from vplog.maps.evaluate import evaluate_map
 
-    options = _truth_options(arguments)
-    if (arguments.run / "map.json").exists():
-        found = evaluate_map(arguments.run, arguments.truth, options)
-    else:
-        found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), options)
+    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), _truth_options(arguments))
     print_result(arguments, found, print_evaluation)
 
 
@@ -91,7 +86,8 @@ def export(arguments: argparse.Namespace) -> None:
 def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
     from vplog.evaluation import TruthOptions
 
-    return TruthOptions(arguments.distance_m, arguments.heading_deg, arguments.align, arguments.truth_offset_s)
+    names = ("distance_m", "heading_deg", "align", "truth_offset_s")
+    return TruthOptions(**{name: value for name in names if (value := getattr(arguments, name)) is not None})
 
 
 def _add_truth_options(sub: argparse.ArgumentParser) -> None:
@@ -99,9 +95,8 @@ def _add_truth_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--heading-deg", type=positive, metavar="DEG", help="and their optical axes turned by less (default: 45)"
     )
-    sub.add_argument("--align", choices=_ALIGNMENTS, default="se3", help="alignment of the ATE (default: se3)")
-    text = "add to the truth's stamps (default: found, for closures alone)"
-    sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help=text)
+    sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
+    sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help="add to the truth's stamps (default: 0)")
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, gps, residuals, trajectory
 from vplog.evaluate.body_truth import body_truth
 from vplog.evaluate.closure_pose import pose_bounds
+from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.record import reopened
@@ -28,21 +29,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TruthOptions:
-    """How a run is held against the truth; None takes the default."""
+    """How a run is held against the truth."""
 
-    distance_m: float | None = None
-    """m between frames of one place (6)."""
-    heading_deg: float | None = None
-    """Degrees between their optical axes (45)."""
+    distance_m: float = DISTANCE_M
+    """m between frames of one place."""
+    heading_deg: float = HEADING_DEG
+    """Degrees between their optical axes."""
     align: str = "se3"
     """Of the ATE: a name of `trajectory.ALIGNMENTS`."""
-    truth_offset_s: float | None = None
-    """s added to the stamps of the truth, for every figure; None finds it for the closures alone."""
+    truth_offset_s: float = 0.0
+    """s added to the stamps of the truth, as evo's --t_offset."""
 
     @property
     def place(self) -> closures.PlaceCriterion:
-        given = {"distance_m": self.distance_m, "heading_deg": self.heading_deg}
-        return closures.PlaceCriterion(**{name: value for name, value in given.items() if value is not None})
+        return closures.PlaceCriterion(self.distance_m, self.heading_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +86,12 @@ def evaluate_poses(
     settings = _recorded(record, folder, dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
     camera = _camera(folder)
-    of_body = body_truth(known, before, camera, options.truth_offset_s is None)
-    figures = _trajectories(before, after, known, of_body, options)
+    of_body = body_truth(known, before, camera)
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
     found = {
         "truth": without_secrets(truth),
-        "truth_is": _about(of_body, options),
-        **figures,
+        "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
+        **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
         "residuals": asdict(residuals.score_residuals(keyframes, ledger, of_body)),
     }
@@ -101,34 +100,20 @@ def evaluate_poses(
 
 def _read_truth(truth: str, options: TruthOptions) -> Trajectory:
     known = read_truth(truth)
-    return Trajectory(known.stamp_ns + round((options.truth_offset_s or 0.0) * 1e9), known.world_from_body)
+    return Trajectory(known.stamp_ns + round(options.truth_offset_s * 1e9), known.world_from_body)
 
 
 def _trajectories(
     before: Trajectory, after: Trajectory, known: Trajectory, of_body: BodyTruth, options: TruthOptions
 ) -> dict[str, Any]:
     """ATE and RPE against the truth as it is given, as evo has them, and the drift against that of the body."""
-    found: dict[str, Any] = {"ate": {}, "rpe": {}, "drift": {}}
-    interpolated = False
+    found: dict[str, Any] = {}
     for when, one in (("before", before), ("after", after)):
-        compared, interpolated = trajectory.at_truth(one, known)
-        shifted, _ = trajectory.at_truth(one, of_body.trajectory)
-        found["ate"][when] = asdict(trajectory.ate(compared, known, alignment=options.align))
-        found["rpe"][when] = asdict(trajectory.rpe(compared, known))
-        found["drift"][when] = asdict(trajectory.drift(shifted, of_body.trajectory))
-    named = {f"{name}_{when}": value for name, both in found.items() for when, value in both.items()}
-    return {**named, "interpolated": interpolated}
-
-
-def _about(truth: BodyTruth, options: TruthOptions) -> dict[str, Any]:
-    """What the truth was found to be, as plain values."""
-    return {
-        "frame": truth.frame,
-        "body_from_truth": None if truth.body_from_truth is None else truth.body_from_truth.tolist(),
-        "offset_s": truth.offset_s if options.truth_offset_s is None else options.truth_offset_s,
-        "offset_found": options.truth_offset_s is None and truth.offset_s != 0.0,
-        "oriented": truth.oriented,
-    }
+        compared, found["interpolated"] = trajectory.at_truth(one, known)
+        found[f"ate_{when}"] = asdict(trajectory.ate(compared, known, alignment=options.align))
+        found[f"rpe_{when}"] = asdict(trajectory.rpe(compared, known))
+        found[f"drift_{when}"] = asdict(trajectory.drift(compared, of_body.trajectory))
+    return found
 
 
 def _camera(folder: Path) -> Floats | None:
@@ -138,68 +123,51 @@ def _camera(folder: Path) -> Floats | None:
 
 
 def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
-    """A joint run."""
-    members = []
-    for found in _recorded(record, folder, list, "maps"):
-        file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
-        members.append({name: folder / name / file for name in _recorded(found, folder, list, "drives")})
-    folders = {name: folder / name for drives in members for name in drives}
-    return evaluate_together(folder, folders, members, [folder / "joins.parquet"], truth, options)
+    """A joint run: drives by themselves, each map of several as one trajectory, and the closures between drives.
 
-
-def evaluate_together(
-    whose: Path,
-    folders: dict[str, Path],
-    maps: list[dict[str, Path]],
-    joins: list[Path],
-    truth: str,
-    options: TruthOptions,
-) -> dict[str, Any]:
-    """Drives by themselves, each map of several as one trajectory, and the closures between drives.
-
-    `folders` are the run folders by drive, `maps` the tables of trajectories in one frame, `joins` those of closures.
     Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
     """
     if truth == "gps":
-        raise TruthError(f"{whose} holds several drives; hold each against its own GPS: vplog evaluate {whose}/DRIVE")
+        raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
     known = _read_truth(truth, options)
     drives: dict[str, Evaluation] = {}
     uncovered: dict[str, str] = {}
-    for name, folder in folders.items():
-        try:
-            drives[name] = evaluate_poses(folder, run_record.read_finished_run(folder), truth, options, known)
-        except TruthError as error:
-            uncovered[name] = str(error)
-    if not drives:
-        raise TruthError(next(iter(uncovered.values()), f"{whose} holds no drive."))
-    found = []
-    for members in maps:
-        parts = [tables.read_trajectory(path)[0] for name, path in members.items() if name in drives]
-        if parts:
+    maps = []
+    for found in _recorded(record, folder, list, "maps"):
+        names = _recorded(found, folder, list, "drives")
+        for name in names:
+            try:
+                own = run_record.read_finished_run(folder / name)
+                drives[name] = evaluate_poses(folder / name, own, truth, options, known)
+            except TruthError as error:
+                uncovered[name] = str(error)
+        names = [name for name in names if name in drives]
+        if names:
+            file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
+            parts = [tables.read_trajectory(folder / name / file)[0] for name in names]
             stamps, rows = np.unique(np.concatenate([part.stamp_ns for part in parts]), return_index=True)
             whole = Trajectory(stamps, np.concatenate([part.world_from_body for part in parts])[rows])
-            whole, _ = trajectory.at_truth(whole, known)
-            own = [{"drive": name, **drives[name].record} for name in members if name in drives]
-            found.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known, alignment=options.align))})
-    between = [pair for path in joins for pair in _joins(path, folders, drives, options.place)]
-    return {"truth": without_secrets(truth), "maps": found, "joins": between, "uncovered": uncovered}
+            ate = trajectory.ate(trajectory.at_truth(whole, known)[0], known, alignment=options.align)
+            own = [{"drive": name, **drives[name].record} for name in names]
+            maps.append({"drives": own, "ate_after": asdict(ate)})
+    if not drives:
+        raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
+    joins = _joins(folder, drives, options.place)
+    return {"truth": without_secrets(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
 
 
-def _joins(
-    path: Path, folders: dict[str, Path], drives: dict[str, Evaluation], place: closures.PlaceCriterion
-) -> list[dict[str, Any]]:
-    """The closures between each two drives of a table, as those of one are judged."""
+def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
+    """The closures between each two drives, as those of one are judged."""
     found = []
-    for (later, earlier), ledger in tables.read_joins(path).items():
+    for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():
         if later in drives and earlier in drives:
             query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
             bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
             oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
-            cameras = _camera(folders[later]), _camera(folders[earlier])
+            cameras = _camera(folder / later), _camera(folder / earlier)
             judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
-            counts = closures.count_closures(ledger, judged)
-            criterion = closures.criterion_of(bounds, place)
-            found.append({"query_drive": later, "match_drive": earlier, **counts, "criterion": criterion})
+            counts = closures.count_closures(ledger, judged, place)
+            found.append({"query_drive": later, "match_drive": earlier, **counts})
     return found
 
 
@@ -215,12 +183,11 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
 def _against_gps(
     folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions
 ) -> dict[str, Any]:
-    for option in ("distance_m", "heading_deg", "truth_offset_s"):
-        if getattr(options, option) is not None:
-            name = option.replace("_", "-")
-            raise TruthError(
-                f"--truth gps takes no --{name}: fixes judge no closure. Give a TUM file, or leave it out."
-            )
+    if options != TruthOptions(align=options.align):
+        raise TruthError(
+            "--truth gps takes no --distance-m, --heading-deg or --truth-offset-s: fixes judge no closure and are in "
+            "the log's clock. Give a TUM file, or leave them out."
+        )
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")

@@ -9,6 +9,7 @@ import numpy as np
 
 from vplog import geometry, logs
 from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
+from vplog.evaluate.closures import in_words
 from vplog.evaluation import TruthOptions, evaluate, evaluate_poses
 from vplog.extract import extract_frames
 from vplog.pipeline import Pipeline
@@ -41,7 +42,8 @@ def report(
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
-    if truth is None and options not in (None, TruthOptions()):
+    options = options or TruthOptions()
+    if truth is None and options != TruthOptions():
         raise TruthError(
             "--distance-m, --heading-deg, --align and --truth-offset-s say how a truth is used: give --truth."
         )
@@ -54,16 +56,12 @@ def report(
 
 
 def judge(
-    folder: Path,
-    record: dict[str, Any],
-    truth: str,
-    topics: logs.TopicChoice | None = None,
-    options: TruthOptions | None = None,
+    folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None, options: TruthOptions
 ) -> Judged:
     """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
     if truth == "gps":
         return Judged(truth, evaluate(folder, truth, topics, options))
-    found = evaluate_poses(folder, record, truth, options or TruthOptions())
+    found = evaluate_poses(folder, record, truth, options)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
     true, solved = at.world_from_body[at.known][:, :3, 3], world_from_body[at.known][:, :3, 3]
@@ -74,6 +72,7 @@ def judge(
     return Judged(
         Path(shown(truth)).name,
         found.record,
+        in_words(found.record["closures"]),
         path,
         judged.right,
         judged.right | judged.wrong,

@@ -12,10 +12,10 @@ from tests.graph.drive import ledger
 from vplog import geometry
 from vplog.data import Trajectory
 from vplog.evaluate.body_truth import BodyTruth, TruthAt, body_truth
-from vplog.evaluate.closure_pose import direction_errors, pose_bounds, pose_errors
+from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.closures import ClosureScore, Judgement, score_closures
 
-SEEDS = range(6)
+SEEDS = range(3)
 
 
 def judged(drive: Drawn, truth: Trajectory) -> tuple[ClosureScore, Judgement, BodyTruth]:
@@ -30,7 +30,7 @@ def test_every_label_is_found(kind: str, seed: int) -> None:
     score, found, truth = judged(drive, drive.truth)
     np.testing.assert_array_equal(found.right, drive.right)
     np.testing.assert_array_equal(found.wrong, ~drive.right)
-    assert (truth.frame, truth.offset_s, truth.oriented) == ("body", 0.0, True)
+    assert (truth.frame, truth.oriented) == ("body", True)
     assert score.precision == drive.right.mean()
     assert (score.not_judged, score.by_place, score.overconfident) == (0, 0, 0)
 
@@ -75,29 +75,19 @@ def test_a_truth_of_another_point_is_estimated(kind: str, seed: int) -> None:
     np.testing.assert_array_equal(found.right, drive.right)
 
 
+@pytest.mark.parametrize("times", [1, 10])
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_clock_that_is_off_is_found(kind: str, seed: int) -> None:
+def test_noise_of_the_truth_makes_no_closure_false(kind: str, seed: int, times: int) -> None:
     drive = draw(kind, seed)
-    truth = Trajectory(drive.truth.stamp_ns - 730_000_000, drive.truth.world_from_body)
-    _, found, of_body = judged(drive, truth)
-    assert of_body.offset_s == pytest.approx(0.73, abs=0.03)
-    assert not (found.right & ~drive.right).any()
-    assert not (found.wrong & drive.right).any()
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_noise_of_the_truth_makes_no_closure_false(kind: str, seed: int) -> None:
-    drive = draw(kind, seed)
-    metres = {"room": 0.005, "road": 0.3, "drone": 0.05, "aisles": 0.02}[kind]
+    metres = times * {"room": 0.005, "road": 0.1, "drone": 0.05, "aisles": 0.02}[kind]
     noise = np.random.default_rng(seed).normal(size=(len(drive.truth.stamp_ns), 6)) * np.repeat([0.005, metres], 3)
     truth = Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ geometry.exp(noise))
     _, found, of_body = judged(drive, truth)
     assert of_body.frame == "body"
     assert not (found.right & ~drive.right).any()
     assert not (found.wrong & drive.right).any()
-    assert (found.right | found.wrong).mean() > 0.95
+    assert times > 1 or (found.right | found.wrong).mean() > 0.95
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -118,7 +108,7 @@ def test_positions_alone_judge_places() -> None:
     flat[:, :3, :3] = np.eye(3)
     score, found, truth = judged(drive, Trajectory(drive.truth.stamp_ns, flat))
     assert not truth.oriented
-    assert not found.pose.posed.any()
+    assert not found.posed.any()
     assert score.by_place == score.accepted
     np.testing.assert_array_equal(found.right, found.at_place)
 
@@ -137,8 +127,8 @@ def outcome(error: np.ndarray, sigma: tuple[float, float], metres: float, unsure
     )
     line = np.linspace([0.0, 0.0, 0.0], [metres, 0.0, 0.0], 10)
     at = known(poses, unsure_m)
-    errors = pose_errors(found, at, at, pose_bounds(line))
-    return "right" if errors.right[0] else "wrong" if errors.wrong[0] else "not judged"
+    _, right, wrong, _ = pose_errors(found, at, at, pose_bounds(line))
+    return "right" if right[0] else "wrong" if wrong[0] else "not judged"
 
 
 def off(metres: float, degrees: float) -> np.ndarray:
@@ -186,7 +176,14 @@ def test_closures_without_metres_are_held_to_their_direction() -> None:
     turned = unit @ geometry.exp(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]))
     reverse = unit.copy()
     reverse[:, :3, 3] *= -1.0
-    bounds = replace(pose_bounds(drive.truth.world_from_body[:, :3, 3]), translation_m=0.5 * float(length.min()))
+    bounds = replace(pose_bounds(drive.truth.world_from_body[:, :3, 3]), translation_m=0.1 * float(length.min()))
     for measured, right in ((unit, True), (turned, False), (reverse, False)):
-        told = replace(closures, match_from_query=camera @ measured @ geometry.inverse(camera))
-        assert (direction_errors(told, at, at, bounds, camera, camera) == right).all()
+        told = replace(
+            closures,
+            match_from_query=camera @ measured @ geometry.inverse(camera),
+            scale=["none"] * len(closures),
+            information=closures.information / 1e12,  # in no metres: a claim that widens nothing
+        )
+        _, found, wrong, _ = pose_errors(told, at, at, bounds, (camera, camera))
+        assert (found == right).all()
+        assert (wrong == ~found).all()

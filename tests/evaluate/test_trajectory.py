@@ -63,9 +63,8 @@ def evo_ate(estimate: Trajectory, truth: Trajectory, alignment: str = "se3") -> 
     return {**metric.get_all_statistics(), "count": reference.num_poses}
 
 
-def evo_rpe(estimate: Trajectory, truth: Trajectory, relation: Any, delta_m: float | None) -> dict[str, Any]:
-    unit, delta = (Unit.frames, 1) if delta_m is None else (Unit.meters, delta_m)
-    metric = metrics.RPE(relation, delta=delta, delta_unit=unit)
+def evo_rpe(estimate: Trajectory, truth: Trajectory, relation: Any) -> dict[str, Any]:
+    metric = metrics.RPE(relation, delta=1, delta_unit=Unit.frames)
     metric.process_data(sync.associate_trajectories(in_evo(truth), in_evo(estimate)))
     return {**metric.get_all_statistics(), "count": len(metric.error)}
 
@@ -75,17 +74,16 @@ def assert_agrees_with_evo(estimate: Trajectory, truth: Trajectory) -> None:
     assert ours.count == theirs["count"]
     for name in ("rmse", "mean", "median", "max"):
         assert getattr(ours, f"{name}_m") == pytest.approx(theirs[name], abs=1e-7), name
-    for delta_m in (None, 0.5, 3.0):
-        steps = rpe(estimate, truth, delta_m)
-        for relation, part, unit in (
-            (metrics.PoseRelation.translation_part, "translation", "m"),
-            (metrics.PoseRelation.rotation_angle_deg, "rotation", "deg"),
-        ):
-            theirs = evo_rpe(estimate, truth, relation, delta_m)
-            assert steps.count == theirs["count"]
-            for name in ("rmse", "mean", "max"):
-                # evo's angle of nearly equal rotations comes from a trace and keeps half the digits
-                assert getattr(steps, f"{part}_{name}_{unit}") == pytest.approx(theirs[name], abs=2e-6), (part, name)
+    steps = rpe(estimate, truth)
+    for relation, part, unit in (
+        (metrics.PoseRelation.translation_part, "translation", "m"),
+        (metrics.PoseRelation.rotation_angle_deg, "rotation", "deg"),
+    ):
+        theirs = evo_rpe(estimate, truth, relation)
+        assert steps.count == theirs["count"]
+        for name in ("rmse", "mean", "max"):
+            # evo's angle of nearly equal rotations comes from a trace and keeps half the digits
+            assert getattr(steps, f"{part}_{name}_{unit}") == pytest.approx(theirs[name], abs=2e-6), (part, name)
 
 
 @pytest.mark.parametrize(("estimated", "true"), [(80, 80), (80, 300), (300, 80)])
@@ -182,10 +180,10 @@ def test_too_little_to_compare_is_one_line() -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_a_drive_shorter_than_the_step_has_no_rpe() -> None:
-    truth = walk(0, 20)
-    found = rpe(truth, truth, delta_m=1000.0)
-    assert (found.delta, found.count, found.translation_rmse_m, found.rotation_max_deg) == ("1000 m", 0, None, None)
+def test_a_single_pose_has_no_rpe() -> None:
+    one = walk(0, 1)
+    found = rpe(one, one)
+    assert (found.delta, found.count, found.translation_rmse_m, found.rotation_max_deg) == ("1 frame", 0, None, None)
 
 
 @pytest.mark.parametrize(("alignment", "name"), [("se3", "SE(3)"), ("sim3", "Sim(3)"), ("origin", "origin")])
@@ -228,26 +226,36 @@ def test_drift_is_a_share_of_the_path_at_every_length(metres: float, lengths: li
     assert drift(truth, truth).translation_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_drift_is_the_mean_of_evos_relative_errors() -> None:
-    """One length, so that evo has the same segments: all pairs that are 100 m of path apart, from starts 10 m apart."""
-    truth, estimate = along_x(195.0, 1951), along_x(195.0, 1951, 1.01, 2.0)
+def devkit(truth: Floats, estimate: Floats) -> tuple[float, float, int]:
+    """m and degrees per 100 m, and segments: calcSequenceErrors of KITTI's evaluate_odometry.cpp, line by line."""
+    step = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
+    away = np.concatenate([[0.0], np.cumsum(step)])
     errors = []
-    reference, measured = in_evo(truth), in_evo(estimate)
-    for start in range(0, 951, 100):
-        reference_step = [reference.poses_se3[start], reference.poses_se3[start + 1000]]
-        measured_step = [measured.poses_se3[start], measured.poses_se3[start + 1000]]
-        metric = metrics.RPE(metrics.PoseRelation.translation_part, delta=1, delta_unit=Unit.frames)
-        stamps = np.array([0.0, 1.0])
-        metric.process_data(
-            (
-                PoseTrajectory3D(poses_se3=reference_step, timestamps=stamps),
-                PoseTrajectory3D(poses_se3=measured_step, timestamps=stamps),
-            )
-        )
-        errors.append(metric.error[0])
-    found = drift(estimate, truth)
-    assert (found.lengths_m, found.segments) == ([100.0], len(errors))
-    assert found.translation_m == pytest.approx(np.mean(errors), rel=2e-3)
+    for first in range(0, len(truth), 10):
+        for length in range(100, 900, 100):
+            last = next((row for row in range(first, len(truth)) if away[row] > away[first] + length), None)
+            if last is not None:
+                true = np.linalg.inv(truth[first]) @ truth[last]
+                error = np.linalg.inv(np.linalg.inv(estimate[first]) @ estimate[last]) @ true
+                turned = np.degrees(np.arccos(np.clip(0.5 * (np.trace(error[:3, :3]) - 1.0), -1.0, 1.0)))
+                errors.append([np.linalg.norm(error[:3, 3]) / length, turned / length])
+    metres, degrees = 100.0 * np.mean(errors, axis=0)
+    return float(metres), float(degrees), len(errors)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_is_that_of_kittis_kit(seed: int) -> None:
+    truth, other = walk(seed, 1200), walk(seed + 10, 1200, noise=0.01)
+    between = geometry.log(geometry.between(other.world_from_body[:-1], other.world_from_body[1:]))
+    poses = truth.world_from_body.copy()
+    for row, step in enumerate(geometry.exp(0.01 * between)):  # the truth's steps, each off by a hundredth of another's
+        poses[row + 1] = poses[row] @ geometry.between(*truth.world_from_body[row : row + 2]) @ step
+    found = drift(Trajectory(truth.stamp_ns, poses), truth)
+    metres, degrees, segments = devkit(truth.world_from_body, poses)
+    assert found.segments == segments > 100
+    assert found.lengths_m[-1] == 800.0
+    assert found.translation_m == pytest.approx(metres, rel=1e-9)
+    assert found.rotation_deg == pytest.approx(degrees, rel=1e-6)
 
 
 def test_a_drive_that_stood_still_has_no_drift() -> None:

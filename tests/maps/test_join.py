@@ -313,32 +313,3 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
         for threads in (1, 3):
             found = candidates.candidates_of(store, members, [2], state, few, threads)[2]
             assert set(found.drive.tolist()) == {1}
-
-
-def test_a_map_is_evaluated_as_a_joint_run_is(
-    whole: Path, joint: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path
-) -> None:
-    from vplog.evaluation import evaluate
-
-    found = verb("evaluate", whole, "--truth", drive.truth, "--json").json
-    expected = evaluate(joint, str(drive.truth))
-    assert [sorted(one["drive"] for one in group["drives"]) for group in found["maps"]] == [
-        ["after", "before"], ["drive"],
-    ]  # fmt: skip
-    assert found["maps"][0]["ate_after"]["rmse_m"] < 1.5
-    own = {one["drive"]: one["closures"] for group in found["maps"] for one in group["drives"]}
-    assert own == {one["drive"]: one["closures"] for group in expected["maps"] for one in group["drives"]}
-    [pair] = found["joins"]
-    assert ({pair["query_drive"], pair["match_drive"]}, pair["precision"]) == ({"after", "before"}, 1.0)
-    said = verb("evaluate", whole, "--truth", drive.truth).out
-    assert f"{pair['query_drive']} to {pair['match_drive']}:" in said
-    short = tmp_path / "short.tum"  # of the drive cut off, that before the cut alone
-    lines = drive.truth.read_text().splitlines(keepends=True)
-    stamps = [int(float(line.split()[0]) * 1e9) for line in lines if not line.startswith("#")]
-    last = tables.read_trajectory(whole / "runs" / "drive=after" / "trajectory.parquet")[0].stamp_ns[0]
-    assert stamps[0] < last
-    short.write_text("".join(line for line in lines if line.startswith("#") or float(line.split()[0]) * 1e9 < last))
-    told = verb("evaluate", whole, "--truth", short)
-    assert "after is left out" in told.err
-    assert "before: ATE" in told.out
-    assert "several drives" in verb("evaluate", whole, "--truth", "gps").error

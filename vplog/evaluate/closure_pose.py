@@ -5,20 +5,20 @@ rotation vector r and a translation t, each with the block C of the claimed cova
 
     e' (b^2 I + k^2 C)^-1 e <= 1   and   |e| <= 2 b
 
-* b of a translation is .04 m sqrt(L / 1 m), 2 m at most, with L the length of the drive. What integrates motion,
-  odometry or the truth itself, is off by a random walk, so by a root of what was travelled, and two visits of a place
-  are known no better: KITTI's own poses differ by .9 m between two passes of a street over a loop of 1 km, hand-held
-  ones by some cm over some metres. .04 m is .4 % after 100 m, the best odometries of KITTI's table. Satellites bound
-  the truth of long drives to metres: the 2 m. L is the path, but no more than once around the drive (pi times its
-  diagonal): who goes round and round in a room stays in the room.
+* b of a translation is .04 m sqrt(L / 1 m), 2 m at most. What integrates motion, odometry or the truth itself, is off
+  by a random walk, and two visits of a place are known no better: KITTI's own poses differ by .9 m between two passes
+  of a street over a loop of 1 km, hand-held ones by some cm over some metres. .04 m is .4 % after 100 m, the best
+  odometries of KITTI's table; satellites bound the truth of long drives to the 2 m. L is the path, but no more than
+  once around the drive (pi times its diagonal): who goes round and round in a room stays in the room.
 * b of a rotation is 5 degrees whatever the drive: half of the turn that makes another keyframe.
-* k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain.
-* 2 b bounds that in turn: a claim to know nothing does not make a wrong closure right. It is 4 m at most, on a drive of
-  kilometres: less than to the next lane but one, or to the next aisle.
-* Where the truth is interpolated it is uncertain by `TruthAt.error`. A closure that is out of bounds by less than this
-  is not judged, for it may be either; nor is one with an end that the truth does not cover.
+* k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain. 2 b bounds that in
+  turn: a claim to know nothing does not make a wrong closure right.
+* Where the truth is interpolated or noisy it is uncertain by `TruthAt.error`. A closure that is out of bounds by less
+  than this is not judged, for it may be either; nor is one with an end that the truth does not cover.
 
-A closure that is good in metres and claims to be better is over-confident, not false: it is counted beside.
+A closure that is good in metres and claims to be better is over-confident, not false: it is counted beside. A claim
+does not tighten the bounds, since a truth that is off between two visits would make right closures false.
+Of a closure without metres turn and direction are judged: the step between the cameras has its length from the truth.
 """
 
 from __future__ import annotations
@@ -78,79 +78,53 @@ def pose_bounds(*drives: Floats) -> PoseBounds:
     return PoseBounds(min(_WALK_M * float(np.sqrt(length_m)), _MOST_M), length_m=length_m)
 
 
-@dataclass(frozen=True, eq=False)
-class PoseErrors:
-    """C closures against the truth."""
-
-    posed: Bools
-    """(C,) with a pose in metres and a truth at both ends."""
-    error: Floats
-    """(C, 2) rad and m; NaN where not posed."""
-    right: Bools
-    wrong: Bools
-    """Posed ones that are neither right nor wrong are not judged."""
-    overconfident: Bools
-    """(C,) right ones whose error is beyond the claimed covariance (99.9 %), what the truth may be off left out."""
-
-
 def pose_errors(
-    closures: Closures, query: TruthAt, match: TruthAt, bounds: PoseBounds, oriented: bool = True
-) -> PoseErrors:
-    """Judge the closures by the truth at the keyframes of their queries and of their matches; none where the truth is
-    not `oriented`."""
-    finite = np.isfinite(closures.match_from_query).all((1, 2)) & oriented
-    metric = np.array([scale != "none" for scale in closures.scale], bool)
-    posed = finite & metric & query.known[closures.query] & match.known[closures.match]
-    rows = np.flatnonzero(posed)
-    there, here = closures.match[rows], closures.query[rows]
-    true = geometry.between(match.world_from_body[there], query.world_from_body[here])
-    apart = geometry.between(true, closures.match_from_query[rows])
-    errors = [geometry.so3_log(apart[:, :3, :3]), apart[:, :3, 3]]
-    claimed = _covariance(closures.information[rows])
-    # a truth that is turned at the match moves the query by as much at its distance
-    lever = match.error[there, 0] * np.linalg.norm(true[:, :3, 3], axis=1)
-    unsure = np.hypot(query.error[here], match.error[there])
-    unsure[:, 1] = np.hypot(unsure[:, 1], lever)
-    size = np.stack([np.linalg.norm(error, axis=1) for error in errors], axis=1)
-    inside, maybe, honest = (np.ones(len(rows), bool) for _ in range(3))
-    for part, (error, b) in enumerate(zip(errors, bounds.b.tolist(), strict=True)):
-        covariance = claimed[:, 3 * part : 3 * part + 3, 3 * part : 3 * part + 3]
-        inside &= _within(error, covariance, b)
-        left = np.maximum(1.0 - unsure[:, part] / np.maximum(size[:, part], 1e-12), 0.0)
-        maybe &= _within(error * left[:, None], covariance, b)
-        honest &= _normalised(error * left[:, None], covariance) <= _CHI
-    found = PoseErrors(posed, np.full((len(closures), 2), np.nan), *(np.zeros(len(closures), bool) for _ in range(3)))
-    found.error[rows], found.right[rows], found.wrong[rows] = size, inside, ~maybe
-    found.overconfident[rows] = inside & ~honest
-    return found
-
-
-def direction_errors(
     closures: Closures,
     query: TruthAt,
     match: TruthAt,
     bounds: PoseBounds,
-    query_camera: Floats,
-    match_camera: Floats,
-) -> Bools:
-    """(C,) whether turn and direction of a closure without metres are the truth's; cameras are body_from_camera.
+    cameras: tuple[Floats | None, Floats | None] = (None, None),
+) -> tuple[Bools, Bools, Bools, Bools]:
+    """Judge the closures by the truth at the keyframes of their queries and of their matches.
 
-    A direction may be off by the bound of a rotation and by what the bound of a translation is at the true distance.
+    `cameras` are body_from_camera of queries and of matches, the identity where not known. Four of (C,): with a pose
+    and a truth at both ends; right; wrong, which not judged ones are not either; right but further off than the claimed
+    covariance and the truth's error allow (99.9 %).
     """
-    right = np.zeros(len(closures), bool)
-    finite = np.isfinite(closures.match_from_query).all((1, 2))
-    rows = np.flatnonzero(finite & query.known[closures.query] & match.known[closures.match])
-    there, here = match.world_from_body[closures.match[rows]], query.world_from_body[closures.query[rows]]
-    seen = geometry.inverse(match_camera) @ closures.match_from_query[rows] @ query_camera
-    true = geometry.between(there @ match_camera, here @ query_camera)
-    distance = np.linalg.norm(true[:, :3, 3], axis=1)
-    cosine = (seen[:, :3, 3] * true[:, :3, 3]).sum(1) / np.maximum(
-        distance * np.linalg.norm(seen[:, :3, 3], axis=1), 1e-12
-    )
-    allowed = bounds.b[0] + np.arctan2(bounds.b[1], distance)
-    turned = geometry.angle(geometry.between(true, seen))
-    right[rows] = (turned <= bounds.b[0]) & (np.arccos(np.clip(cosine, -1.0, 1.0)) <= allowed)
-    return right
+    posed = np.isfinite(closures.match_from_query).all((1, 2))
+    posed &= query.known[closures.query] & match.known[closures.match]
+    rows = np.flatnonzero(posed)
+    there, here = closures.match[rows], closures.query[rows]
+    true = geometry.between(match.world_from_body[there], query.world_from_body[here])
+    measured, claimed = closures.match_from_query[rows], _covariance(closures.information[rows])
+    directed = np.array([closures.scale[row] == "none" for row in rows], bool)
+    measured[directed] = _at_true_length(measured[directed], true[directed], *cameras)
+    claimed[directed] = 0.0
+    apart = geometry.between(true, measured)
+    # a truth that is turned at the match moves the query by as much at its distance
+    lever = match.error[there, 0] * np.linalg.norm(true[:, :3, 3], axis=1)
+    unsure = np.hypot(query.error[here], match.error[there])
+    unsure[:, 1] = np.hypot(unsure[:, 1], lever)
+    inside, maybe, honest = (np.ones(len(rows), bool) for _ in range(3))
+    for part, error in enumerate((geometry.so3_log(apart[:, :3, :3]), apart[:, :3, 3])):
+        covariance = claimed[:, 3 * part : 3 * part + 3, 3 * part : 3 * part + 3]
+        size = np.maximum(np.linalg.norm(error, axis=1), 1e-12)
+        left = error * np.maximum(1.0 - unsure[:, part] / size, 0.0)[:, None]
+        inside &= _within(error, covariance, bounds.b[part])
+        maybe &= _within(left, covariance, bounds.b[part])
+        honest &= _normalised(left, covariance) <= _CHI
+    right, wrong, overconfident = (np.zeros(len(closures), bool) for _ in range(3))
+    right[rows], wrong[rows], overconfident[rows] = inside, ~maybe, inside & ~honest
+    return posed, right, wrong, overconfident
+
+
+def _at_true_length(measured: Floats, true: Floats, query_camera: Floats | None, match_camera: Floats | None) -> Floats:
+    """Closures (R, 4, 4) whose step from camera to camera is as long as the true one."""
+    into, out = (np.eye(4) if camera is None else camera for camera in (query_camera, match_camera))
+    measured, true = (geometry.inverse(out) @ one @ into for one in (measured, true))
+    length, wanted = (np.linalg.norm(one[:, :3, 3], axis=1, keepdims=True) for one in (measured, true))
+    measured[:, :3, 3] *= wanted / np.maximum(length, 1e-12)
+    return out @ measured @ geometry.inverse(into)
 
 
 def _within(error: Floats, covariance: Floats, b: float) -> Bools:

@@ -2,7 +2,7 @@
 
 Two questions, two criteria. Is the closure's pose right: that of `closure_pose`, for accepted closures. Do its two
 frames show one place: a distance and a heading between the true poses, as in `vplog compare`, for what place
-recognition is asked, candidates and revisits. A closure without metres is held to the second, and to its direction.
+recognition is asked, candidates and revisits.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import TruthError
-from vplog.evaluate.closure_pose import direction_errors, pose_bounds, pose_errors
+from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Closures, Floats, Int32s, Ints, Keyframes
     from vplog.evaluate.body_truth import BodyTruth, TruthAt
-    from vplog.evaluate.closure_pose import PoseBounds, PoseErrors
+    from vplog.evaluate.closure_pose import PoseBounds
 
     Bools = NDArray[np.bool_]
 
@@ -47,7 +47,10 @@ class Judgement:
     """C closures against the truth."""
 
     bounds: PoseBounds
-    pose: PoseErrors
+    posed: Bools
+    """(C,) judged by their pose."""
+    overconfident: Bools
+    """(C,) right ones that are further off than they claim."""
     known: Bools
     """(C,) the truth covers both ends."""
     at_place: Bools
@@ -55,7 +58,7 @@ class Judgement:
     opposite: Bools
     """(C,) the two frames are near each other and look in opposite directions (more than 90 degrees)."""
     right: Bools
-    """(C,) by pose where there is one, else by place, and by direction where there is one."""
+    """(C,) by pose where there is one, else by place."""
     wrong: Bools
     """(C,) neither right nor wrong: not judged, as the truth is missing or too coarse."""
     curves: dict[str, Floats] = field(default_factory=dict)
@@ -82,7 +85,7 @@ class ClosureScore:
     precision: float | None
     """Accepted closures that are right, of those that are right or wrong."""
     by_place: int
-    """Accepted closures without a pose in metres, judged by the place criterion."""
+    """Accepted closures judged by the place criterion, for want of a pose or of a truth with orientations."""
     overconfident: int
     """Right ones that are further off than they claim (99.9 %)."""
     same_place: int
@@ -99,10 +102,7 @@ class ClosureScore:
     directions: int
     """Closures that the solve took without metres (`direction_only`)."""
     directions_true: int
-    """Those of one place whose turn and direction are right."""
-    without_pose: int
-    """Candidates that agree by epipolar geometry alone (`no_calibration`)."""
-    without_pose_same_place: int
+    """Those whose turn and direction are right."""
     average_precision: float | None
     """Area below precision over recall of all candidates by falling score, whatever their verdict, by place."""
     recall_at_full_precision: float | None
@@ -139,15 +139,10 @@ def judge_closures(
     at_place, opposite = np.zeros(len(closures), bool), np.zeros(len(closures), bool)
     at_place[rows] = (distance <= place.distance_m) & (heading <= place.heading_deg)
     opposite[rows] = (distance <= place.distance_m) & (heading > _OPPOSITE_DEG)
-    pose = pose_errors(closures, query, match, bounds, oriented)
-    right = at_place & ~pose.posed
-    directed = np.array([scale == "none" for scale in closures.scale], bool)
-    directed &= np.isfinite(closures.match_from_query).all((1, 2))
-    if oriented and directed.any():
-        known_cameras = [np.eye(4) if camera is None else camera for camera in cameras]
-        right &= ~directed | direction_errors(closures, query, match, bounds, *known_cameras)
-    wrong = known & ~pose.posed & ~right
-    return Judgement(bounds, pose, known, at_place, opposite, right | pose.right, wrong | pose.wrong)
+    posed, right, wrong, overconfident = np.array(pose_errors(closures, query, match, bounds, cameras)) & oriented
+    by_place = known & ~posed
+    right, wrong = right | by_place & at_place, wrong | by_place & ~at_place
+    return Judgement(bounds, posed, overconfident, known, at_place, opposite, right, wrong)
 
 
 def score_closures(
@@ -182,7 +177,7 @@ def score_closures(
     return _score(closures, judged, at.known, revisit, place), judged
 
 
-def count_closures(closures: Closures, judged: Judgement) -> dict[str, Any]:
+def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion) -> dict[str, Any]:
     """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
     accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
     right, wrong = accepted & judged.right, accepted & judged.wrong
@@ -194,17 +189,45 @@ def count_closures(closures: Closures, judged: Judgement) -> dict[str, Any]:
         "accepted_false": int(wrong.sum()),
         "not_judged": int((accepted & ~right & ~wrong).sum()),
         "precision": _share(right.sum(), right.sum() + wrong.sum()),
-        "by_place": int((here & ~judged.pose.posed).sum()),
-        "overconfident": int((accepted & judged.pose.overconfident).sum()),
+        "by_place": int((here & ~judged.posed).sum()),
+        "overconfident": int((accepted & judged.overconfident).sum()),
         "same_place": int((accepted & judged.at_place).sum()),
         "place_precision": _share((accepted & judged.at_place).sum(), here.sum()),
         "opposite": int((accepted & judged.opposite).sum()),
+        "criterion": {**asdict(judged.bounds), **asdict(place)},
     }
 
 
-def criterion_of(bounds: PoseBounds, place: PlaceCriterion) -> dict[str, float]:
-    """The bounds as plain values."""
-    return {**asdict(bounds), **asdict(place)}
+def in_words(closures: dict[str, Any]) -> list[str]:
+    """Sentences of a ClosureScore, or of the counts between two drives with their criterion, as plain values."""
+    share = {
+        name: "none" if closures.get(name) is None else f"{closures[name]:.3f}"
+        for name in ("precision", "place_precision", "recall")
+    }
+    by = closures["criterion"]
+    lines = [
+        f"{closures['accepted']} accepted, {closures['accepted_true']} of them true, {closures['accepted_false']} "
+        f"false (precision {share['precision']}); {closures['opposite']} in the opposite direction",
+        f"true by pose: within {by['translation_m']:.2f} m and {by['rotation_deg']:g} deg of the truth, or the claimed "
+        f"covariance, at most {by['most']:g} times that: {by['length_m']:.0f} m of drive",
+        f"{closures['same_place']} accepted of one place: within {by['distance_m']:g} m and {by['heading_deg']:g} deg "
+        f"between optical axes (precision {share['place_precision']})",
+    ]
+    for name, text in (
+        ("not_judged", "are not judged: the truth has a gap there, or is too coarse to tell"),
+        (
+            "overconfident",
+            "true ones are off by more than they claim (99.9 %): the claim, or the truth between two visits, is off",
+        ),
+        ("by_place", "without a pose, or a truth with orientations, are judged by place"),
+        ("directions", f"without metres, {closures.get('directions_true')} of them true by turn and direction"),
+    ):
+        if closures.get(name):
+            lines.append(f"{closures[name]} {text}")
+    if "revisits" in closures:
+        found = f"{closures['revisits_found']} of {closures['revisits']}"
+        lines.append(f"{found} revisits found (recall {share['recall']})")
+    return lines
 
 
 def _score(
@@ -212,26 +235,22 @@ def _score(
 ) -> ClosureScore:
     accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
     direction = np.array([verdict == Verdict.DIRECTION_ONLY for verdict in closures.verdict], bool) & judged.known
-    unposed = np.array([verdict == Verdict.NO_CALIBRATION for verdict in closures.verdict], bool) & judged.known
     found = np.unique(closures.query[accepted & judged.right])
     found = found[revisit[found]]
     by_score, by_inliers = (_area(judged.curves.get(name), bool(revisit.any())) for name in ("score", "inliers"))
     return ClosureScore(
         keyframes=int(covered.sum()),
         outside=int((~covered).sum()),
-        **count_closures(closures, judged),
+        **count_closures(closures, judged, place),
         revisits=int(revisit.sum()),
         revisits_found=len(found),
         recall=_share(len(found), revisit.sum()),
         directions=int(direction.sum()),
         directions_true=int((direction & judged.right).sum()),
-        without_pose=int(unposed.sum()),
-        without_pose_same_place=int((unposed & judged.at_place).sum()),
         average_precision=by_score[0],
         recall_at_full_precision=by_score[1],
         average_precision_by_inliers=by_inliers[0],
         recall_at_full_precision_by_inliers=by_inliers[1],
-        criterion=criterion_of(judged.bounds, place),
     )
 
 

@@ -60,10 +60,10 @@ class Drift:
 
 @dataclass(frozen=True)
 class Rpe:
-    """Relative pose error over steps of one kind; None where the drive has no such step."""
+    """Relative pose error over steps of one kind; None where the drive has no step."""
 
     delta: str
-    """The step: `1 frame`, or a length of path such as `100 m`."""
+    """The step: `1 frame`."""
     translation_rmse_m: float | None
     translation_mean_m: float | None
     translation_max_m: float | None
@@ -74,11 +74,11 @@ class Rpe:
     """Steps compared."""
 
 
-def associate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = MAX_DIFFERENCE_S) -> tuple[Ints, Ints]:
+def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Ints, Ints]:
     """Rows of the estimate and of the truth that show the same moment.
 
     Each pose of the trajectory with fewer poses (the estimate, of two equal ones) takes the nearest in time of the
-    other, the earlier of two equally near, when it is no further than `max_difference_s`. In float seconds, as evo.
+    other, the earlier of two equally near, when it is within MAX_DIFFERENCE_S. In float seconds, as evo.
     Raises TruthError where there is no such pair or a pose is not finite.
     """
     for name, trajectory in (("estimated trajectory", estimate), ("truth", truth)):
@@ -88,14 +88,14 @@ def associate(estimate: Trajectory, truth: Trajectory, max_difference_s: float =
             raise TruthError(f"The {name} holds a pose that is not finite.")
     estimate_is_longer = len(estimate.stamp_ns) > len(truth.stamp_ns)
     short, long = (truth, estimate) if estimate_is_longer else (estimate, truth)
-    here, there = _nearest(_seconds(short.stamp_ns), _seconds(long.stamp_ns), max_difference_s)
+    here, there = _nearest(_seconds(short.stamp_ns), _seconds(long.stamp_ns))
     if not len(here):
         spans = [
             f"{_seconds(t.stamp_ns[[0, -1]])[0]:.3f}..{_seconds(t.stamp_ns[[0, -1]])[1]:.3f} s"
             for t in (estimate, truth)
         ]
         raise TruthError(
-            f"No stamps of the estimate ({spans[0]}) and the truth ({spans[1]}) are within {max_difference_s} s. "
+            f"No stamps of the estimate ({spans[0]}) and the truth ({spans[1]}) are within {MAX_DIFFERENCE_S} s. "
             "Give the truth of this drive, in the log's clock."
         )
     return (there, here) if estimate_is_longer else (here, there)
@@ -108,23 +108,21 @@ def at_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, bool]
     """
     inside = (truth.stamp_ns >= estimate.stamp_ns[0]) & (truth.stamp_ns <= estimate.stamp_ns[-1])
     at_ns = truth.stamp_ns[inside]
-    rows = np.clip(np.searchsorted(estimate.stamp_ns, at_ns), 1, len(estimate.stamp_ns) - 1)
-    away_ns = np.minimum(np.abs(estimate.stamp_ns[rows] - at_ns), np.abs(estimate.stamp_ns[rows - 1] - at_ns))
-    sparser = len(truth.stamp_ns) < len(estimate.stamp_ns)
-    if not sparser or not len(at_ns) or np.mean(away_ns <= MAX_DIFFERENCE_S * 1e9) > 0.5:
+    near, _ = _nearest(_seconds(at_ns), _seconds(estimate.stamp_ns))
+    if len(truth.stamp_ns) >= len(estimate.stamp_ns) or 2 * len(near) >= len(at_ns):
         return estimate, False
     poses = geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns)
     return Trajectory(at_ns, poses), True
 
 
-def _nearest(short: Floats, long: Floats, max_difference_s: float) -> tuple[Ints, Ints]:
+def _nearest(short: Floats, long: Floats) -> tuple[Ints, Ints]:
     """Rows of both; the comparisons are those of evo.core.sync.matching_time_indices, ties included."""
     after = np.minimum(np.searchsorted(long, short, side="right"), len(long) - 1)
     until = long[after] - short
     since = np.where(after > 0, short - long[np.maximum(after - 1, 0)], np.inf)
-    inside = (short >= long[0] - max_difference_s) & (short <= long[-1] + max_difference_s)
-    take_after = inside & (until <= max_difference_s) & (until < since)
-    take_before = inside & ~take_after & (since <= max_difference_s) & (since <= until)
+    inside = (short >= long[0] - MAX_DIFFERENCE_S) & (short <= long[-1] + MAX_DIFFERENCE_S)
+    take_after = inside & (until <= MAX_DIFFERENCE_S) & (until < since)
+    take_before = inside & ~take_after & (since <= MAX_DIFFERENCE_S) & (since <= until)
     here = np.flatnonzero(take_after | take_before)
     return here, (after - take_before)[here]
 
@@ -134,17 +132,12 @@ def _seconds(stamp_ns: Ints) -> Floats:
     return np.array([stamp / 1_000_000_000 for stamp in stamp_ns.tolist()])
 
 
-def ate(
-    estimate: Trajectory,
-    truth: Trajectory,
-    max_difference_s: float = MAX_DIFFERENCE_S,
-    alignment: str = "se3",
-) -> Ate:
+def ate(estimate: Trajectory, truth: Trajectory, alignment: str = "se3") -> Ate:
     """ATE after an alignment of ALIGNMENTS, by default as `evo_ape tum TRUTH ESTIMATE -a` (Umeyama 1991).
 
     Raises TruthError where fewer than three poses can be compared.
     """
-    here, there = associate(estimate, truth, max_difference_s)
+    here, there = associate(estimate, truth)
     estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
     if alignment != "origin":
         return aligned_error(estimated[:, :3, 3], true[:, :3, 3], alignment)
@@ -169,8 +162,8 @@ def _ate(difference: Floats, alignment: str, scale: float = 1.0) -> Ate:
 def drift(estimate: Trajectory, truth: Trajectory) -> Drift:
     """Mean relative pose error over segments of the truth's path, per 100 m of it.
 
-    As KITTI's kit: segments of 100, 200, .. 800 m, all that fit, from starts 10 m apart, each weighs the same. A drive
-    shorter than 100 m has segments of 1 to 8 times the largest power of ten that fits, from starts at tenths of it.
+    As KITTI's kit: segments of 100, 200, .. 800 m, all that fit, from every tenth pose, each weighs the same. A drive
+    shorter than 100 m has segments of 1 to 8 times the largest power of ten that fits.
     """
     here, there = associate(estimate, truth)
     estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
@@ -178,17 +171,13 @@ def drift(estimate: Trajectory, truth: Trajectory) -> Drift:
     if not path_m[-1] > _LEAST_PATH_M:
         return Drift(None, None, [], 0)
     unit_m = min(100.0, 10.0 ** np.floor(np.log10(path_m[-1])))
-    starts = np.unique(np.searchsorted(path_m, np.arange(0.0, path_m[-1], unit_m / 10.0)))
+    starts = np.arange(0, len(path_m), 10)
     errors, lengths = [], []
     for length_m in unit_m * np.arange(1, 9):
-        last = np.searchsorted(path_m, path_m[starts] + length_m)
+        last = np.searchsorted(path_m, path_m[starts] + length_m, side="right")
         first, last = starts[last < len(path_m)], last[last < len(path_m)]
         if len(first):
-            wrong = geometry.between(
-                geometry.between(true[first], true[last]), geometry.between(estimated[first], estimated[last])
-            )
-            metres = np.linalg.norm(wrong[:, :3, 3], axis=1)
-            errors.append(np.stack([metres, np.degrees(geometry.angle(wrong))], axis=1) * (100.0 / length_m))
+            errors.append(_relative_errors(estimated, true, first, last) * (100.0 / length_m))
             lengths.append(float(length_m))
     if not errors:
         return Drift(None, None, [], 0)
@@ -196,41 +185,22 @@ def drift(estimate: Trajectory, truth: Trajectory) -> Drift:
     return Drift(float(every[:, 0].mean()), float(every[:, 1].mean()), lengths, len(every))
 
 
-def rpe(
-    estimate: Trajectory,
-    truth: Trajectory,
-    delta_m: float | None = None,
-    max_difference_s: float = MAX_DIFFERENCE_S,
-) -> Rpe:
-    """RPE over consecutive steps of one pose, or of `delta_m` of the estimate's path, as evo_rpe's defaults."""
-    here, there = associate(estimate, truth, max_difference_s)
-    estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
-    ends = np.arange(len(here)) if delta_m is None else _path_steps(estimated[:, :3, 3], delta_m)
-    start, stop = ends[:-1], ends[1:]
-    name = "1 frame" if delta_m is None else f"{delta_m:g} m"
-    if not len(start):
-        return Rpe(name, None, None, None, None, None, None, 0)
-    error = geometry.between(
-        geometry.between(true[start], true[stop]), geometry.between(estimated[start], estimated[stop])
-    )
-    metres, degrees = np.linalg.norm(error[:, :3, 3], axis=1), np.degrees(geometry.angle(error))
-    return Rpe(
-        name,
-        *(_rms(metres), float(metres.mean()), float(metres.max())),
-        *(_rms(degrees), float(degrees.mean()), float(degrees.max())),
-        len(metres),
-    )
+def rpe(estimate: Trajectory, truth: Trajectory) -> Rpe:
+    """RPE over steps of one pose, as evo_rpe's defaults."""
+    here, there = associate(estimate, truth)
+    rows = np.arange(len(here))
+    errors = _relative_errors(estimate.world_from_body[here], truth.world_from_body[there], rows[:-1], rows[1:])
+    if not len(errors):
+        return Rpe("1 frame", None, None, None, None, None, None, 0)
+    metres, degrees = ((_rms(error), float(error.mean()), float(error.max())) for error in errors.T)
+    return Rpe("1 frame", *metres, *degrees, len(errors))
 
 
-def _path_steps(positions: Floats, delta_m: float) -> Ints:
-    """Rows where `delta_m` of path are complete, counted anew from each such row; row 0 is the first."""
-    rows, travelled = [0], 0.0
-    for row, step in enumerate(np.linalg.norm(np.diff(positions, axis=0), axis=1).tolist(), start=1):
-        travelled += step
-        if travelled >= delta_m:
-            rows.append(row)
-            travelled = 0.0
-    return np.array(rows)
+def _relative_errors(estimated: Floats, true: Floats, first: Ints, last: Ints) -> Floats:
+    """(S, 2) m and degrees by which the steps from rows `first` to rows `last` (S,) differ."""
+    steps = (geometry.between(poses[first], poses[last]) for poses in (true, estimated))
+    wrong = geometry.between(*steps)
+    return np.stack([np.linalg.norm(wrong[:, :3, 3], axis=1), np.degrees(geometry.angle(wrong))], axis=1)
 
 
 def _rms(error: Floats) -> float:

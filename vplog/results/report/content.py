@@ -20,6 +20,8 @@ class Judged:
     """Of the truth, as it was given."""
     scores: dict[str, Any]
     """What `vplog evaluate --json` says."""
+    words: list[str] = field(default_factory=list)
+    """Sentences on the closures and their criteria."""
     path: Floats | None = None
     """(T, 3) m, the truth in the frame of the trajectory; None where the truth is the log's own GPS."""
     true: NDArray[np.bool_] | None = None

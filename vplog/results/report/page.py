@@ -121,29 +121,12 @@ def _truth(content: Content) -> str:
     heads = ["", f"ATE rmse m ({aligned})", "ATE max m", "RPE m a frame", "RPE degrees a frame"]
     heads += ["drift m per 100 m", "drift degrees per 100 m"]
     said = [f"<h2>Against the truth</h2>\n<p class='quiet'>{text(judged.name)}</p>{table(heads, rows)}"]
-    closures = part(judged.scores, "closures")
-    if closures:
-        said.append(_judged(closures))
+    said += [f"<p>{text(line)}</p>" for line in judged.words]
     if judged.curves:
         names = {"after": "candidates by score", "other": "candidates by inliers"}
         drawn = list(zip(names, judged.curves.values(), strict=False))
         said.append(f'<h3>Precision and recall</h3>{key(names, names)}<div class="charts">{charts.curves(drawn)}</div>')
     return "".join(said)
-
-
-def _judged(closures: dict[str, Any]) -> str:
-    """How many closures are right, and by which criteria."""
-    by = part(closures, "criterion")
-    return (
-        f"<p>{figure(closures.get('accepted'))} closures accepted, {figure(closures.get('accepted_true'))} of them "
-        f"true, {figure(closures.get('accepted_false'))} false (precision {figure(closures.get('precision'), 3)}), "
-        f"{figure(closures.get('not_judged'))} not judged; {figure(closures.get('revisits_found'))} of "
-        f"{figure(closures.get('revisits'))} revisits found (recall {figure(closures.get('recall'), 3)}).</p>"
-        f"<p class='quiet'>True by pose: within {figure(by.get('translation_m'), 2)} m and "
-        f"{figure(by.get('rotation_deg'), 1)} degrees of the truth, or the claimed covariance, at most "
-        f"{figure(by.get('most'), 1)} times that. One place: frames within {figure(by.get('distance_m'), 1)} m and "
-        f"{figure(by.get('heading_deg'), 1)} degrees between their optical axes; the curves are by place.</p>"
-    )
 
 
 def _costs(content: Content) -> str:
