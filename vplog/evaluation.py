@@ -13,10 +13,11 @@ from vplog.evaluate import closures, gps, residuals, trajectory
 from vplog.evaluate.body_truth import body_truth
 from vplog.evaluate.closure_pose import pose_bounds
 from vplog.evaluate.truth import read_truth
+from vplog.folders import is_below
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.record import reopened
 from vplog.results import mcap_read, run_record, tables
-from vplog.urls import without_secrets
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -90,7 +91,7 @@ def evaluate_poses(
     figures = _trajectories(before, after, known, of_body, options)
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
     found = {
-        "truth": without_secrets(truth),
+        "truth": shown(truth),
         "truth_is": _about(of_body, options),
         **figures,
         "closures": asdict(score),
@@ -141,8 +142,11 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     """A joint run."""
     members = []
     for found in _recorded(record, folder, list, "maps"):
+        names = _recorded(found, folder, list, "drives")
+        if not all(map(is_below, names)):
+            raise ResultError(f"{folder}/run.json names drives outside its folder. Run `vplog run` again.")
         file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
-        members.append({name: folder / name / file for name in _recorded(found, folder, list, "drives")})
+        members.append({name: folder / name / file for name in names})
     folders = {name: folder / name for drives in members for name in drives}
     return evaluate_together(folder, folders, members, [folder / "joins.parquet"], truth, options)
 
@@ -182,7 +186,7 @@ def evaluate_together(
             own = [{"drive": name, **drives[name].record} for name in members if name in drives]
             found.append({"drives": own, "ate_after": asdict(trajectory.ate(whole, known, alignment=options.align))})
     between = [pair for path in joins for pair in _joins(path, folders, drives, options.place)]
-    return {"truth": without_secrets(truth), "maps": found, "joins": between, "uncovered": uncovered}
+    return {"truth": shown(truth), "maps": found, "joins": between, "uncovered": uncovered}
 
 
 def _joins(
