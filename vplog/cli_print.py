@@ -165,8 +165,9 @@ def print_evaluation(found: dict[str, Any]) -> None:
         if pair["accepted"] or pair["not_judged"]:
             print(f"  {pair['query_drive']} to {pair['match_drive']}:")
             _print_closures(pair, "    ")
-    for drive, why in found.get("uncovered", {}).items():
-        say(f"warning: {drive} is left out: {why}")
+    uncovered = [f"{drive} is left out: {why}" for drive, why in found.get("uncovered", {}).items()]
+    for warning in [*uncovered, *found.get("warnings", ())] if "maps" in found else ():
+        say(f"warning: {warning}")
     if "maps" in found:
         return
     for line in _truth_notes(found):
