@@ -252,7 +252,7 @@ def test_a_pair_without_its_log_is_left_out_and_tried_again(copy: Path) -> None:
     told = joined(copy)
     assert told["components"] == []
     [warning] = told["warnings"]
-    assert warning.startswith("before in after was left out. The log of before, /gone.mcap, is not there")
+    assert warning.startswith("before in after was left out. The log of before /gone.mcap is not there any more")
     run_record.write_run_json(record, about)
     told = joined(copy)
     assert (told["searched"], told["pairs_computed"], told["warnings"]) == (["before"], 1, [])
