@@ -339,7 +339,9 @@ def test_an_interrupted_comparison_leaves_the_one_before(
         assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
-def test_libraries_of_every_origin(verb: Verb, walks: tuple[Path, Path], tmp_path: Path) -> None:
+def test_libraries_of_every_origin(
+    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The map's own frames are the default; a drive is drawn from in the same way; a saved library is taken whole."""
     day, dusk = walks
     saved = tmp_path / "library"
@@ -358,6 +360,9 @@ def test_libraries_of_every_origin(verb: Verb, walks: tuple[Path, Path], tmp_pat
     few = verb(*arguments, "--library-size", 50).json
     assert few["library"]["size"] == FRAMES
     assert any("16 images instead of 50" in warning for warning in few["warnings"])
+    (saved / "features.parquet").write_bytes(b"damaged")
+    monkeypatch.setattr(compare, "extract_walk", None)  # which takes minutes, so a library is read before
+    assert str(saved) in verb(*arguments, "--library", saved).error
 
 
 def test_frames_without_truth_are_left_out(verb: Verb, drive: Drive, tmp_path: Path) -> None:

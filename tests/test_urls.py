@@ -167,6 +167,14 @@ def test_urls_are_cut_and_paths_are_not() -> None:
     assert shown("https://h:80/a%20b.mcap?sig=1#x") == "https://h:80/a%20b.mcap"
     assert shown("http://h/a b.mcap?sig=a b") == "http://h/a b.mcap"
     assert shown("https://u:p@s@h/a@2.mcap") == "https://h/a@2.mcap"
+    assert shown("http:/h/a?sig=1") == "http:/h/a"
+    assert shown("https://h:80/a@b;c?sig='1'#\"2\"") == "https://h:80/a@b;c"
+    assert shown("https://h/a;jsessionid=1") == "https://h/a"
+    for password in ("p/1", "p?1", "p#1", "p@1", "p:1"):
+        assert shown(f"ftp://u:{password}@[::1]:80/a") == "ftp://[::1]:80/a"
+    assert (
+        without_secrets('"https://h/a?b="c" is 404, <https://h/d?e> too') == '"https://h/a" is 404, <https://h/d> too'
+    )
     assert shown("/logs/a#1?.mcap") == "/logs/a#1?.mcap"
     assert without_secrets("Cannot read https://u:p@h/a?b=c, or s3://k/d.") == "Cannot read https://h/a or s3://k/d."
     assert without_secrets("(/logs/a?b) and a: b?c") == "(/logs/a?b) and a: b?c"

@@ -159,12 +159,13 @@ def _extract_all(
         store = stack.enter_context(FeatureStore(scratch / f"{role}.features"))
         return extract_walk(log, pipeline.features, store, frames, chosen, threads, progress)
 
+    saved = load_references(library) if library is not None and _is_saved(library) else None
     chosen = known.map_frames[choose(other.stamps()[known.map_frames], wanted)] if library is None else None
     map_walk = walk_of(other, "map", known.map_frames, chosen)
     query_walk = map_walk if query is other else walk_of(query, "query", known.query_frames)
     warnings = list(dict.fromkeys(map_walk.warnings + query_walk.warnings))
-    if library is not None and _is_saved(library):
-        return map_walk, query_walk, load_references(library), warnings
+    if saved is not None:
+        return map_walk, query_walk, saved, warnings
     references = map_walk.references
     if library is not None:
         log = logs.open(library, topics)

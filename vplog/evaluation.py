@@ -14,10 +14,11 @@ from vplog.evaluate.body_truth import body_truth
 from vplog.evaluate.closure_pose import pose_bounds
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 from vplog.evaluate.truth import read_truth
+from vplog.folders import is_below
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.record import reopened
 from vplog.results import mcap_read, run_record, tables
-from vplog.urls import without_secrets
+from vplog.urls import shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -89,7 +90,7 @@ def evaluate_poses(
     of_body = body_truth(known, before, camera)
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
     found = {
-        "truth": without_secrets(truth),
+        "truth": shown(truth),
         "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
         **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
@@ -135,6 +136,8 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     maps = []
     for found in _recorded(record, folder, list, "maps"):
         names = _recorded(found, folder, list, "drives")
+        if not all(map(is_below, names)):
+            raise ResultError(f"{folder}/run.json names drives outside its folder. Run `vplog run` again.")
         for name in names:
             try:
                 own = run_record.read_finished_run(folder / name)
@@ -153,7 +156,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     if not drives:
         raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
     joins = _joins(folder, drives, options.place)
-    return {"truth": without_secrets(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
+    return {"truth": shown(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
 
 
 def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:

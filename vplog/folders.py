@@ -48,6 +48,11 @@ def regular_files(folder: Path) -> Iterator[str]:
             )
 
 
+def is_below(name: object) -> bool:
+    """Whether a name that a record has is that of something below its folder."""
+    return isinstance(name, str) and not {"", ".", ".."} & {*name.split("/")} and not {"\\", "\0"} & {*name}
+
+
 def check_regular(folder: Path, record: str = "") -> None:
     """Raises ResultError where something in a folder or below it is neither a regular file nor a folder; with the name
     of a record only where that is there: what is no map may be a home folder."""

@@ -11,6 +11,7 @@ from vplog import logs
 from vplog.data import Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.extract import extract_frames
+from vplog.folders import check_regular
 from vplog.places.coverage import (
     STRONGEST,
     Coverage,
@@ -152,6 +153,7 @@ def _library_in(out: Path) -> list[str]:
     """The files of a library in a folder that a new one may replace. Raises SettingsError where it may not."""
     if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "library.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a library. Choose another with -o.")
+    check_regular(out, "library.json")
     if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
         raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")
     return ["library.json", "features.parquet", "references.parquet"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import ResultError
-from vplog.folders import regular_files
+from vplog.folders import is_below, regular_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -91,9 +91,10 @@ def put_in_place(part: Path, path: Path) -> None:
 
 def sync_all(path: Path) -> None:
     """Have a file, or a folder with all that is in it, on the disk. Raises OSError."""
-    for file in [*sorted(path.rglob("*")), path]:
-        if file.is_dir() or file.is_file():
-            sync(file)
+    names = list(regular_files(path))
+    below = {*names, *(str(above) for name in names for above in PurePosixPath(name).parents), "."}
+    for name in sorted(below):
+        sync(path / name)
 
 
 def sync(path: Path) -> None:
@@ -124,7 +125,7 @@ def pieces(path: Path) -> Iterator[Bytes]:
 
 def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
     """A file of a folder from its pieces. Raises ResultError."""
-    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+    if not is_below(name):
         raise ResultError(f"A worker gave back a file named {name!r}, which is not inside its folder.")
     path = folder / name
     try:

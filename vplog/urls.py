@@ -9,15 +9,23 @@ from __future__ import annotations
 
 import re
 
-_URL = re.compile(r"""\b([a-z][a-z0-9+.-]*:/{1,3})([^\s/?#"<>]*@)?([^\s?#"<>]*)([?#][^\s"<>]*)?""", re.IGNORECASE)
-"""Scheme, user and password, host and path, query and fragment. A URL that was taken for a path has one slash."""
+_USER = r"""\b([a-z][a-z0-9+.-]*:/{1,3})(?:[^\s/?#"<>]*@|[^\s/?#"<>@:[]+:(?!\d*[/?#])[^\s"<>]*@)?"""
+"""Scheme; user and password, which may have any character but blanks. A URL taken for a path has one slash."""
+_QUERY = r"[?#]|;[\w.-]+="
+"""Where a query, a fragment or the parameters of a path (`;jsessionid=`) begin."""
+_URL = re.compile(
+    rf"""{_USER}((?:(?!{_QUERY})[^\s"<>])*)(?:(?:{_QUERY})(?:[^\s"<>]|["<>](?=[^\s.,:;<>)\]}}]))*)?""", re.IGNORECASE
+)
+"""In a sentence, where a quotation mark ends it but for one within the query."""
 
 
 def shown(url: str) -> str:
     """One URL, whatever characters it has, without its secrets; a path as it is."""
-    return without_secrets(re.split("[?#]", url, maxsplit=1)[0]) if "://" in url else url
+    if not re.match(r"[a-z][a-z0-9+.-]+:/", url, re.IGNORECASE):
+        return url
+    return re.split(_QUERY, re.sub(_USER, r"\1", url, count=1, flags=re.IGNORECASE), maxsplit=1)[0]
 
 
 def without_secrets(text: str) -> str:
     """A sentence that may name URLs, without their secrets."""
-    return _URL.sub(lambda found: found[1] + found[3], text)
+    return _URL.sub(r"\1\2", text)

@@ -13,6 +13,7 @@ import pytest
 from vplog.maps.index import update_index
 from vplog.maps.store import Store, folder_name
 from vplog.places.bobb import BobbSettings
+from vplog.results import run_record
 
 from ..benchmarks.scale import made_up_library, write_drive
 from ..benchmarks.search import make_places
@@ -73,7 +74,8 @@ def check(said: Said) -> None:
 def test_records_that_say_something_else_are_one_line(root: Path, verb: Verb, tmp_path: Path, name: str) -> None:
     here = tmp_path / "map"
     shutil.copytree(root, here)
-    tree = json.loads((here / name).read_text())
+    tree, about = run_record.read_run_json(here / name), here / "runs" / "drive=walk" / "drive.json"
+    run_record.write_run_json(about, {**run_record.read_run_json(about), "files": {}})  # without hashes
     if name.endswith("drive.json"):
         tree.pop("earth", None)  # which run.json says then
     every = [*damaged(tree), *damaged({**tree, "earth": {"bounds": [1, 2, 3, 4]}})][::5]  # of 13 of each

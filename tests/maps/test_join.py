@@ -54,7 +54,7 @@ def put(root: Path, joint: Path, *names: str, **changes: Any) -> None:
             shutil.copytree(joint / name, made)
             cache = root / ".cache" / f"drive={name}"
             cache.parent.mkdir(exist_ok=True)
-            (made / ".cache").rename(cache)
+            shutil.copytree(joint / ".cache" / name, cache)
             about = {"drive": name, "log": str(log), "key": name, "library": digest, "inputs": hash_inputs(log)}
             run_record.write_run_json(made / "drive.json", {**about, **changes})
             map_store.publish(store, name, made)
@@ -190,13 +190,37 @@ def test_a_drive_that_is_removed_is_out_of_the_joint_graph(copy: Path) -> None:
 def test_a_drive_that_was_replaced_is_said(copy: Path, verb: Callable[..., Said]) -> None:
     assert "replaced" not in verb("map", "info", copy).err
     record = copy / "runs" / "drive=after" / "drive.json"
-    run_record.write_run_json(record, {**json.loads(record.read_text()), "key": "of another log"})
+    run_record.write_run_json(record, {**run_record.read_run_json(record), "key": "of another log"})
     assert "after was replaced since" in verb("map", "info", copy).err
     path = copy / "joint.json"
-    joint = json.loads(path.read_text())
+    joint = run_record.read_run_json(path)
     joint["groups"][0]["components"] = [{"folder": "x", "drives": 3}]
     path.write_text(json.dumps(joint))
     assert "joint.json is damaged" in verb("map", "info", copy).err
+
+
+def test_a_damaged_drive_is_named_by_the_evaluation(copy: Path, drive: Drive, verb: Callable[..., Said]) -> None:
+    (copy / "runs" / "drive=after" / "drive.json").write_text("{")
+    said = verb("evaluate", copy, "--truth", drive.truth, "--json")
+    assert [one["drive"] for found in said.json["maps"] for one in found["drives"]] == ["before", "drive"]
+    assert "after is damaged and left out" in said.json["warnings"][0]
+    assert "after is damaged and left out" in verb("evaluate", copy, "--truth", drive.truth).err
+
+
+@pytest.mark.parametrize("name", ["..", "/etc", "a/../../b", "", 7])
+def test_a_record_that_names_other_folders_is_refused(
+    copy: Path, joint: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path, name: str
+) -> None:
+    record = run_record.read_run_json(copy / "joint.json")
+    record["groups"][0]["components"][0]["folder"] = name
+    run_record.write_run_json(copy / "joint.json", record)
+    assert "joint.json is damaged" in verb("evaluate", copy, "--truth", drive.truth).error
+    run = tmp_path / "run"
+    run.mkdir()
+    record = run_record.read_run_json(joint / "run.json")
+    record["maps"][0]["drives"] = [name]
+    run_record.write_run_json(run / "run.json", record)
+    assert f"{run}/run.json names drives outside its folder" in verb("evaluate", run, "--truth", drive.truth).error
 
 
 def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
@@ -223,12 +247,12 @@ def test_a_pair_without_its_log_is_left_out_and_tried_again(copy: Path) -> None:
     for path in copy.glob("joins/*/features.parquet"):
         path.unlink()
     record = copy / "runs" / "drive=before" / "drive.json"
-    about = json.loads(record.read_text())
+    about = run_record.read_run_json(record)
     run_record.write_run_json(record, {**about, "log": "/gone.mcap"})
     told = joined(copy)
     assert told["components"] == []
     [warning] = told["warnings"]
-    assert warning.startswith("before in after was left out. The log of before, /gone.mcap, is not there")
+    assert warning.startswith("before in after was left out. The log of before /gone.mcap is not there any more")
     run_record.write_run_json(record, about)
     told = joined(copy)
     assert (told["searched"], told["pairs_computed"], told["warnings"]) == (["before"], 1, [])
@@ -242,7 +266,7 @@ def test_drives_with_gps_are_kept_apart(joint: Path, tmp_path: Path) -> None:
     keyframes, poses = tables.read_keyframes(path)
     settings = load_pipeline("default", [*QUICK, "gps.use=true"]).model_dump(mode="json")
     tables.write_keyframes(path, keyframes, poses, tables.TableMetadata(settings, ""))
-    record = json.loads(path.with_name("drive.json").read_text())
+    record = run_record.read_run_json(path.with_name("drive.json"))
     run_record.write_run_json(path.with_name("drive.json"), {**record, "files": {}})
     told = joined(tmp_path / "map")
     assert told["alone"] == ["after"]

@@ -17,7 +17,7 @@ from vplog.maps.keys import drive_names
 from vplog.maps.query import search
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
-from vplog.results import tables
+from vplog.results import run_record, tables
 
 from .runs import put_rows
 
@@ -130,7 +130,7 @@ def test_places_of_another_library_are_refused(root: Path, finished: Path, drive
 def test_what_is_no_map_is_one_line(root: Path, drive: Drive, verb: Verb, tmp_path: Path) -> None:
     assert "is not a map" in verb("map", "info", tmp_path).error
     assert "is not a map" in verb("map", "query", tmp_path / "gone", drive.log).error
-    record = json.loads((root / "map.json").read_text())
+    record = run_record.read_run_json(root / "map.json")
     for change, why in (({"format": 99}, "version 99"), ({"library": "../.."}, "no sound library")):
         (root / "map.json").write_text(json.dumps({**record, **change}))
         assert why in verb("map", "info", root).error

@@ -18,7 +18,7 @@ import pytest
 from vplog import geodesy, geometry
 from vplog.data import Gps
 from vplog.maps import store as map_store
-from vplog.results import tables
+from vplog.results import run_record, tables
 from vplog.results.places_map import read_map
 
 from .runs import KIND, LIBRARY, OTHER_LIBRARY, PLACES, make_map, put, put_library
@@ -214,7 +214,7 @@ def test_an_export_goes_from_server_to_map(root: Path, verb: Verb, tmp_path: Pat
 
 def test_a_drive_of_an_older_map_is_exported_with_its_place_on_earth(root: Path, verb: Verb, tmp_path: Path) -> None:
     record = root / "runs" / "drive=near" / "drive.json"
-    about = json.loads(record.read_text())
+    about = run_record.read_run_json(record)
     record.write_text(json.dumps({name: about[name] for name in about if name != "earth"}))
     out, other = tmp_path / "out.parquet", make_map(tmp_path / "other", {"x": 7})
     verb("map", "export", root, "--format", "geoparquet", "-o", out)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +11,15 @@ import pytest
 
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
+from vplog.errors import ResultError
 from vplog.maps import store as map_store
 from vplog.maps.damage import damaged_files, left_out, without_damaged
 from vplog.maps.index import update_index
+from vplog.maps.joint_record import read_joint, write_joint
+from vplog.maps.layout import drive_record
 from vplog.maps.store import Store, folder_name
 from vplog.places.bobb import BobbSettings
+from vplog.results import run_record
 
 from .runs import PLACES, make_map
 
@@ -47,18 +50,13 @@ def cut(path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
 
 
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
 def empty(path: Path) -> None:
     path.unlink()
     path.touch()
 
 
 DAMAGES: dict[str, Callable[[Path], Any]] = {
-    "flip": flip, "cut": cut, "gone": lambda path: path.unlink(), "pipe": pipe, "empty": empty,
+    "flip": flip, "cut": cut, "gone": lambda path: path.unlink(), "empty": empty,
 }  # fmt: skip
 
 
@@ -105,7 +103,7 @@ def test_the_others_are_answered_with(root: Path, verb: Verb, tmp_path: Path, na
 def test_a_damaged_record_leaves_its_drive_out(root: Path, verb: Verb, tmp_path: Path) -> None:
     here = copied(root, tmp_path / "map")
     path = here / "runs" / folder_name("walk") / "drive.json"
-    for bad in ("{", "[]", "{}", json.dumps({**json.loads(path.read_text()), "inputs": 7})):
+    for bad in ("{", "[]", "{}", json.dumps({**run_record.read_run_json(path), "inputs": 7})):
         path.write_text(bad)
         said = verb("map", "info", here, "--json")
         assert [one["drive"] for one in said.json["drives"]] == ["ride", "sail"]
@@ -157,6 +155,36 @@ def test_every_flip_in_a_run_folder_is_found_by_the_check(root: Path, verb: Verb
     assert "Traceback" not in said.err
 
 
+@pytest.mark.parametrize("name", ["map.json", "drive.json", "run.json", "joint.json"])
+def test_no_flip_in_a_record_is_silent(root: Path, tmp_path: Path, name: str) -> None:
+    """A drive whose record is damaged is left out; a damaged map.json or joint.json is one line."""
+    here = copied(root, tmp_path / "map")
+    write_joint(here, {"groups": [], "alone": sorted(DRIVES), "apart": {}, "keys": {}})
+    [path] = here.glob(name) if name in ("map.json", "joint.json") else here.glob(f"runs/drive=walk/{name}")
+
+    def read() -> tuple[Any, ...]:
+        with map_store.reading(here) as store:
+            drives = {drive: store.read(drive, record_of) for drive in store.drives()}
+            return store.head(), read_joint(here).get("alone"), drives
+
+    def record_of(folder: Path) -> Any:
+        record = drive_record(folder)
+        named = {name: record.get(name) for name in ("drive", "log", "key", "library", "inputs", "earth", "files")}
+        return named, run_record.read_run_json(folder / "run.json")
+
+    whole, wanted = path.read_bytes(), read()
+    left_out = (*wanted[:2], {drive: about for drive, about in wanted[2].items() if drive != "walk"})
+    for seed in range(200):
+        flip(path, seed)
+        try:
+            found = read()
+            assert found in (wanted, left_out)
+        except ResultError as error:
+            assert str(path) in str(error)
+            assert "\n" not in str(error)
+        path.write_bytes(whole)
+
+
 def test_an_index_is_made_of_the_sound_drives(tmp_path: Path) -> None:
     settings = BobbSettings(references=4, windows_along=2)
     state, store = made_up_library(settings, 30), Store(tmp_path)
@@ -178,7 +206,7 @@ def test_a_newer_map_is_refused_in_one_line(root: Path, verb: Verb, tmp_path: Pa
     """No drive of it is taken for damaged."""
     for name in ("map.json", f"runs/{folder_name('walk')}/drive.json"):
         here = copied(root, tmp_path / name.replace("/", "-"))
-        record = json.loads((here / name).read_text())
+        record = run_record.read_run_json(here / name)
         (here / name).write_text(json.dumps({**record, "format": 2, "vplog": "9.8"}))
         for arguments in (
             ("info", here),
@@ -193,7 +221,7 @@ def test_a_map_without_hashes_is_read(root: Path, verb: Verb, tmp_path: Path) ->
     """As an older vplog wrote it."""
     here = copied(root, tmp_path / "map")
     for path in here.glob("runs/*/drive.json"):
-        record = json.loads(path.read_text())
+        record = run_record.read_run_json(path)
         path.write_text(json.dumps({key: value for key, value in record.items() if key not in ("files", "format")}))
     assert [one["drive"] for one in verb("map", "info", here, "--check", "--json").json["drives"]] == sorted(DRIVES)
     (here / "runs" / folder_name("walk") / "descriptors.parquet").unlink()

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vplog.errors import LibraryError, NewerError, ResultError
+from vplog.folders import is_below
 from vplog.maps.layout import AT_HAND, drive_record, sha256_of
 
 if TYPE_CHECKING:
@@ -57,29 +58,22 @@ def left_out(store: Store) -> list[str]:
 
 
 def check_at_hand(folder: Path, record: dict[str, Any]) -> None:
-    """Raises ResultError where a table or run.json of a drive is missing or has another length than drive.json has; of
-    a drive whose drive.json has no lengths, as an older vplog wrote it, that is found when it is read."""
-    for wrong in _wrong_lengths(folder, record, AT_HAND if _files(record) else ()):
-        raise ResultError(wrong)
+    """Raises ResultError where run.json or a table of a drive is missing or, tables by their length, not as drive.json
+    has it; of a drive whose drive.json has no lengths, as an older vplog wrote it, that is found when it is read."""
+    files = _files(record)
+    for name in AT_HAND if files else ():
+        if wrong := _difference(folder / name, files.get(name, {}), hashed=name == "run.json"):
+            raise ResultError(wrong)
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """A line for each file of a run folder in a map that does not have the sha256 that drive.json names."""
+    """A line for each file of a run folder in a map that does not have the length and sha256 that drive.json names."""
     try:
-        record = drive_record(folder)
+        files = _files(drive_record(folder))
     except ResultError as error:
         return [str(error)]
-    files, lines = _files(record), []
-    for name in sorted({*AT_HAND, *files}):
-        wrong = list(_wrong_lengths(folder, record, [name]))
-        if not wrong and name in files:
-            try:
-                if sha256_of(folder / name) != files[name].get("sha256"):
-                    wrong = [f"{folder / name} does not have the sha256 that drive.json names."]
-            except OSError as error:
-                wrong = [f"{folder / name} cannot be read: {error.strerror or error}."]
-        lines += wrong
-    return lines
+    lines = (_difference(folder / name, files.get(name, {})) for name in sorted({*AT_HAND, *files}))
+    return [line for line in lines if line]
 
 
 def hashes_of(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -90,21 +84,22 @@ def hashes_of(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
         raise ResultError(f"Cannot read {error.filename or folder}: {error.strerror or error}.") from None
 
 
-def _wrong_lengths(folder: Path, record: dict[str, Any], names: Iterable[str]) -> Iterator[str]:
-    files = _files(record)
-    for name in names:
-        path, wanted = folder / name, files.get(name, {}).get("bytes")
+def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:
+    """How a file differs from what drive.json says of it; empty where it does not."""
+    try:
         if not path.is_file():
-            yield f"{path} is not there." if not path.exists() else f"{path} is not a file."
-        elif wanted is not None and path.stat().st_size != wanted:
-            yield f"{path} has {path.stat().st_size} bytes instead of {wanted}."
+            return f"{path} is not a file." if path.exists() else f"{path} is not there."
+        if wanted.get("bytes") not in (None, size := path.stat().st_size):
+            return f"{path} has {size} bytes instead of {wanted['bytes']}."
+        if hashed and wanted.get("sha256") not in (None, sha256_of(path)):
+            return f"{path} does not have the sha256 that drive.json names."
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror or error}."
+    return ""
 
 
 def _files(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Of each file its length and sha256, by drive.json; empty where an older vplog wrote it."""
     files = record.get("files")
-    sound = isinstance(files, dict) and all(
-        isinstance(about, dict) and not name.startswith("/") and ".." not in name.split("/")
-        for name, about in files.items()
-    )
+    sound = isinstance(files, dict) and all(isinstance(files[name], dict) and is_below(name) for name in files)
     return files if isinstance(files, dict) and sound else {}

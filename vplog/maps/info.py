@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
+from vplog.folders import regular_files
 from vplog.maps import keys
 from vplog.maps import store as map_store
 from vplog.maps.damage import damaged_files, left_out, without_damaged
@@ -45,10 +46,8 @@ def _damaged_files(store: Store) -> list[str]:
     folders = sorted(path.parent for path in store.root.glob("runs/drive=*/drive.json"))
     if store.mirror is None:
         lines = [line for folder in folders for line in damaged_files(folder)]
-        tables = (
-            path for path in sorted(store.root.rglob("*.parquet")) if path.relative_to(store.root).parts[0] != "runs"
-        )
-        return [*lines, *(line for path in tables for line in _damaged_table(path))]
+        names = (name for name in regular_files(store.root) if name.endswith(".parquet") and name[:5] != "runs/")
+        return [*lines, *(line for name in names for line in _damaged_table(store.root / name))]
     wrong = []
     for drive in store.mirror.manifests:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.folders import is_below
 from vplog.parquet_bounds import check_version
 from vplog.results import run_record
 
@@ -45,7 +46,7 @@ def read_joint(root: Path) -> dict[str, Any]:
 
 def _is_component(told: Any) -> bool:
     drives = told.get("drives") if isinstance(told, dict) else None
-    return isinstance(drives, list) and all(isinstance(one, str) for one in [told.get("folder"), *drives])
+    return isinstance(drives, list) and is_below(told.get("folder")) and all(isinstance(one, str) for one in drives)
 
 
 def components_of(root: Path) -> list[dict[str, Any]]:
@@ -75,4 +76,4 @@ def write_joint(root: Path, record: dict[str, Any]) -> None:
             return
     except ResultError:  # damaged
         pass
-    run_record.write_run_json(path, record)
+    run_record.write_run_json(path, record, checksum=True)

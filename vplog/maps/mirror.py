@@ -27,6 +27,7 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
 
 from vplog.errors import ResultError
+from vplog.folders import is_below
 from vplog.maps import objects
 from vplog.maps.layout import ADD_AGAIN, HASH, folder_name, sound_record
 from vplog.remote import reason
@@ -124,7 +125,7 @@ class Mirror:
                 names = sorted(objects.files_below(place))
                 if "library.json" not in names:  # it is sent last
                     return
-                for name in filter(_sound, names):
+                for name in filter(is_below, names):
                     (part / name).parent.mkdir(parents=True, exist_ok=True)
                     files[name] = objects.fetch(place / name, part / name, _LIBRARY_FILE_BYTES)
             if self.cache is not None:
@@ -243,7 +244,7 @@ def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
         sound = all(_GENERATION.fullmatch(one) for one in generations) and all(
             isinstance(one["bytes"], int)
             and isinstance(one.get("rows", 0), int)
-            and _sound(name)
+            and is_below(name)
             and HASH.fullmatch(one["sha256"])
             for name, one in files.items()
         )
@@ -252,9 +253,3 @@ def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
     if not sound:
         raise ResultError(f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}")
     return manifest
-
-
-def _sound(name: str) -> bool:
-    """Whether a name from a manifest stays below the folder that it is written to."""
-    parts = PurePosixPath(name).parts
-    return bool(parts) and not name.startswith("/") and ".." not in parts and "\\" not in name

@@ -161,7 +161,7 @@ def put_sight(store: Store, member: Member, pipeline: Pipeline, sight: Sight) ->
     folder = folder_of(store, member.drive)
     _make(folder)
     record = {"drive": member.drive, **asdict(sight), "made_from": _sight_key(member, pipeline)}
-    run_record.write_run_json(folder / "camera.json", record)
+    run_record.write_run_json(folder / "camera.json", record, checksum=True)
 
 
 def _sight_key(member: Member, pipeline: Pipeline) -> str:
@@ -213,7 +213,7 @@ def read_joins(store: Store, drive: str) -> Joins | None:
 def put_joins(store: Store, drive: str, joins: Joins) -> None:
     folder = folder_of(store, drive)
     _make(folder)
-    run_record.write_run_json(folder / "joins.json", {"drive": drive, **asdict(joins)})
+    run_record.write_run_json(folder / "joins.json", {"drive": drive, **asdict(joins)}, checksum=True)
 
 
 def forget(store: Store, drive: str, kept: set[str]) -> None:

@@ -268,7 +268,7 @@ class Store:
         path = self.root / name
         if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
             return
-        run_record.write_run_json(path, record)
+        run_record.write_run_json(path, record, checksum=name != "failures.json")  # whose keys are drives
         if self.mirror is not None:
             from vplog.maps.sending import write_json
 
@@ -346,11 +346,11 @@ def publish(store: Store, drive: str, made: Path) -> None:
         about["earth"] = earth_of_made(made)
     store.damaged.pop(drive, None)
     if store.mirror is None:
-        names = [name for name in files_in(made) if name != "drive.json"]
-        run_record.write_run_json(made / "drive.json", {**about, "files": hashes_of(made, names)})
+        about["files"] = hashes_of(made, [name for name in files_in(made) if name != "drive.json"])
+    run_record.write_run_json(made / "drive.json", about, checksum=True)
+    if store.mirror is None:
         local.publish(store, drive, made)
         return
-    run_record.write_run_json(made / "drive.json", about)
     from vplog.maps import sending
 
     sending.publish(store.mirror, drive, made)
@@ -360,7 +360,7 @@ def relocate(store: Store, drive: str, log: str) -> None:
     """Note where the log of a drive is now; nothing else of the drive depends on it. Raises ResultError."""
     run = store.root / "runs" / folder_name(drive)
     if store.mirror is None:
-        run_record.write_run_json(run / "drive.json", {**drive_record(run), "log": log})
+        run_record.write_run_json(run / "drive.json", {**drive_record(run), "log": log}, checksum=True)
         return
     from vplog.maps import sending
 

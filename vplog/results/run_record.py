@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import shlex
@@ -24,20 +25,24 @@ CACHE = ".cache"
 """Where a run folder keeps what its stages came to, unless another place is named."""
 REQUEST = f"{CACHE}/run.json"
 """What a run that is not finished was asked for; run.json of its folder is that of the finished run before, if any."""
+CHECKSUM = "record_sha256"
+"""Field of a record of a map: sha256 of `canonical_json` of all others. One without it is taken as it is: an
+older vplog or an editor wrote it."""
 _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
 
-def write_run_json(path: Path, record: dict[str, Any]) -> None:
+def write_run_json(path: Path, record: dict[str, Any], checksum: bool = False) -> None:
     """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
-    text = json.dumps(plain(record), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    record = {**plain(record), CHECKSUM: _sha256(record)} if checksum else plain(record)
+    text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with replacing(path) as stream:
         stream.write(text.encode())
 
 
 def read_run_json(path: Path) -> dict[str, Any]:
-    """A record of a run or a map. Raises ResultError where the file is missing or is no JSON object, and NewerError
-    where it is of a newer version."""
+    """A record of a run or a map, without its checksum. Raises ResultError where the file is missing, is no JSON object
+    or does not have its checksum, and NewerError where it is of a newer version."""
     try:
         check_file(path)
         record = _sound_json(path.read_text(encoding="utf-8"))
@@ -49,9 +54,15 @@ def read_run_json(path: Path) -> dict[str, Any]:
         raise ResultError(f"{path} is not JSON. Run `vplog run` again to write it anew.") from None
     if not isinstance(record, dict):
         raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again to write it anew.")
+    if CHECKSUM in record and record.pop(CHECKSUM) != _sha256(record):
+        raise ResultError(f"{path} is damaged: it does not have the checksum that it names. Copy it back.")
     if type(version := record.get("format")) is int:
         check_version(path, version, FORMAT, record.get("vplog"))
     return record
+
+
+def _sha256(record: dict[str, Any]) -> str:
+    return hashlib.sha256(canonical_json(record).encode()).hexdigest()
 
 
 def _sound_json(text: str) -> Any:
