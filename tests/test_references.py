@@ -67,7 +67,7 @@ def test_a_choice_by_coverage_needs_features() -> None:
 
 
 def test_an_unknown_way_is_refused_with_the_choices() -> None:
-    with pytest.raises(SettingsError, match="'random', 'spread' or 'coverage'"):
+    with pytest.raises(SettingsError, match="one of random, spread, coverage, not 'best'"):
         LibrarySettings.read({"choose": "best"}, "test")
 
 

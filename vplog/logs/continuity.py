@@ -131,9 +131,11 @@ def _continued(stamp_ns: Ints, poses: Floats, rows: Ints) -> Floats:
 
 
 def _sentence(stamp_ns: Ints, poses: Floats, rows: Ints, what: str) -> str:
-    metres = np.linalg.norm(poses[rows + 1, :3, 3] - poses[rows, :3, 3], axis=1)
-    at_s = (stamp_ns[rows + 1] - stamp_ns[0]) / 1e9
-    named = [f"{m:.1f} m at {s:.1f} s" for m, s in zip(metres[:_NAMED], at_s[:_NAMED], strict=True)]
+    named = []
+    for row in rows[:_NAMED].tolist():
+        step = geometry.between(poses[row], poses[row + 1])
+        metres, degrees = np.linalg.norm(step[:3, 3]), np.degrees(geometry.angle(step))
+        named.append(f"{metres:.1f} m and {degrees:.0f} deg at {(stamp_ns[row + 1] - stamp_ns[0]) / 1e9:.1f} s")
     more = f" and {len(rows) - _NAMED} times more" if len(rows) > _NAMED else ""
     return (
         f"{what}: the poses jump by {', '.join(named)}{more} (a relocalisation or a reset?); the motion before is "

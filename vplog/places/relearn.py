@@ -30,8 +30,12 @@ class ReferencesState:
     settings: Any
     references: list[Reference]
 
-    @cached_property
+    @property
     def hash(self) -> str:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> str:
         return stored.references_hash(self.references, self.settings)
 
     def save(self, folder: Path) -> None:
