@@ -179,7 +179,7 @@ def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
     for name in names:
         record = record.get(name) if isinstance(record, dict) else None
     if not isinstance(record, kind):
-        raise ResultError(f"{folder}/run.json lacks {'.'.join(names)}. Run `vplog run` again to write it anew.")
+        raise ResultError(f"{folder}/run.json lacks {'.'.join(names)}. Compute it again with `vplog run`.")
     return record
 
 

@@ -32,11 +32,14 @@ def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
     """
     stamp_ns, positions = local_enu(gps)
     if len(estimate.stamp_ns) < 2:
-        raise TruthError("The estimated trajectory has fewer than 2 poses, so it cannot be compared with GPS.")
+        raise TruthError("The trajectory has fewer than 2 poses: too few to compare with GPS. Run on more of the log.")
     if not np.isfinite(estimate.world_from_body).all():
-        raise TruthError("The estimated trajectory holds a pose that is not finite.")
+        raise TruthError("The estimated trajectory holds a pose that is not finite. Run `vplog run` again.")
     inside = (stamp_ns >= estimate.stamp_ns[0]) & (stamp_ns <= estimate.stamp_ns[-1])
     if inside.sum() < 3:
-        raise TruthError(f"Only {inside.sum()} of {len(inside)} GPS fixes lie within the drive; 3 are needed.")
+        raise TruthError(
+            f"Only {inside.sum()} of {len(inside)} GPS fixes lie within the drive; 3 are needed. Give a TUM file with "
+            "--truth."
+        )
     poses = geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
     return aligned_error(poses[:, :3, 3], positions[inside], alignment)

@@ -83,9 +83,9 @@ def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Ints, Ints]:
     """
     for name, trajectory in (("estimated trajectory", estimate), ("truth", truth)):
         if not len(trajectory.stamp_ns):
-            raise TruthError(f"The {name} holds no pose.")
+            raise TruthError(f"The {name} holds no pose. Give a trajectory of this drive.")
         if not np.isfinite(trajectory.world_from_body).all():
-            raise TruthError(f"The {name} holds a pose that is not finite.")
+            raise TruthError(f"The {name} holds a pose that is not finite. Leave that pose out.")
     estimate_is_longer = len(estimate.stamp_ns) > len(truth.stamp_ns)
     short, long = (truth, estimate) if estimate_is_longer else (estimate, truth)
     here, there = _nearest(_seconds(short.stamp_ns), _seconds(long.stamp_ns))
@@ -148,7 +148,9 @@ def ate(estimate: Trajectory, truth: Trajectory, alignment: str = "se3") -> Ate:
 def aligned_error(estimate: Floats, truth: Floats, alignment: str = "se3") -> Ate:
     """ATE of positions (T, 3) that belong together. Raises TruthError where T is less than three."""
     if len(estimate) < 3:
-        raise TruthError(f"Only {len(estimate)} poses have a truth; an alignment needs 3 at least.")
+        raise TruthError(
+            f"Only {len(estimate)} poses have a truth; an alignment needs 3 at least. Give a truth that covers the drive."
+        )
     truth_from_estimate, scale = geometry.umeyama(estimate, truth, alignment == "sim3")
     return _ate(geometry.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)
 
