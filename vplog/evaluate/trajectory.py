@@ -149,7 +149,7 @@ def aligned_error(estimate: Floats, truth: Floats, alignment: str = "se3") -> At
     """ATE of positions (T, 3) that belong together. Raises TruthError where T is less than three."""
     if len(estimate) < 3:
         raise TruthError(
-            f"Only {len(estimate)} poses have a truth; an alignment needs 3 at least. Give a truth that covers the drive."
+            f"Only {len(estimate)} poses have a truth; an alignment needs 3. Give a truth that covers the drive."
         )
     truth_from_estimate, scale = geometry.umeyama(estimate, truth, alignment == "sim3")
     return _ate(geometry.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)
