@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -332,9 +331,13 @@ def test_an_interrupted_comparison_leaves_the_one_before(
     arguments = ("compare", dusk, day, "--truth", "index", "--methods", "thumbnail", "-o", out, "--json", *QUICK)
     assert verb(*arguments).code == 0
     before = {file.name: file.read_bytes() for file in out.iterdir()}
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
     for last in ("vplog.compare._write_scores", "vplog.compare_figures.draw_curves"):
         with monkeypatch.context() as patch:
-            patch.setattr(last, lambda *_: signal.raise_signal(signal.SIGINT))
+            patch.setattr(last, interrupted)
             assert verb(*arguments, "--library-size", 5).code == 130
         assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 

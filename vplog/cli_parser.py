@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -73,6 +74,11 @@ class Parser(argparse.ArgumentParser):
         if not near and Path(value).exists():
             near = f" To look into it: {self.prog} info {value}"
         self.error(f"{value!r} is no verb of {self.prog}.{near or f' Verbs: {listed}.'}")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Before Python 3.11.4 a stream that nobody reads is an error here, and the status that of a crash."""
+        with suppress(OSError):
+            super()._print_message(message, file)
 
     def error(self, message: str) -> NoReturn:
         """The shortest usage, then what is wrong in one line; exit 2."""
