@@ -203,7 +203,7 @@ def run_batch(
 
 
 def _failed(store: Store) -> dict[str, dict[str, Any]]:
-    """What is known of drives that failed or are damaged: their IDs are theirs as long as that is told."""
+    """Records of failed and damaged drives, whose IDs stay reserved while the map lists them."""
     found = {drive: {"log": told.get("log"), "inputs": None} for drive, told in store.failures().items()}
     for drive in store.damaged:
         with suppress(ResultError):
@@ -333,7 +333,7 @@ def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
 
 
 def _place(path: Path) -> str:
-    """What opens a log from any folder, by the name given, whatever that is a link to: a URL with its query."""
+    """Absolute path of a log as it was named, links not resolved, or its URL with the query."""
     if isinstance(path, RemotePath):
         return path.url
     if path.name in ("", ".."):

@@ -29,7 +29,7 @@ class Task:
 
     drive: str
     log: str
-    """What opens it: a URL with its query, which `about` has without."""
+    """Path or URL of the log, with the query that `about` omits."""
     folder: Path
     """Where the run folder is made; it is the map's when it is renamed in."""
     library: Path

@@ -17,7 +17,7 @@ up at 2.8 GB/s where sha256 takes eight times as long."""
 ENDING = ".stage"
 """Of the files of a cache: what else is in its folder is not touched."""
 INPUTS = "inputs.json"
-"""What a cache knows of the files of its drive."""
+"""Name of the file with the identity and hashes of the log that a cache is of."""
 CACHE_FILES = (f"*{ENDING}", ".*.part", INPUTS)
 """Glob patterns of all files of a cache; the parts are what a killed run was writing."""
 _BLOCK_BYTES = 2**20

@@ -202,7 +202,7 @@ def print_evaluation(found: dict[str, Any]) -> None:
 
 
 def _truth_notes(found: dict[str, Any]) -> list[str]:
-    """What a reader must know of the truth to trust the figures."""
+    """Warnings about the truth that bear on the figures."""
     truth, notes = found.get("truth_is"), []
     if truth is not None and truth["frame"] != "body":
         what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
