@@ -1,4 +1,4 @@
-"""Every check of the project: lint, format, types, tests. `python -m tests`, from the top of the checkout.
+"""Every check of the project: lint, format, documentation, types, tests. `python -m tests`, from the checkout's top.
 
 Arguments go to pytest. The exit status is 0 only when all passed; every check runs even if one before it failed.
 """
@@ -16,6 +16,7 @@ TOP = Path(__file__).parents[1]
 CHECKS = {
     "lint": ["-m", "ruff", "check", "."],
     "format": ["-m", "ruff", "format", "--check", "."],
+    "docs": ["-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", "build/site"],
     # a file stays with one worker, so that what its tests share is made once; they come in the order of conftest.py
     "tests": ["-m", "pytest", "--numprocesses", "auto", "--dist", "loadfile", "--no-loadscope-reorder", *sys.argv[1:]],
 }
@@ -24,7 +25,7 @@ TYPES = ["-m", "pyright", "--pythonpath", sys.executable]
 
 def main() -> int:
     # one thread a library: the tests start workers of their own, and a BLAS pool inside each only gets in their way
-    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
+    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1", **os.environ}
     failed = []
     with tempfile.TemporaryFile() as said:
         # one process for minutes, beside the tests: they leave it a share of a core
