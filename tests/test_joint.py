@@ -15,7 +15,7 @@ from vplog.evaluate.truth import read_truth
 from vplog.evaluation import evaluate
 from vplog.record import OWN_LIBRARY
 from vplog.results import tables
-from vplog.results.tum import write_tum
+from vplog.tum import write_tum
 
 from .joined import QUICK, cut
 

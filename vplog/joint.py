@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog import logs, record
+from vplog import logs, record, tum
 from vplog.between import closures_between, likely_drives, no_candidates, shared_of, with_drive, with_shared
 from vplog.cores import limited
 from vplog.errors import LogError, SettingsError
@@ -20,7 +20,7 @@ from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of
 from vplog.parts import odometry_of
 from vplog.pipeline import run as run_alone
-from vplog.results import g2o, run_record, tables, tum
+from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
 from vplog.run_folder import begun
 from vplog.timing import Watch

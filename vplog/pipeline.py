@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import model_validator
 
-from vplog import logs, record
+from vplog import logs, record, tum
 from vplog.back_end import about_gps, back_end
 from vplog.cores import limited
 from vplog.data import Closures, EdgeKind, Keyframes, Reference
@@ -38,7 +38,7 @@ from vplog.places.stored import load_references
 from vplog.recognise import describe, find_candidates, name_shared
 from vplog.references import LibrarySettings
 from vplog.report import write_report
-from vplog.results import g2o, mcap, run_record, tables, tum
+from vplog.results import g2o, mcap, run_record, tables
 from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run_folder import begun
