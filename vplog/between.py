@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Closures, Verdict
+from vplog.data import Closures, SharedReferences, Verdict
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import calibration_share, verify_between
 from vplog.places.sequence import rank_places
-from vplog.places.shared import Shared, SharesReferences
-from vplog.stages import index_of_part
+from vplog.stages import BoxState, index_of_part
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -150,16 +149,18 @@ def calibration_of(later: Drive, earlier: Drive, threads: int = 1) -> float:
     return max(calibration_share(drive, threads) for drive in (later, earlier))
 
 
-def shared_of(proposals: Proposals, state: PlaceState, later: Sequence[Any], earlier: Sequence[Any]) -> Shared:
+def shared_of(
+    proposals: Proposals, state: PlaceState, later: Sequence[Any], earlier: Sequence[Any]
+) -> SharedReferences:
     """The references that explain both places of each candidate; none where the recogniser has no boxes."""
-    if not isinstance(state, SharesReferences):
+    if not isinstance(state, BoxState):
         nothing = [np.empty(0, np.uint16)] * len(proposals.query), [np.empty(0, np.float32)] * len(proposals.query)
-        return Shared(*nothing)
+        return SharedReferences(*nothing)
     both = [*earlier, *later]  # the two drives' places one after the other
     return state.shared(both, proposals.query + np.int32(len(earlier)), proposals.match)
 
 
-def with_shared(ledger: Closures, proposals: Proposals, shared: Shared) -> Closures:
+def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences) -> Closures:
     """The ledger of some of the proposals, with what is shared by each."""
     pairs = zip(proposals.query.tolist(), proposals.match.tolist(), strict=True)
     row_of = {pair: row for row, pair in enumerate(pairs)}

@@ -14,8 +14,8 @@ from vplog.maps.damage import reading_drive
 from vplog.maps.index import as_described, update_index
 from vplog.maps.search import best_places
 from vplog.maps.sequences import PLACES_A_VIEW, credits_of
-from vplog.places.bobb import BobbState
 from vplog.results import tables
+from vplog.stages import CodedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Mapping, Sequence
@@ -94,7 +94,7 @@ def worth_a_search(
     """
     most = most_searched(pipeline)
     searched: dict[int, Container[int]] = {number: range(number) for number in later}
-    if max(later) <= most or not isinstance(state, BobbState) or store.mirror is not None:
+    if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
         return searched
     about = store.drives()
     parts, _ = update_index(store, {one.drive: about[one.drive] for one in members}, state.hash, state, threads)

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
     from pathlib import Path
 
+    from vplog.data import SharedReferences
     from vplog.loops.propose import Proposals
     from vplog.maps.pairs import PairTask
     from vplog.maps.roster import Drives
     from vplog.maps.seen import Sight
     from vplog.maps.store import Store
-    from vplog.places.shared import Shared
     from vplog.stages import PlaceState
 
     Progress = Callable[[str, int, int], None]
@@ -58,7 +58,7 @@ class Wanted(NamedTuple):
     later: int
     earlier: int
     proposals: Proposals
-    shared: Shared
+    shared: SharedReferences
 
 
 def join(

@@ -26,12 +26,11 @@ from vplog.results.atomic import replacing
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Closures
+    from vplog.data import Closures, SharedReferences
     from vplog.loops.propose import Proposals
     from vplog.maps.members import Member
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
-    from vplog.places.shared import Shared
 
 
 _CODE = ("vplog.between", "vplog.extract", "vplog.features.sift", "vplog.results.tables")
@@ -52,7 +51,7 @@ class PairTask:
     later_sight: Sight
     earlier_sight: Sight
     proposals: Proposals
-    shared: Shared
+    shared: SharedReferences
     """Of each of the proposals."""
     pipeline: Pipeline
     library: str
