@@ -9,9 +9,9 @@ from __future__ import annotations
 import time
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from vplog.between import likely_drives, shared_of
+from vplog.between import likely_pairs
 from vplog.cores import limited
 from vplog.maps import pairs
 from vplog.maps.candidates import candidates_of, places_of
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
     from pathlib import Path
 
-    from vplog.data import SharedReferences
-    from vplog.loops.propose import Proposals
+    from vplog.between import DrivePair
     from vplog.maps.pairs import PairTask
     from vplog.maps.roster import Drives
     from vplog.maps.seen import Sight
@@ -50,15 +49,6 @@ def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceSta
     pairs.depends(pipeline)
     pairs.search_code()
     return cast("PlaceState", pipeline.places.load(library, threads))
-
-
-class Wanted(NamedTuple):
-    """Candidates of one drive in another."""
-
-    later: int
-    earlier: int
-    proposals: Proposals
-    shared: SharedReferences
 
 
 def join(
@@ -129,26 +119,21 @@ def _join(
 def _search(
     store: Store, drives: Drives, new: Sequence[int], pipeline: Pipeline, threads: int, progress: Progress,
     load: Callable[[], PlaceState],
-) -> list[Wanted]:  # fmt: skip
+) -> list[DrivePair]:  # fmt: skip
     """The candidates of new drives that are worth verifying."""
     later = [at for at in new if at]  # the first has none before it
     if not later:
         return []
-    state, wanted = load(), []
-    for at, found in candidates_of(store, drives.members, later, state, pipeline, threads, progress).items():
-        own = places_of(store, drives.members[at], state)
-        for earlier in likely_drives(found, pipeline.join):
-            proposals = found.of(earlier)
-            shared = shared_of(proposals, state, own, places_of(store, drives.members[earlier], state))
-            wanted.append(Wanted(at, earlier, proposals, shared))
-    return wanted
+    state = load()
+    found = candidates_of(store, drives.members, later, state, pipeline, threads, progress)
+    return likely_pairs(found, lambda at: places_of(store, drives.members[at], state), state, pipeline.join)
 
 
 def _verify(
     store: Store,
     drives: Drives,
     new: Sequence[int],
-    wanted: Sequence[Wanted],
+    wanted: Sequence[DrivePair],
     pipeline: Pipeline,
     executor: Executor | None,
     threads: int,
@@ -187,7 +172,7 @@ def _verify(
 
 
 def _sights(
-    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[Wanted], pipeline: Pipeline,
+    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair], pipeline: Pipeline,
     executor: Executor | None, threads: int,
 ) -> tuple[dict[int, Sight], dict[int, str]]:  # fmt: skip
     """How the drives see that are verified, by number, and why that cannot be told of others.
@@ -217,11 +202,11 @@ def _sights(
 
 
 def _remember(
-    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[Wanted],
+    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair],
     reasons: dict[tuple[str, str], str], pipeline: Pipeline,
 ) -> None:  # fmt: skip
     """Write of each new drive what it was verified against."""
-    of_later: dict[int, list[Wanted]] = {at: [] for at in new}
+    of_later: dict[int, list[DrivePair]] = {at: [] for at in new}
     for one in wanted:
         of_later[one.later].append(one)
     for at in new:

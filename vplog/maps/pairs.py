@@ -92,7 +92,7 @@ def compute_pair(task: PairTask) -> bytes:
 
         share = max(task.later_sight.rotation_share, task.earlier_sight.rotation_share)
         ledger = closures_between(
-            task.proposals, later, earlier, task.pipeline.join, threads, share=share, fetch=fetch
+            task.proposals, later, earlier, task.pipeline.join, share, threads, fetch=fetch
         )  # fmt: skip
         ledger = with_shared(ledger, task.proposals, task.shared)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)

@@ -27,14 +27,13 @@ def solve_groups(
     store: Store, drives: Drives, ties: Sequence[Tie], pipeline: Pipeline, progress: Progress
 ) -> dict[str, Any]:
     """Solve the groups that are not solved yet, and let joint.json say so; then the folders of others go."""
-    solving = components.Solving(pipeline.solve, pipeline.join, pipeline.refine, drives.library)
-    groups = components.groups_of([member.drive for member in drives.members], drives.keys, ties, solving)
+    groups = components.groups_of([member.drive for member in drives.members], drives.keys, ties, pipeline)
     known = {group["key"]: group for group in _joint(store).get("groups", [])}
     folder, told = store.root / "joint", []
     for done, group in enumerate(groups):
         progress("solve together", done, len(groups))
         if not _is_there(folder, known.get(group.key)):
-            known[group.key] = _solved(store, group, drives, solving)
+            known[group.key] = _solved(store, group, pipeline, drives.library)
         told.append(known[group.key])
     progress("solve together", len(groups), len(groups))
     together = {drive for group in told for component in group["components"] for drive in component["drives"]}
@@ -63,13 +62,13 @@ def _is_there(folder: Path, known: dict[str, Any] | None) -> bool:
     )
 
 
-def _solved(store: Store, group: Group, drives: Drives, solving: components.Solving) -> dict[str, Any]:
+def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
     """Solve a group, and rename in its components."""
     staging = store.staging / "joint"
     shutil.rmtree(staging, ignore_errors=True)
     runs = {drive: store.run(drive) for drive in group.drives}
     try:
-        told = components.solve_group(group, runs, solving, staging)
+        told = components.solve_group(group, runs, pipeline, library, staging)
     except DamagedDriveError:  # the others are solved without it
         raise
     except VplogError as error:  # one group must not take the others along; it is tried again
