@@ -10,6 +10,7 @@ import numpy as np
 
 from vplog.data import Closures, SharedReferences, Verdict
 from vplog.extract import map_in_order
+from vplog.ledger import merged
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import verify_between
 from vplog.places.sequence import rank_places
@@ -44,7 +45,7 @@ class Candidates:
 
     def of(self, number: int) -> Proposals:
         """The candidates in one drive."""
-        return taken(self.proposals, self.drive == number)
+        return self.proposals.rows(self.drive == number)
 
 
 def no_candidates() -> Candidates:
@@ -74,11 +75,11 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
         for one in fields(Proposals)
     })  # fmt: skip
     order = np.lexsort((every.rank, drive, -every.score, every.query))
-    every, drive = taken(every, order), drive[order]
+    every, drive = every.rows(order), drive[order]
     starts = np.searchsorted(every.query, every.query)
     rank = (np.arange(len(drive)) - starts).astype(np.int32)
     kept = rank < pipeline.propose.per_query
-    return Candidates(drive[kept], taken(replace(every, rank=rank), kept))
+    return Candidates(drive[kept], replace(every, rank=rank).rows(kept))
 
 
 def candidates_among(
@@ -174,7 +175,7 @@ def closures_between(
 
     def look(rows: Ints) -> None:
         fetch(np.unique(proposals.query[rows]), np.unique(proposals.match[rows]))
-        ledger = verify_between(taken(proposals, rows), later, earlier, threads, progress, share)
+        ledger = verify_between(proposals.rows(rows), later, earlier, threads, progress, share)
         looks.append((rows, ledger))
 
     def confirmed() -> Int32s:
@@ -188,8 +189,7 @@ def closures_between(
             others = _near(proposals.query, confirmed(), settings.around)
             others[best] = False
             look(np.flatnonzero(others))
-    rows = np.concatenate([rows for rows, _ in looks])
-    return _in_order([ledger for _, ledger in looks], np.argsort(rows))
+    return merged([ledger for _, ledger in looks], [rows for rows, _ in looks])
 
 
 def shared_of(
@@ -215,11 +215,6 @@ def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences
     )
 
 
-def taken(proposals: Proposals, rows: Bools | Ints) -> Proposals:
-    """Some of the proposals."""
-    return Proposals(**{one.name: getattr(proposals, one.name)[rows] for one in fields(Proposals)})
-
-
 def _near(query: Int32s, held: Int32s, around: int) -> Bools:
     """(C,) whether a query is at most so many keyframes from one of `held`, which increase."""
     if len(held) == 0:
@@ -227,15 +222,3 @@ def _near(query: Int32s, held: Int32s, around: int) -> Bools:
     after = np.searchsorted(held, query)
     left, right = held[np.maximum(after - 1, 0)], held[np.minimum(after, len(held) - 1)]
     return np.minimum(np.abs(query - left), np.abs(query - right)) <= around
-
-
-def _in_order(ledgers: Sequence[Closures], order: Ints) -> Closures:
-    """The rows of all ledgers, in this order."""
-
-    def joined(columns: list[Any]) -> Any:
-        if isinstance(columns[0], list):
-            every = [cell for column in columns for cell in column]
-            return [every[row] for row in order.tolist()]
-        return np.concatenate(columns)[order]
-
-    return Closures(**{part.name: joined([getattr(one, part.name) for one in ledgers]) for part in fields(Closures)})

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs, record, tum
-from vplog.between import candidates_among, closures_between, likely_pairs, no_candidates, with_shared
+from vplog.between import candidates_among, closures_between, likely_pairs, with_shared
 from vplog.cores import limited
 from vplog.errors import SettingsError
 from vplog.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.libraries import build_library, check_library
-from vplog.loops.verify import calibration_share, drive_of
+from vplog.loops.verify import calibration_share, drive_of, no_closures
 from vplog.parts import odometry_of
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
@@ -131,13 +131,15 @@ def _ledgers(
     likely = {(one.later, one.earlier): one for one in likely_pairs(found, places.__getitem__, state, pipeline.join)}
 
     def verified(later: int, earlier: int) -> Closures:
-        name, pair = f"{drives[later].name} in {drives[earlier].name}", likely.get((later, earlier))
+        pair = likely.get((later, earlier))
+        if pair is None:
+            return no_closures()
+        name = f"{drives[later].name} in {drives[earlier].name}"
         ledger = closures_between(
-            no_candidates().proposals if pair is None else pair.proposals,
-            drives[later].drive, drives[earlier].drive, pipeline.join, max(share[later], share[earlier]), threads,
-            lambda done, total: progress(name, done, total),
+            pair.proposals, drives[later].drive, drives[earlier].drive, pipeline.join,
+            max(share[later], share[earlier]), threads, lambda done, total: progress(name, done, total),
         )  # fmt: skip
-        return ledger if pair is None else with_shared(ledger, pair.proposals, pair.shared)
+        return with_shared(ledger, pair.proposals, pair.shared)
 
     return {(number, earlier): verified(number, earlier) for number in later for earlier in range(number)}
 
