@@ -1,6 +1,6 @@
-"""Closures between the drives of a map, and one graph of those that they join; what is there already stays.
+"""Closures between the drives of a map, and one graph of those that they join; results that are up to date stay.
 
-A drive is looked for in all that came before it: first by its places, then, in the drives that hold most like them,
+A drive is searched in all that came before it: first by its places, then, in the drives that hold most like them,
 by geometry. Drives come in order of their IDs within a batch, and after all that were there.
 """
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from vplog.between import DrivePair
     from vplog.maps.pairs import PairTask
     from vplog.maps.roster import Drives
-    from vplog.maps.seen import Sight
+    from vplog.maps.seen import CameraTrust
     from vplog.maps.store import Store
     from vplog.stages import PlaceState
 
@@ -60,8 +60,8 @@ def join(
     places: Callable[[], PlaceState] | None = None,
     urls: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Verify what was not yet looked at, solve what that touches, and say what joins. `urls` open logs of drives that
-    were given now: a map has URLs without their queries.
+    """Verify the pairs of drives that are new or changed, solve the groups that have them, and return the record.
+    `urls` open the logs of drives given now: a map stores URLs without their queries.
 
     The caller holds the map's lock. With an executor its processes verify, pair by pair, each with `threads`; they
     must see the map and the logs under the same paths. Neither counts for the result. `places` gives what `load_places`
@@ -98,13 +98,13 @@ def _join(
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    blind = [
+    uncalibrated = [
         member.drive
         for member in drives.members
-        if (sight := pairs.known_sight(store, member, pipeline)) is not None and sight.camera["matrix"] is None
+        if (known := pairs.known_camera(store, member, pipeline)) is not None and known.camera["matrix"] is None
     ]
-    if blind:
-        unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(blind)}.")
+    if uncalibrated:
+        unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(uncalibrated)}.")
     return {
         "searched": [drives.members[at].drive for at in new],
         "pairs": len(ties),
@@ -140,18 +140,18 @@ def _verify(
     progress: Progress,
 ) -> tuple[int, dict[tuple[str, str], str]]:
     """Store the ledgers that are not there yet; how many those were, and why others could not be made, by drives."""
-    sights, blind = _sights(store, drives, new, wanted, pipeline, executor, threads)
+    cameras, failed = _cameras(store, drives, new, wanted, pipeline, executor, threads)
     reasons: dict[tuple[str, str], str] = {}
 
     def tasks() -> Iterator[PairTask]:
         for at, one in enumerate(wanted):
             later, earlier = drives.members[one.later], drives.members[one.earlier]
             progress("verify between drives", at, len(wanted))
-            if why := blind.get(one.later, "") or blind.get(one.earlier, ""):
+            if why := failed.get(one.later, "") or failed.get(one.earlier, ""):
                 reasons[later.drive, earlier.drive] = why
                 continue
             task = pairs.PairTask(
-                later, earlier, sights[one.later], sights[one.earlier], one.proposals, one.shared, pipeline,
+                later, earlier, cameras[one.later], cameras[one.earlier], one.proposals, one.shared, pipeline,
                 drives.library, threads,
             )  # fmt: skip
             if not pairs.is_stored(store, task):
@@ -171,51 +171,51 @@ def _verify(
     return computed, reasons
 
 
-def _sights(
+def _cameras(
     store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair], pipeline: Pipeline,
     executor: Executor | None, threads: int,
-) -> tuple[dict[int, Sight], dict[int, str]]:  # fmt: skip
-    """How the drives see that are verified, by number, and why that cannot be told of others.
+) -> tuple[dict[int, CameraTrust], dict[int, str]]:  # fmt: skip
+    """Cameras of the drives that are verified, by number, and why others have none.
 
-    That of new drives is looked at now, while their features are at hand.
+    New drives are included, paired or not, while their features are in the caches of their runs.
     """
     paired = {at for one in wanted for at in (one.later, one.earlier)}
-    sights: dict[int, Sight] = {}
+    cameras: dict[int, CameraTrust] = {}
     missing: list[int] = []
     for at in sorted(paired | {at for at in new if drives.members[at].cache.is_dir()}):
-        known = pairs.known_sight(store, drives.members[at], pipeline)
+        known = pairs.known_camera(store, drives.members[at], pipeline)
         if known is None:
             missing.append(at)
         else:
-            sights[at] = known
-    blind: dict[int, str] = {}
-    work = partial(pairs.compute_sight, pipeline=pipeline, threads=threads)
-    for at, (member, sight, why) in zip(
+            cameras[at] = known
+    failed: dict[int, str] = {}
+    work = partial(pairs.compute_camera, pipeline=pipeline, threads=threads)
+    for at, (member, camera, why) in zip(
         missing, each_done(work, [drives.members[at] for at in missing], executor), strict=True
     ):
-        if sight is None:
-            blind[at] = why
+        if camera is None:
+            failed[at] = why
         else:
-            sights[at] = sight
-            pairs.put_sight(store, member, pipeline, sight)
-    return sights, blind
+            cameras[at] = camera
+            pairs.put_camera(store, member, pipeline, camera)
+    return cameras, failed
 
 
 def _remember(
     store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair],
     reasons: dict[tuple[str, str], str], pipeline: Pipeline,
 ) -> None:  # fmt: skip
-    """Write of each new drive what it was verified against."""
+    """Write the pairs of each new drive."""
     of_later: dict[int, list[DrivePair]] = {at: [] for at in new}
     for one in wanted:
         of_later[one.later].append(one)
     for at in new:
-        member, told = drives.members[at], []
+        member, known = drives.members[at], []
         for one in of_later[at]:
             earlier = drives.members[one.earlier]
             why = reasons.get((member.drive, earlier.drive), "")
             ledger = None if why else pairs.read_ledger(store, member.drive, earlier.drive)
-            told.append({
+            known.append({
                 "match": earlier.drive,
                 "match_key": earlier.key,
                 "candidates": 0 if ledger is None else len(ledger),
@@ -224,7 +224,7 @@ def _remember(
                 **({"reason": why} if why else {}),
             })  # fmt: skip
         position = drives.joins[at].position
-        drives.joins[at] = pairs.Joins(position, member.key, pairs.search_key(member, pipeline), tuple(told))
+        drives.joins[at] = pairs.Joins(position, member.key, pairs.search_key(member, pipeline), tuple(known))
         pairs.put_joins(store, member.drive, drives.joins[at])
 
 
