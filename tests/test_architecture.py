@@ -28,7 +28,7 @@ LAYERS = (
     {"tum"},
     {"stages", "references", "inputs", "code_hash", "cache_file"},
     {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},
-    {"extract", "record", "drawing", "back_end", "boxes", "stage_codecs"},
+    {"extract", "record", "drawing", "back_end", "stage_codecs"},
     {"stage_cache", "run_folder", "extracted", "shared_view", "libraries", "recognise"},
     {"parts", "ledger"},
     {"show"},
@@ -91,6 +91,17 @@ def test_imports_point_one_way(file: Path) -> None:
     assert part in LEVEL, f"{part} has no place in the order of the parts: give it one here and in the README"
     wrong = {used for used in parts_used(file) if used != part and LEVEL[used] >= LEVEL[part]}
     assert not wrong, f"{name_of(file)} may not import {sorted(wrong)}"
+
+
+def test_no_stage_asks_for_a_certain_recogniser() -> None:
+    """What a state can do is a protocol of stages.py."""
+    asked = []
+    for file in FILES:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance" and part_of(file) != "places":
+                kinds = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
+                asked += [f"{name_of(file)}:{node.lineno}" for kind in kinds if re.search("(Bobb|Hybrid)State", kind)]
+    assert not asked
 
 
 def test_the_check_sees_imports() -> None:

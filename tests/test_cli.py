@@ -272,7 +272,7 @@ def test_evaluate_with_a_clock_that_is_said_to_be_off_and_a_truth_of_the_camera(
     from vplog.data import Trajectory
     from vplog.evaluate.truth import read_truth
     from vplog.results.mcap_read import read_camera_pose
-    from vplog.results.tum import write_tum
+    from vplog.tum import write_tum
 
     true, camera = read_truth(drive.truth), read_camera_pose(finished / "result.mcap")
     assert camera is not None

@@ -15,7 +15,7 @@ from vplog.evaluate.truth import read_truth
 from vplog.evaluation import evaluate
 from vplog.record import OWN_LIBRARY
 from vplog.results import tables
-from vplog.results.tum import write_tum
+from vplog.tum import write_tum
 
 from .joined import QUICK, cut
 
@@ -81,6 +81,15 @@ def _resumed(verb: Callable[..., Said], out: Path) -> dict[str, Any]:
 def tables_of(out: Path) -> dict[str, bytes]:
     files = [*out.rglob("*.parquet"), *out.glob("*.g2o"), *out.rglob("*.tum")]
     return {file.relative_to(out).as_posix(): file.read_bytes() for file in files}
+
+
+def test_odometry_of_a_drive_in_a_map_is_that_of_its_run(joint: Path) -> None:
+    """To the last bit: it is not read back from a table of quaternions."""
+    for name in ("before", "after"):
+        alone, mapped = (pq.read_table(joint / name / f"{prefix}trajectory.parquet") for prefix in ("", "joint_"))
+        columns = ["stamp_ns", *(column for column in alone.column_names if column.startswith("odom_"))]
+        assert len(columns) > 7
+        assert mapped.select(columns).equals(alone.select(columns))
 
 
 def test_the_ledger_names_both_drives(joint: Path) -> None:

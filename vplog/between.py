@@ -1,21 +1,23 @@
-"""Closures between drives: which others hold places like a drive's, and which of those places geometry confirms."""
+"""Closures between drives: place recognition proposes pairs of drives and candidates, and geometry verifies them."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Closures, Verdict
+from vplog.data import Closures, SharedReferences, Verdict
+from vplog.extract import map_in_order
+from vplog.ledger import merged
 from vplog.loops.propose import Proposals, ProposeSettings, propose
-from vplog.loops.verify import calibration_share, verify_between
+from vplog.loops.verify import verify_between
 from vplog.places.sequence import rank_places
-from vplog.places.shared import Shared, SharesReferences
-from vplog.stages import index_of_part
+from vplog.stages import BoxState, index_of_part
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Container, Mapping, Sequence
 
     from vplog.data import Bools, Int32s, Ints
     from vplog.graph.joint import JoinSettings
@@ -34,29 +36,21 @@ views are among those that score highest."""
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The best candidates of each keyframe of a drive in others, all of those together: by query, then rank."""
+    """The best candidates of each keyframe of a drive in other drives, ranked together: by query, then rank."""
 
     drive: Int32s
     """(C,) number of the other drive."""
     proposals: Proposals
-    """C; ranks count those in all drives."""
+    """C rows, ranked over all drives."""
 
     def of(self, number: int) -> Proposals:
-        """Those in one drive."""
-        return taken(self.proposals, self.drive == number)
+        """The candidates in one drive."""
+        return self.proposals.rows(self.drive == number)
 
 
 def no_candidates() -> Candidates:
-    """Before any drive was searched."""
+    """No candidates."""
     return Candidates(np.empty(0, np.int32), propose([], ProposeSettings()))
-
-
-def with_drive(
-    known: Candidates, number: int, later: Sequence[Any], earlier: Sequence[Any], state: PlaceState,
-    pipeline: Pipeline, threads: int = 1,
-) -> Candidates:  # fmt: skip
-    """The candidates with those of the places `later` in a drive more, whose places are `earlier`."""
-    return with_proposals(known, number, proposed_in(later, earlier, state, pipeline, threads), pipeline)
 
 
 def proposed_in(
@@ -81,11 +75,45 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
         for one in fields(Proposals)
     })  # fmt: skip
     order = np.lexsort((every.rank, drive, -every.score, every.query))
-    every, drive = taken(every, order), drive[order]
+    every, drive = every.rows(order), drive[order]
     starts = np.searchsorted(every.query, every.query)
     rank = (np.arange(len(drive)) - starts).astype(np.int32)
     kept = rank < pipeline.propose.per_query
-    return Candidates(drive[kept], taken(replace(every, rank=rank), kept))
+    return Candidates(drive[kept], replace(every, rank=rank).rows(kept))
+
+
+def candidates_among(
+    later: Mapping[int, Sequence[Any]],
+    earlier: Callable[[int], Sequence[Any]],
+    searched: Mapping[int, Container[int]],
+    state: PlaceState,
+    pipeline: Pipeline,
+    threads: int = 1,
+    progress: Callable[[int], None] = lambda _: None,
+) -> dict[int, Candidates]:
+    """The best candidates of the places of each drive of `later`, by number, in those drives of lower numbers that it
+    is `searched` in.
+
+    `earlier` gives the places of the drives that are not among `later`; it is called from any thread. A thread has a
+    drive to itself where there are enough of them: a drive of a few hundred views is done too soon to share.
+    `progress` gets the number of pairs of drives that were compared.
+    """
+    found = {number: no_candidates() for number in later}
+    inside = -(-threads // max(later))
+
+    def compare(number: int) -> list[tuple[int, Proposals]]:
+        queries = [one for one in later if number in searched[one]]
+        if not queries:
+            return []
+        known = later[number] if number in later else earlier(number)
+        return [(one, proposed_in(later[one], known, state, pipeline, inside)) for one in queries]
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        for number, proposed in enumerate(map_in_order(pool, compare, range(max(later)), ahead=2 * threads)):
+            for one, more in proposed:
+                found[one] = with_proposals(found[one], number, more, pipeline)
+            progress(len(proposed))
+    return found
 
 
 def likely_drives(candidates: Candidates, settings: JoinSettings) -> list[int]:
@@ -98,26 +126,48 @@ def likely_drives(candidates: Candidates, settings: JoinSettings) -> list[int]:
     return np.sort(numbers[best]).tolist()
 
 
+class DrivePair(NamedTuple):
+    """The candidates of one drive (queries) in another (matches)."""
+
+    later: int
+    """Number of the drive."""
+    earlier: int
+    proposals: Proposals
+    shared: SharedReferences
+    """References that explain both places of each of the proposals."""
+
+
+def likely_pairs(
+    found: Mapping[int, Candidates], places: Callable[[int], Sequence[Any]], state: PlaceState, settings: JoinSettings
+) -> list[DrivePair]:
+    """The pairs of drives whose candidates are worth verifying, by later, then earlier drive."""
+    pairs = []
+    for later, candidates in found.items():
+        own = places(later)
+        for earlier in likely_drives(candidates, settings):
+            proposals = candidates.of(earlier)
+            pairs.append(DrivePair(later, earlier, proposals, shared_of(proposals, state, own, places(earlier))))
+    return pairs
+
+
 def closures_between(
     proposals: Proposals,
     later: Drive,
     earlier: Drive,
     settings: JoinSettings,
+    share: float,
     threads: int = 1,
     progress: Progress = lambda *_: None,
-    share: float | None = None,
     fetch: Callable[[Int32s, Int32s], None] = lambda *_: None,
 ) -> Closures:
     """The ledger of the candidates of one drive's keyframes (queries) in another (matches) that are worth a look.
 
     First come the bests of the queries that score highest. Where geometry shows none of them to be of the same place
     the drives do not meet; else the best of each other query follows, and then all candidates of the queries around
-    those of the same place: they are for the graph, and left out where no calibration gives them metres. `share` is by
-    what the calibrations are wrong, where that is known; `fetch` is told before each look which queries and matches it
-    is about. `progress` counts the candidates of each look.
+    those of the same place: they are for the graph, and left out where no calibration gives them metres. `share` is the
+    larger `calibration_share` of the two drives; `fetch` gets queries and matches before they are verified. `progress`
+    counts the candidates of each look.
     """
-    if share is None:
-        share = calibration_of(later, earlier, threads)
     _, best = np.unique(proposals.query, return_index=True)
     by_score = best[np.argsort(-proposals.score[best], kind="stable")]
     count = max(settings.first_look, -(-len(best) // _FIRST_SHARE))
@@ -125,41 +175,35 @@ def closures_between(
 
     def look(rows: Ints) -> None:
         fetch(np.unique(proposals.query[rows]), np.unique(proposals.match[rows]))
-        ledger = verify_between(taken(proposals, rows), later, earlier, threads, progress, share)
+        ledger = verify_between(proposals.rows(rows), later, earlier, threads, progress, share)
         looks.append((rows, ledger))
 
-    def held() -> Int32s:
+    def confirmed() -> Int32s:
         """Queries whose candidate is of the same place, increasing."""
         return np.unique(np.concatenate([one.query[[v not in _NO_POSE for v in one.verdict]] for _, one in looks]))
 
     look(np.sort(by_score[:count]))
-    if len(held()):
+    if len(confirmed()):
         look(np.sort(by_score[count:]))
         if later.camera.matrix is not None and earlier.camera.matrix is not None:
-            others = _near(proposals.query, held(), settings.around)
+            others = _near(proposals.query, confirmed(), settings.around)
             others[best] = False
             look(np.flatnonzero(others))
-    rows = np.concatenate([rows for rows, _ in looks])
-    return _in_order([ledger for _, ledger in looks], np.argsort(rows))
+    return merged([ledger for _, ledger in looks], [rows for rows, _ in looks])
 
 
-def calibration_of(later: Drive, earlier: Drive, threads: int = 1) -> float:
-    """By what the calibrations are wrong at most, as a share of a rotation; 0 where there is none."""
-    if later.camera.matrix is None or earlier.camera.matrix is None:
-        return 0.0
-    return max(calibration_share(drive, threads) for drive in (later, earlier))
-
-
-def shared_of(proposals: Proposals, state: PlaceState, later: Sequence[Any], earlier: Sequence[Any]) -> Shared:
+def shared_of(
+    proposals: Proposals, state: PlaceState, later: Sequence[Any], earlier: Sequence[Any]
+) -> SharedReferences:
     """The references that explain both places of each candidate; none where the recogniser has no boxes."""
-    if not isinstance(state, SharesReferences):
+    if not isinstance(state, BoxState):
         nothing = [np.empty(0, np.uint16)] * len(proposals.query), [np.empty(0, np.float32)] * len(proposals.query)
-        return Shared(*nothing)
+        return SharedReferences(*nothing)
     both = [*earlier, *later]  # the two drives' places one after the other
     return state.shared(both, proposals.query + np.int32(len(earlier)), proposals.match)
 
 
-def with_shared(ledger: Closures, proposals: Proposals, shared: Shared) -> Closures:
+def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences) -> Closures:
     """The ledger of some of the proposals, with what is shared by each."""
     pairs = zip(proposals.query.tolist(), proposals.match.tolist(), strict=True)
     row_of = {pair: row for row, pair in enumerate(pairs)}
@@ -171,11 +215,6 @@ def with_shared(ledger: Closures, proposals: Proposals, shared: Shared) -> Closu
     )
 
 
-def taken(proposals: Proposals, rows: Bools | Ints) -> Proposals:
-    """Some of the proposals."""
-    return Proposals(**{one.name: getattr(proposals, one.name)[rows] for one in fields(Proposals)})
-
-
 def _near(query: Int32s, held: Int32s, around: int) -> Bools:
     """(C,) whether a query is at most so many keyframes from one of `held`, which increase."""
     if len(held) == 0:
@@ -183,15 +222,3 @@ def _near(query: Int32s, held: Int32s, around: int) -> Bools:
     after = np.searchsorted(held, query)
     left, right = held[np.maximum(after - 1, 0)], held[np.minimum(after, len(held) - 1)]
     return np.minimum(np.abs(query - left), np.abs(query - right)) <= around
-
-
-def _in_order(ledgers: Sequence[Closures], order: Ints) -> Closures:
-    """The rows of all ledgers, in this order."""
-
-    def joined(columns: list[Any]) -> Any:
-        if isinstance(columns[0], list):
-            every = [cell for column in columns for cell in column]
-            return [every[row] for row in order.tolist()]
-        return np.concatenate(columns)[order]
-
-    return Closures(**{part.name: joined([getattr(one, part.name) for one in ledgers]) for part in fields(Closures)})

@@ -141,6 +141,26 @@ class Reference:
 
 
 @dataclass(frozen=True, eq=False)
+class Boxes:
+    """Where the windows of an image are found on the references that explain it."""
+
+    references: Ints
+    """(J,) best first; fewer where fewer references share anything."""
+    corners: Floats
+    """(J, I, 4) x0 y0 x1 y1 as shares of the reference's sides, NaN where nothing of a window is found."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharedReferences:
+    """The references that explain both images of C pairs."""
+
+    references: list[Uint16s]
+    """(C,) of (S,) reference numbers, by decreasing part in the score."""
+    overlap: list[Float32s]
+    """(C,) of (S,) common share of a box, mean over the boxes, 0..1."""
+
+
+@dataclass(frozen=True, eq=False)
 class Ranking:
     """The places of a map that are most like a query, best first."""
 

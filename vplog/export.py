@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from vplog import tum
 from vplog.errors import ResultError
 from vplog.report import gather_tracks
-from vplog.results import geo, poses, tables, tum
+from vplog.results import geo, poses, tables
 from vplog.results.atomic import replacing
 from vplog.results.rrd import write_rrd
 from vplog.results.run_record import read_single_run

@@ -1,9 +1,9 @@
-"""From what drives and their ledgers hold to the joint graph of several, and back."""
+"""Several drives and the ledgers between them in one graph, and its results in tables: for runs and for maps."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,38 +11,104 @@ from vplog.back_end import by_odometry
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
+from vplog.graph.correct import correct_trajectory
 from vplog.graph.refine import rescaled
+from vplog.results import tables
 
 if TYPE_CHECKING:
-    from vplog.data import Closures, Floats, PoseGraph
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from vplog.data import Closures, Floats, Keyframes, Odometry, PoseGraph, Trajectory
+    from vplog.pipeline import Pipeline
+
+    Ledgers = Mapping[tuple[int, int], Closures]
+    """By numbers of the later drive, whose keyframes are the queries, and of the earlier one."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedDrive:
+    """A drive as its own run solved it."""
+
+    keyframes: Keyframes
+    graph: graph_joint.Drive
+    odometry: Callable[[], Odometry]
+    """Needed for its trajectory alone."""
+
+
+def solve_drives(
+    drives: Sequence[SolvedDrive], ledgers: Ledgers, pipeline: Pipeline
+) -> tuple[graph_joint.Joined, dict[tuple[int, int], Closures]]:
+    """The maps that the drives make, and the ledgers with weights, residuals and verdicts of the solve. Raises
+    GraphError where a graph cannot be solved."""
+    between = [_between_of(*pair, ledger) for pair, ledger in ledgers.items()]
+    graphs = [drive.graph for drive in drives]
+    joined = graph_joint.join(graphs, between, pipeline.solve, pipeline.join, pipeline.refine)
+    judged = map(_judged_by, ledgers.values(), joined.weight, joined.residual)
+    return joined, dict(zip(ledgers, judged, strict=True))
 
 
 def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor: float) -> graph_joint.Drive:
-    """A drive's graph, at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0), with
-    the odometry's noise as it was said: `sigma_factor` is what the solve made of it.
-
-    The metres stay as they were found: with the same noise for all, the joint solve judges it anew.
-    """
+    """The graph of a drive at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0),
+    with the odometry's noise before its solve scaled that by `sigma_factor`: the joint solve estimates it again, with
+    the same scale for all."""
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
-    said = rescaled(graph, odometry, odometry, 1.0 / sigma_factor**2, 1.0)
+    claimed = rescaled(graph, odometry, odometry, 1.0 / sigma_factor**2, 1.0)
     used = np.flatnonzero(np.isfinite(closures.weight))
     metric = np.array([closures.scale[row] != "none" for row in used.tolist()], bool)
-    of_odometry = by_odometry(said, closures, np.concatenate([used[metric], used[~metric]]))
-    kept = np.flatnonzero(odometry | (weight > 0.5))
+    of_odometry = by_odometry(claimed, closures, np.concatenate([used[metric], used[~metric]]))
+    edges = np.flatnonzero(odometry | (weight > 0.5))
     own = replace(
-        said,
-        a=graph.a[kept],
-        b=graph.b[kept],
-        a_from_b=said.a_from_b[kept],
-        information=said.information[kept],
-        kind=[graph.kind[edge] for edge in kept.tolist()],
+        claimed,
+        a=graph.a[edges],
+        b=graph.b[edges],
+        a_from_b=claimed.a_from_b[edges],
+        information=claimed.information[edges],
+        kind=[graph.kind[edge] for edge in edges.tolist()],
     )
-    return graph_joint.Drive(own, of_odometry[kept], sigma_factor)
+    return graph_joint.Drive(own, of_odometry[edges], sigma_factor)
 
 
-def between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
+def pair_record(query_drive: str, match_drive: str, ledger: Closures) -> dict[str, Any]:
+    """What run.json and component.json say of a pair of drives."""
+    kept = int(np.nansum(ledger.weight))
+    return {
+        "query_drive": query_drive,
+        "match_drive": match_drive,
+        "candidates": len(ledger),
+        "verified": int(np.isfinite(ledger.weight).sum()),
+        "kept": kept,
+        "median_residual_sigma": float(np.nanmedian(ledger.residual_after)) if kept else None,
+    }
+
+
+def write_ledgers(path: Path, drives: Sequence[SolvedDrive], ledgers: Ledgers, header: tables.TableMetadata) -> None:
+    """The table of the candidates of all pairs."""
+    rows = [
+        (drives[later].keyframes, drives[earlier].keyframes, ledger) for (later, earlier), ledger in ledgers.items()
+    ]
+    tables.write_joins(path, rows, header)
+
+
+def write_drive(
+    folder: Path, prefix: str, drive: SolvedDrive, poses: Floats, header: tables.TableMetadata
+) -> Trajectory:
+    """Tables of keyframes (N, 4, 4) and trajectory of a drive in the frame of its map. Returns the trajectory."""
+    odometry = drive.odometry()
+    trajectory = correct_trajectory(odometry, drive.keyframes, poses)
+    tables.write_keyframes(folder / f"{prefix}keyframes.parquet", drive.keyframes, poses, header)
+    tables.write_trajectory(folder / f"{prefix}trajectory.parquet", trajectory, odometry, header)
+    return trajectory
+
+
+def _accepted(ledger: Closures) -> np.ndarray:
+    """Rows of the verified closures."""
+    return np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
+
+
+def _between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
     """The verified closures of a ledger, for the graph."""
-    rows = np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
+    rows = _accepted(ledger)
     shared = busier(ledger.match[rows], ledger.query[rows])
     return graph_joint.Between(
         later,
@@ -55,9 +121,9 @@ def between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Betwee
     )
 
 
-def judged_by(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
-    """The ledger with what the joint solve made of its verified rows."""
-    rows = np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
+def _judged_by(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
+    """The ledger with weights and residuals (L,) of its verified rows from the joint solve."""
+    rows = _accepted(ledger)
     weights, residuals, verdict = np.full(len(ledger), np.nan), np.full(len(ledger), np.nan), list(ledger.verdict)
     weights[rows], residuals[rows] = weight, residual
     for row in rows[weight < 0.5].tolist():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,7 +49,7 @@ def verify_in_parts(
         share = cache.result("calibrate", of, [settings], _CODE, exact, lambda: calibration_share(drive, threads))
     found, reused, done, places = [], 0, 0, _parts(proposals.match)
     for number, rows in enumerate(places):
-        part = _taken(proposals, rows)
+        part = proposals.rows(rows)
         cache.saw(candidates=[part.query, part.match, part.rank, part.score, part.support], share=share)
         name = f"verify-{number:06d}"
         found.append(
@@ -63,7 +63,7 @@ def verify_in_parts(
         reused += cache.told.pop(name)["result"] == "reused"
         done += len(rows)
     cache.tell("verify", len(places), reused)
-    return _together(found, places)
+    return merged(found, places)
 
 
 def _parts(match: np.ndarray) -> list[Ints]:
@@ -75,12 +75,8 @@ def _parts(match: np.ndarray) -> list[Ints]:
     return [np.sort(order[number == part]) for part in np.unique(number)]
 
 
-def _taken(proposals: Proposals, rows: Ints) -> Proposals:
-    return replace(proposals, **{field.name: getattr(proposals, field.name)[rows] for field in fields(proposals)})
-
-
-def _together(parts: Sequence[Closures], rows: Sequence[Ints]) -> Closures:
-    """The ledgers of the parts as one; `rows` are the places of their candidates in it."""
+def merged(parts: Sequence[Closures], rows: Sequence[Ints]) -> Closures:
+    """One ledger of several parts, by the numbers `rows` of their candidates."""
     place = np.argsort(np.concatenate(rows), kind="stable")
     columns = {}
     for field in fields(Closures):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import model_validator
 
-from vplog import logs, record
+from vplog import logs, record, tum
 from vplog.back_end import about_gps, back_end
 from vplog.cores import limited
 from vplog.data import Closures, EdgeKind, Keyframes, Reference
@@ -38,7 +38,7 @@ from vplog.places.stored import load_references
 from vplog.recognise import describe, find_candidates, name_shared
 from vplog.references import LibrarySettings
 from vplog.report import write_report
-from vplog.results import g2o, mcap, run_record, tables, tum
+from vplog.results import g2o, mcap, run_record, tables
 from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run_folder import begun
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from vplog.data import Camera, Odometry, PoseGraph, Solution, Trajectory
-    from vplog.features.store import FeaturesOf, FeatureStore
+    from vplog.features.store import FeaturesOf
     from vplog.results.shown import Shown
     from vplog.stages import Log, PlaceState
 
@@ -152,6 +152,12 @@ class Run:
     closures: Closures
     graph: PoseGraph
     solution: Solution
+    odometry: Odometry
+    camera: Camera
+    features: FeaturesOf
+    """Of the keyframes, as long as the stage cache is there."""
+    places: Sequence[Any]
+    """Descriptors of the keyframes."""
     record: dict[str, Any] = field(default_factory=dict)
 
 
@@ -163,18 +169,16 @@ def run(
     topics: logs.TopicChoice | None = None,
     threads: int = 1,
     progress: Progress = lambda *_: None,
-    features: FeatureStore | None = None,
     cache: Path | None = None,
     use_cache: bool = True,
     force: bool = False,
 ) -> Run:
     """Drive in, run folder out. Raises VplogError with one line where that cannot be.
 
-    `path` is a log, or several that are the parts of one recording, in any order. The features of the keyframes go to
-    the store given too, for who needs them afterwards. What stages come to is kept in `cache`, a folder of this drive
-    alone (by default in `out`), and found there by a later run as far as that would make the same; without
-    `use_cache` nothing is found and nothing stays. What `out` holds stays until the new run is whole; the run of
-    another log is replaced with `force` only.
+    `path` is a log, or several that are the parts of one recording, in any order. What stages come to is kept in
+    `cache`, a folder of this drive alone (by default in `out`), and found there by a later run as far as that would
+    make the same; without `use_cache` nothing is found and nothing stays. What `out` holds stays until the new run is
+    whole; the run of another log is replaced with `force` only.
     """
     topics = topics or logs.TopicChoice()
     log = logs.open_drive(files_of(path), topics)
@@ -199,8 +203,6 @@ def run(
             seen = extract(log, parts, stages, threads, progress)
             keyframes, lost = kept(selected, seen)
             warnings += lost + ([_UNCALIBRATED.format(camera=camera.name)] if camera.matrix is None else [])
-            if features is not None:
-                features.extend(seen)
         known = references_of(library, log, selected, keyframes, seen, pipeline.library, stages, threads)
         with watch.stage("learn", len(known)):
             state = learn(pipeline, library, known, threads)
@@ -231,7 +233,7 @@ def run(
             closures, graph, solution = solved.closures, solved.refined.graph, solved.refined.solution
             warnings += solved.warnings
         with watch.stage("write"):
-            done = Run(keyframes, closures, graph, solution)
+            done = Run(keyframes, closures, graph, solution, odometry, camera, seen, descriptors)
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
             column = [state.to_arrow(descriptors)]
             tables.write_descriptors(made / "descriptors.parquet", keyframes, column, state.arrow_type, header)
@@ -243,7 +245,7 @@ def run(
                 gps=log.gps(), earth=earth_of(solved.trajectory, log.gps(), on_earth),
                 about={"versions": head["versions"], "inputs": hashes.result()},
             )  # fmt: skip
-            write_results(made, done, odometry, solved.trajectory, camera, header, shown)
+            write_results(made, done, solved.trajectory, header, shown)
             if library is None:
                 state.save(made / "library")
             stages.finish(path, inputs, seen.files)
@@ -293,9 +295,7 @@ def finish(out: Path, account: dict[str, Any], stages: StageCache) -> dict[str, 
 def write_results(
     out: Path,
     done: Run,
-    odometry: Odometry,
     trajectory: Trajectory,
-    camera: Camera,
     header: tables.TableMetadata,
     shown: Shown | None = None,
 ) -> None:
@@ -306,10 +306,10 @@ def write_results(
     tables.write_keyframes(out / "keyframes.parquet", keyframes, poses, header)
     tables.write_closures(out / "closures.parquet", closures, keyframes, header)
     tables.write_edges(out / "edges.parquet", graph, solution, residual, header)
-    tables.write_trajectory(out / "trajectory.parquet", trajectory, odometry, header)
+    tables.write_trajectory(out / "trajectory.parquet", trajectory, done.odometry, header)
     tum.write_tum(out / "trajectory.tum", trajectory)
     g2o.write_g2o(out / "graph.g2o", graph, poses)
-    mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, camera, shown)
+    mcap.write_mcap(out / "result.mcap", keyframes, poses, graph, closures, header, done.camera, shown)
 
 
 def references_of(

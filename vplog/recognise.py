@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.extract import map_in_order, one_thread_each
 from vplog.loops.propose import candidate_stops, propose
 from vplog.places.sequence import rank_places
-from vplog.places.shared import SharesReferences
+from vplog.stages import BoxState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -49,7 +49,7 @@ def find_candidates(
 
 def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:
     """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
-    if not isinstance(state, SharesReferences):
+    if not isinstance(state, BoxState):
         return closures
     found = state.shared(descriptors, closures.query, closures.match)
     return replace(closures, shared_references=found.references, shared_overlap=found.overlap)

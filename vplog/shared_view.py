@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import geometry
-from vplog.boxes import boxes_of, references_of, windows_of
 from vplog.loops import undistort
 from vplog.loops.matching import match_features
 from vplog.loops.verify_epipolar import agreeing
-from vplog.places.hybrid import HybridState
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Camera, Features, Float32s, Floats
     from vplog.loops.verify import VerifySettings
+    from vplog.stages import BoxState
 
 SHOWN = 4
 """References that are shown of a closure: more colours are not told apart."""
@@ -97,14 +96,12 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], cam
         return (error * focal_px < most_px) & (ahead | far)
 
 
-def find_boxes(state: Any, query: Any, match: Any, references: list[int]) -> list[SharedBoxes]:
+def find_boxes(state: BoxState, query: Any, match: Any, references: list[int]) -> list[SharedBoxes]:
     """Of the references shared, best first, those drawn: their boxes, and the windows whose boxes agree best.
 
     Of windows that agree alike one is taken that no other reference has shown yet.
     """
-    if isinstance(state, HybridState):
-        state, query, match = state.bobb, query.boxes, match.boxes
-    mine, theirs = boxes_of(state, query), boxes_of(state, match)
+    mine, theirs = state.boxes(query), state.boxes(match)
     result: list[SharedBoxes] = []
     used: list[int] = []
     for reference in references[:SHOWN]:
@@ -116,8 +113,8 @@ def find_boxes(state: Any, query: Any, match: Any, references: list[int]) -> lis
         seen = np.isin(np.arange(len(here)), used)
         i, j = np.unravel_index(np.argmax(common - 1e-6 * seen[:, None] + 1e-9 * np.eye(len(here))), common.shape)
         used.append(int(i))
-        windows = windows_of(state, int(rank))[i], windows_of(state, int(other))[j]
-        image = references_of(state)[reference].image
+        windows = state.windows(int(rank))[i], state.windows(int(other))[j]
+        image = state.references[reference].image
         result.append(SharedBoxes(reference, image, here, there, *windows, (int(i), int(j))))
     return result
 

@@ -9,22 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import geodesy, geometry
-from vplog.boxes import boxes_of, references_of, voting_map, windows_of
 from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.extract import one_thread_each
-from vplog.places.bobb import BobbState
-from vplog.places.bobb_paper import PaperBobbState
-from vplog.places.hybrid import HybridState
 from vplog.results.collage import Half, Panel, collage
 from vplog.results.previews import jpeg, scaled_size, shrink
 from vplog.results.shown import Earth, Explained, Shown
 from vplog.shared_view import find_agreement, find_boxes
+from vplog.stages import BoxState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vplog.boxes import BoxState
     from vplog.data import Bytes, Camera, Closures, Features, Gps, Reference, Trajectory
     from vplog.loops.verify import VerifySettings
     from vplog.results.previews import PictureSettings, Previews
@@ -59,8 +55,7 @@ def finished_picture(
     pictures: PictureSettings, threads: int, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
 ) -> Shown:  # fmt: skip
     """All that result.mcap shows of a run, made while its features are at hand."""
-    boxed = box_state(seen.state)
-    camera = seen.camera
+    state, camera = seen.state, seen.camera
     small = {
         number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
         for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
@@ -72,7 +67,7 @@ def finished_picture(
     return Shown(
         image=previews.__getitem__ if len(previews) else None,
         image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
-        explained=None if boxed is None else lambda row: explain(boxed, _boxes(seen.state, seen.places[row])),
+        explained=(lambda row: explain(state, seen.places[row])) if isinstance(state, BoxState) else None,
         references=small,
         pictures=drawn,
         gps=gps,
@@ -81,35 +76,22 @@ def finished_picture(
     )
 
 
-def box_state(state: Any) -> BoxState | None:
-    """The recogniser's state where it is one with boxes."""
-    if isinstance(state, HybridState):
-        return state.bobb
-    return state if isinstance(state, BobbState | PaperBobbState) else None
-
-
 def explain(state: BoxState, place: Any) -> Explained | None:
     """Where the parts of a keyframe were found on the reference that explains it best; None where none does."""
-    found = boxes_of(state, place)
+    found = state.boxes(place)
     if not len(found.references):
         return None
-    return Explained(found.references.tolist(), windows_of(state, 0), found.corners[0])
+    return Explained(found.references.tolist(), state.windows(0), found.corners[0])
 
 
-def reference_use(state: Any, places: Sequence[Any]) -> list[int] | None:
+def reference_use(state: PlaceState, places: Sequence[Any]) -> list[int] | None:
     """How many keyframes each reference explains, or None for a recogniser without boxes."""
-    boxed = box_state(state)
-    if boxed is None:
+    if not isinstance(state, BoxState):
         return None
-    count = np.zeros(len(references_of(boxed)), np.int64)
+    count = np.zeros(len(state.references), np.int64)
     for place in places:
-        count[boxes_of(boxed, _boxes(state, place)).references] += 1
+        count[state.boxes(place).references] += 1
     return count.tolist()
-
-
-def _boxes(state: Any, place: Any) -> Any:
-    """The part of a place that is boxes."""
-    return place.boxes if isinstance(state, HybridState) else place
 
 
 def choose_examples(closures: Closures, count: int) -> list[int]:
@@ -159,16 +141,16 @@ def _panels(
     row: int, nodes: Sequence[int], features: Sequence[Features], seen: Seen, closures: Closures
 ) -> list[Panel]:
     """Boxes of both on the references they share most on, and how both vote on the first of these."""
-    shared, boxed = closures.shared_references[row].tolist(), box_state(seen.state)
-    if boxed is None or not shared:
+    shared, state = closures.shared_references[row].tolist(), seen.state
+    if not isinstance(state, BoxState):
         return []
     panels, none = [], np.zeros((0, 4))
-    for found in find_boxes(seen.state, seen.places[nodes[0]], seen.places[nodes[1]], shared)[:2]:
+    for found in find_boxes(state, seen.places[nodes[0]], seen.places[nodes[1]], shared)[:2]:
         name = f"reference {found.reference}"
         panels.append(Panel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
         if len(panels) <= _VOTED:
             for who, one in zip(("query", "match"), features, strict=True):
-                votes = voting_map(boxed, one, found.reference)
+                votes = state.voting_map(one, found.reference)
                 panels.append(Panel(found.image, f"votes of the {who}", none, none, votes))
     return panels
 

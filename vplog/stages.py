@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from vplog.data import (
+        Boxes,
         Bytes,
         Camera,
         Features,
@@ -18,12 +19,14 @@ if TYPE_CHECKING:
         Floats,
         Frame,
         Gps,
+        Int32s,
         Ints,
         LogInfo,
         Odometry,
         PoseGraph,
         Ranking,
         Reference,
+        SharedReferences,
         Solution,
     )
 
@@ -122,6 +125,54 @@ class PlaceState(Protocol):
     def index(self, descriptors: Sequence[Any]) -> PlaceIndex: ...
 
     def save(self, folder: Path) -> None: ...
+
+
+@runtime_checkable
+class BoxState(PlaceState, Protocol):
+    """A recogniser that explains an image by boxes on reference images."""
+
+    @property
+    def references(self) -> Sequence[Reference]:
+        """The library, in the order of the reference numbers of places."""
+        ...
+
+    def windows(self, rank: int) -> Floats:
+        """(I, 4) x0 y0 x1 y1, as shares of an image's sides: its windows that are searched on the reference of that
+        rank."""
+        ...
+
+    def boxes(self, place: Any) -> Boxes: ...
+
+    def voting_map(self, features: Features, reference: int) -> Floats:
+        """(rows, columns) votes of all features of an image for a reference, 1 at most; zeros without a vote."""
+        ...
+
+    def shared(self, places: Sequence[Any], query: Int32s, match: Int32s) -> SharedReferences:
+        """The references that explain both places of each of C pairs of rows of `places`."""
+        ...
+
+
+@runtime_checkable
+class CodedState(PlaceState, Protocol):
+    """A recogniser whose places are short codes, which a map indexes by inverted lists on disk."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of references, and codes of a place on each."""
+        ...
+
+    @property
+    def pairing(self) -> Any:
+        """Which codes of two places are compared."""
+        ...
+
+    def overlaps(self) -> Bytes:
+        """(256, 256) similarity of two codes."""
+        ...
+
+    def lists(self, *columns: pa.Array) -> Any:
+        """The inverted lists of the places of several columns. Raises LibraryError where one is of another library."""
+        ...
 
 
 def index_of_part(state: PlaceState, descriptors: Sequence[Any]) -> PlaceIndex:

@@ -1,4 +1,4 @@
-"""Poses over time from a TUM file, which a stranger may have written."""
+"""TUM files, one pose a line, as the TUM RGB-D benchmark and evo have them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 
 from vplog import geometry
 from vplog.remote import reason
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Floats, Ints
+    from vplog.data import Floats, Ints, Trajectory
     from vplog.errors import VplogError
 
 _LINE_LIMIT = 4096
@@ -72,3 +73,19 @@ def _pose(fields: list[str], where: str, failure: type[VplogError]) -> tuple[int
     if abs(norm - 1.0) > _UNIT_TOLERANCE:
         raise failure(f"{where}: the quaternion has length {norm:.3g} instead of 1. {_FORMAT}")
     return int((stamp * 10**9).to_integral_value()), row
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """`stamp tx ty tz qx qy qz qw` in s, m and 1; 9 decimals, the stamp's exact to the ns."""
+    poses = trajectory.world_from_body
+    values = np.concatenate([poses[:, :3, 3], geometry.quaternion(poses[:, :3, :3])], axis=1)
+    with replacing(path) as stream:
+        stream.write(b"# timestamp tx ty tz qx qy qz qw (world_from_body)\n")
+        for stamp_ns, row in zip(trajectory.stamp_ns.tolist(), values.tolist(), strict=True):
+            stream.write(f"{seconds(stamp_ns)} {' '.join(f'{value:.9f}' for value in row)}\n".encode())
+
+
+def seconds(stamp_ns: int) -> str:
+    """A stamp in s with all its digits; a float has too few for the clock of today."""
+    whole, rest = divmod(abs(stamp_ns), 1_000_000_000)
+    return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"

@@ -12,7 +12,7 @@ from vplog import geometry, logs
 from vplog.data import Camera, Gps, Odometry, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice, open_truth
-from vplog.results.tum import write_tum
+from vplog.tum import write_tum
 
 from .data import data
 

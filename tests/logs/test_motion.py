@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs import TopicChoice
-from vplog.results.tum import write_tum
+from vplog.tum import write_tum
 
 from .drives import START_NS, Written, matrices, matrix, store, write_foxglove, write_ros1, write_ros2
 

@@ -12,9 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tests.results.example import COUNT, make_run
+from vplog import tum
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.results import run_record, tables, tum
+from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
     from pathlib import Path

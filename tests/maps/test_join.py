@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from vplog import geometry
-from vplog.between import likely_drives, no_candidates, with_drive
+from vplog.between import candidates_among, likely_drives, no_candidates, proposed_in, with_proposals
 from vplog.data import Ranking
 from vplog.errors import ResultError
 from vplog.evaluate.truth import read_truth
@@ -278,9 +278,11 @@ def test_a_map_is_joined_on_demand(copy: Path, verb: Callable[..., Said], tmp_pa
 class Likeness:
     """Places are numbers, the more alike the closer."""
 
+    def __init__(self, known: list[float] | None = None) -> None:
+        self.known = np.array(known or [])
+
     def index(self, descriptors: list[float]) -> Likeness:
-        self.known = np.array(descriptors)
-        return self
+        return Likeness(descriptors)
 
     def query(self, descriptor: float, k: int, stop: int | None = None) -> Ranking:
         score = (1.0 / (1.0 + np.abs(self.known - descriptor))).astype(np.float32)
@@ -299,8 +301,12 @@ def test_candidates_are_bounded_over_all_drives() -> None:
         candidates = no_candidates()
         for number in order:
             state: Any = Likeness()
-            candidates = with_drive(candidates, number, later, drives[number], state, settings)
+            more = proposed_in(later, drives[number], state, settings)
+            candidates = with_proposals(candidates, number, more, settings)
         found.append(candidates)
+    for threads in (1, 3):
+        state, searched = Likeness(), {7: range(7)}
+        found.append(candidates_among({7: later}, drives.__getitem__, searched, state, settings, threads)[7])
     for one in found:
         proposals = one.proposals
         assert np.array_equal(one.drive, found[0].drive)

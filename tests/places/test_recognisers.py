@@ -23,6 +23,7 @@ from vplog.places.gist import GistSettings
 from vplog.places.hybrid import HybridSettings
 from vplog.places.thumbnail import ThumbnailSettings
 from vplog.places.vlad import VladSettings
+from vplog.stages import BoxState, CodedState
 
 from .pictures import nothing
 
@@ -191,6 +192,32 @@ def test_an_image_without_features_is_described(case: Case, references: list[Ref
         assert index.query(case.places[0], 5).rows.tolist() == [1]
         with pytest.raises(LibraryError, match="feature"):
             case.settings.learn([replace(reference, features=BLANK) for reference in references[:3]], 1)
+
+
+def test_boxes_of_any_recogniser_that_has_them(case: Case, references: list[Reference]) -> None:
+    state = case.state
+    assert isinstance(state, BoxState) == case.settings.kind.startswith(("bobb", "hybrid"))
+    assert isinstance(state, CodedState) == (case.settings.kind == "bobb")
+    if not isinstance(state, BoxState):
+        return
+    assert [one.stamp_ns for one in state.references] == [one.stamp_ns for one in references]
+    places = [*case.places, state.describe(BLANK)]
+    found = [state.boxes(place) for place in places]
+    assert not len(found[-1].references)
+    for one in found:
+        assert one.corners.shape[:2] == (len(one.references), len(state.windows(0)))
+        inside = one.corners[~np.isnan(one.corners).any(axis=2)]
+        assert np.all((inside >= 0) & (inside <= 1))
+        assert np.all(inside[:, :2] < inside[:, 2:])
+    query, match = np.divmod(np.arange(len(places) ** 2, dtype=np.int32), len(places))
+    shared = state.shared(places, query, match)
+    for q, m, numbers in zip(query, match, shared.references, strict=True):
+        assert set(numbers.tolist()) == set(found[q].references.tolist()) & set(found[m].references.tolist())
+    features = references[0].features
+    votes = state.voting_map(features, int(found[0].references[0]))
+    assert votes.min() >= 0
+    assert votes.max() == 1.0
+    assert not state.voting_map(BLANK, 0).any()
 
 
 def test_a_library_needs_references(case: Case) -> None:

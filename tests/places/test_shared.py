@@ -11,7 +11,7 @@ from vplog.places import shared
 from vplog.places.bobb import BobbSettings
 from vplog.places.bovf import BovfSettings
 from vplog.places.hybrid import HybridSettings
-from vplog.places.shared import SharesReferences
+from vplog.stages import BoxState
 
 from .pictures import noisy, nothing
 
@@ -83,10 +83,10 @@ def test_pairs_are_compared_alike_however_many_at_once(
 
 def test_only_recognisers_with_boxes_share_references(references: list[Reference]) -> None:
     hybrid = HybridSettings(bobb=TINY, words=2, bits=8).learn(references, 1)
-    assert isinstance(hybrid, SharesReferences)
+    assert isinstance(hybrid, BoxState)
     places = [hybrid.describe(r.features) for r in references]
     query, match = pairs(len(places))
     found = hybrid.shared(places, query, match)
     boxes = hybrid.bobb.shared([place.boxes for place in places], query, match)
     assert all(map(np.array_equal, found.references, boxes.references))
-    assert not isinstance(BovfSettings(features=250).learn(references, 1), SharesReferences)
+    assert not isinstance(BovfSettings(features=250).learn(references, 1), BoxState)

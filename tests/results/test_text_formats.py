@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from vplog.data import Trajectory
 from vplog.evaluate.truth import read_truth
 from vplog.results.g2o import write_g2o
-from vplog.results.tum import seconds, write_tum
+from vplog.tum import seconds, write_tum
 
 from .example import COUNT, make_run, random_poses
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,7 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from vplog.data import Float32s, Int32s, Ints, Keyframes, Ranking
+    from vplog.data import Bools, Float32s, Int32s, Ints, Keyframes, Ranking
 
 
 class ProposeSettings(Settings):
@@ -55,6 +55,10 @@ class Proposals:
     """(C,) the recogniser's similarity."""
     support: Int32s
     """(C,) neighbours of the pair that agree by sequence; 0 where no sequence was used."""
+
+    def rows(self, rows: Ints | Bools) -> Proposals:
+        """Some of the candidates."""
+        return Proposals(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
 def candidate_stops(keyframes: Keyframes, settings: ProposeSettings) -> Ints:

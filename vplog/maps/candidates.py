@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.between import no_candidates, proposed_in, with_proposals
-from vplog.extract import map_in_order
+from vplog.between import candidates_among
 from vplog.maps.damage import reading_drive
 from vplog.maps.index import as_described, update_index
 from vplog.maps.search import best_places
 from vplog.maps.sequences import PLACES_A_VIEW, credits_of
-from vplog.places.bobb import BobbState
 from vplog.results import tables
+from vplog.stages import CodedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Mapping, Sequence
 
     from vplog.between import Candidates
-    from vplog.loops.propose import Proposals
     from vplog.maps.members import Member
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
@@ -48,32 +45,21 @@ def candidates_of(
     store: Store, members: Sequence[Member], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
     threads: int = 1, progress: Progress = lambda *_: None,
 ) -> dict[int, Candidates]:  # fmt: skip
-    """For each new drive, by number, its best candidates in the drives of a lower number that are worth a look.
-
-    Each thread has a drive of its own to look through: of a drive's few hundred views, each is done too soon to share.
-    """
-    found = {number: no_candidates() for number in new}
+    """For each new drive, by number, its best candidates in the drives of a lower number that are worth a search."""
+    found: dict[int, Candidates] = {}
     done, total = 0, sum(min(number, most_searched(pipeline)) for number in new)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for first in range(0, len(new), _AT_ONCE):
-            block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
-            searched = worth_a_search(store, members, block, state, pipeline, threads)
 
-            def look_through(
-                earlier: int, block: dict[int, Sequence[Any]] = block, searched: dict[int, Container[int]] = searched
-            ) -> list[tuple[int, Proposals]]:
-                those = [later for later in block if earlier in searched[later]]
-                if not those:
-                    return []
-                known = block.get(earlier) or places_of(store, members[earlier], state)
-                return [(later, proposed_in(block[later], known, state, pipeline)) for later in those]
+    def tell(count: int) -> None:
+        nonlocal done
+        done += count
+        progress("search the map", done, total)
 
-            looked = map_in_order(pool, look_through, range(max(block)), ahead=2 * threads)
-            for earlier, proposed in enumerate(looked):
-                for later, more in proposed:
-                    found[later] = with_proposals(found[later], earlier, more, pipeline)
-                done += len(proposed)
-                progress("search the map", done, total)
+    for first in range(0, len(new), _AT_ONCE):
+        block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
+        searched = worth_a_search(store, members, block, state, pipeline, threads)
+        found |= candidates_among(
+            block, lambda number: places_of(store, members[number], state), searched, state, pipeline, threads, tell
+        )
     return found
 
 
@@ -94,7 +80,7 @@ def worth_a_search(
     """
     most = most_searched(pipeline)
     searched: dict[int, Container[int]] = {number: range(number) for number in later}
-    if max(later) <= most or not isinstance(state, BobbState) or store.mirror is not None:
+    if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
         return searched
     about = store.drives()
     parts, _ = update_index(store, {one.drive: about[one.drive] for one in members}, state.hash, state, threads)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Int32s
     from vplog.maps.store import Store
-    from vplog.places.bobb import BobbState
+    from vplog.stages import CodedState
 
     Progress = Callable[[str, int, int], None]
 
@@ -64,7 +64,7 @@ def update_index(
     store: Store,
     drives: Mapping[str, Mapping[str, Any]],
     library: str,
-    state: BobbState,
+    state: CodedState,
     threads: int = 1,
     progress: Progress = lambda *_: None,
 ) -> tuple[list[Part], list[str]]:
@@ -133,10 +133,12 @@ def _descriptors(store: Store, drive: str) -> Path:
     return store.file(drive, "descriptors.parquet")
 
 
-def _open_all(store: Store, library: str, state: BobbState) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
+def _open_all(
+    store: Store, library: str, state: CodedState
+) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
     """The segments that fit the library, the files that are of no use, and why the damaged ones are not."""
     known, useless, warnings = [], [], []
-    shape = (len(state.matcher), state.settings.boxes)
+    shape = state.shape
     for path in sorted(store.index.glob(f"*{SUFFIX}")):
         try:
             segment = open_segment(path)
@@ -193,7 +195,7 @@ def _plan(
     return absorbed, groups
 
 
-def _build(store: Store, group: Sequence[Content], library: str, state: BobbState, threads: int) -> Segment:
+def _build(store: Store, group: Sequence[Content], library: str, state: CodedState, threads: int) -> Segment:
     def read(one: Content) -> pa.Array:
         path = _descriptors(store, one.drive)
         with reading_drive(one.drive):

@@ -1,6 +1,6 @@
-"""Closures between the drives of a map, and one graph of those that they join; what is there already stays.
+"""Closures between the drives of a map, and one graph of those that they join; results that are up to date stay.
 
-A drive is looked for in all that came before it: first by its places, then, in the drives that hold most like them,
+A drive is searched in all that came before it: first by its places, then, in the drives that hold most like them,
 by geometry. Drives come in order of their IDs within a batch, and after all that were there.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 import time
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from vplog.between import likely_drives, shared_of
+from vplog.between import likely_pairs
 from vplog.cores import limited
 from vplog.maps import pairs
 from vplog.maps.candidates import candidates_of, places_of
@@ -28,12 +28,11 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
     from pathlib import Path
 
-    from vplog.loops.propose import Proposals
+    from vplog.between import DrivePair
     from vplog.maps.pairs import PairTask
     from vplog.maps.roster import Drives
-    from vplog.maps.seen import Sight
+    from vplog.maps.seen import CameraTrust
     from vplog.maps.store import Store
-    from vplog.places.shared import Shared
     from vplog.stages import PlaceState
 
     Progress = Callable[[str, int, int], None]
@@ -52,15 +51,6 @@ def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceSta
     return cast("PlaceState", pipeline.places.load(library, threads))
 
 
-class Wanted(NamedTuple):
-    """Candidates of one drive in another."""
-
-    later: int
-    earlier: int
-    proposals: Proposals
-    shared: Shared
-
-
 def join(
     store: Store,
     pipeline: Pipeline,
@@ -70,8 +60,8 @@ def join(
     places: Callable[[], PlaceState] | None = None,
     urls: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Verify what was not yet looked at, solve what that touches, and say what joins. `urls` open logs of drives that
-    were given now: a map has URLs without their queries.
+    """Verify the pairs of drives that are new or changed, solve the groups that have them, and return the record.
+    `urls` open the logs of drives given now: a map stores URLs without their queries.
 
     The caller holds the map's lock. With an executor its processes verify, pair by pair, each with `threads`; they
     must see the map and the logs under the same paths. Neither counts for the result. `places` gives what `load_places`
@@ -108,13 +98,13 @@ def _join(
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    blind = [
+    uncalibrated = [
         member.drive
         for member in drives.members
-        if (sight := pairs.known_sight(store, member, pipeline)) is not None and sight.camera["matrix"] is None
+        if (known := pairs.known_camera(store, member, pipeline)) is not None and known.camera["matrix"] is None
     ]
-    if blind:
-        unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(blind)}.")
+    if uncalibrated:
+        unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(uncalibrated)}.")
     return {
         "searched": [drives.members[at].drive for at in new],
         "pairs": len(ties),
@@ -129,44 +119,39 @@ def _join(
 def _search(
     store: Store, drives: Drives, new: Sequence[int], pipeline: Pipeline, threads: int, progress: Progress,
     load: Callable[[], PlaceState],
-) -> list[Wanted]:  # fmt: skip
+) -> list[DrivePair]:  # fmt: skip
     """The candidates of new drives that are worth verifying."""
     later = [at for at in new if at]  # the first has none before it
     if not later:
         return []
-    state, wanted = load(), []
-    for at, found in candidates_of(store, drives.members, later, state, pipeline, threads, progress).items():
-        own = places_of(store, drives.members[at], state)
-        for earlier in likely_drives(found, pipeline.join):
-            proposals = found.of(earlier)
-            shared = shared_of(proposals, state, own, places_of(store, drives.members[earlier], state))
-            wanted.append(Wanted(at, earlier, proposals, shared))
-    return wanted
+    state = load()
+    found = candidates_of(store, drives.members, later, state, pipeline, threads, progress)
+    return likely_pairs(found, lambda at: places_of(store, drives.members[at], state), state, pipeline.join)
 
 
 def _verify(
     store: Store,
     drives: Drives,
     new: Sequence[int],
-    wanted: Sequence[Wanted],
+    wanted: Sequence[DrivePair],
     pipeline: Pipeline,
     executor: Executor | None,
     threads: int,
     progress: Progress,
 ) -> tuple[int, dict[tuple[str, str], str]]:
     """Store the ledgers that are not there yet; how many those were, and why others could not be made, by drives."""
-    sights, blind = _sights(store, drives, new, wanted, pipeline, executor, threads)
+    cameras, failed = _cameras(store, drives, new, wanted, pipeline, executor, threads)
     reasons: dict[tuple[str, str], str] = {}
 
     def tasks() -> Iterator[PairTask]:
         for at, one in enumerate(wanted):
             later, earlier = drives.members[one.later], drives.members[one.earlier]
             progress("verify between drives", at, len(wanted))
-            if why := blind.get(one.later, "") or blind.get(one.earlier, ""):
+            if why := failed.get(one.later, "") or failed.get(one.earlier, ""):
                 reasons[later.drive, earlier.drive] = why
                 continue
             task = pairs.PairTask(
-                later, earlier, sights[one.later], sights[one.earlier], one.proposals, one.shared, pipeline,
+                later, earlier, cameras[one.later], cameras[one.earlier], one.proposals, one.shared, pipeline,
                 drives.library, threads,
             )  # fmt: skip
             if not pairs.is_stored(store, task):
@@ -186,51 +171,51 @@ def _verify(
     return computed, reasons
 
 
-def _sights(
-    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[Wanted], pipeline: Pipeline,
+def _cameras(
+    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair], pipeline: Pipeline,
     executor: Executor | None, threads: int,
-) -> tuple[dict[int, Sight], dict[int, str]]:  # fmt: skip
-    """How the drives see that are verified, by number, and why that cannot be told of others.
+) -> tuple[dict[int, CameraTrust], dict[int, str]]:  # fmt: skip
+    """Cameras of the drives that are verified, by number, and why others have none.
 
-    That of new drives is looked at now, while their features are at hand.
+    New drives are included, paired or not, while their features are in the caches of their runs.
     """
     paired = {at for one in wanted for at in (one.later, one.earlier)}
-    sights: dict[int, Sight] = {}
+    cameras: dict[int, CameraTrust] = {}
     missing: list[int] = []
     for at in sorted(paired | {at for at in new if drives.members[at].cache.is_dir()}):
-        known = pairs.known_sight(store, drives.members[at], pipeline)
+        known = pairs.known_camera(store, drives.members[at], pipeline)
         if known is None:
             missing.append(at)
         else:
-            sights[at] = known
-    blind: dict[int, str] = {}
-    work = partial(pairs.compute_sight, pipeline=pipeline, threads=threads)
-    for at, (member, sight, why) in zip(
+            cameras[at] = known
+    failed: dict[int, str] = {}
+    work = partial(pairs.compute_camera, pipeline=pipeline, threads=threads)
+    for at, (member, camera, why) in zip(
         missing, each_done(work, [drives.members[at] for at in missing], executor), strict=True
     ):
-        if sight is None:
-            blind[at] = why
+        if camera is None:
+            failed[at] = why
         else:
-            sights[at] = sight
-            pairs.put_sight(store, member, pipeline, sight)
-    return sights, blind
+            cameras[at] = camera
+            pairs.put_camera(store, member, pipeline, camera)
+    return cameras, failed
 
 
 def _remember(
-    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[Wanted],
+    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair],
     reasons: dict[tuple[str, str], str], pipeline: Pipeline,
 ) -> None:  # fmt: skip
-    """Write of each new drive what it was verified against."""
-    of_later: dict[int, list[Wanted]] = {at: [] for at in new}
+    """Write the pairs of each new drive."""
+    of_later: dict[int, list[DrivePair]] = {at: [] for at in new}
     for one in wanted:
         of_later[one.later].append(one)
     for at in new:
-        member, told = drives.members[at], []
+        member, known = drives.members[at], []
         for one in of_later[at]:
             earlier = drives.members[one.earlier]
             why = reasons.get((member.drive, earlier.drive), "")
             ledger = None if why else pairs.read_ledger(store, member.drive, earlier.drive)
-            told.append({
+            known.append({
                 "match": earlier.drive,
                 "match_key": earlier.key,
                 "candidates": 0 if ledger is None else len(ledger),
@@ -239,7 +224,7 @@ def _remember(
                 **({"reason": why} if why else {}),
             })  # fmt: skip
         position = drives.joins[at].position
-        drives.joins[at] = pairs.Joins(position, member.key, pairs.search_key(member, pipeline), tuple(told))
+        drives.joins[at] = pairs.Joins(position, member.key, pairs.search_key(member, pipeline), tuple(known))
         pairs.put_joins(store, member.drive, drives.joins[at])
 
 

@@ -40,13 +40,13 @@ def read_joint(root: Path) -> dict[str, Any]:
     )
     check_version(path, record.get("format"), FORMAT)
     if not sound:
-        raise ResultError(f"{path} is damaged. Run `vplog map join {root}` to write it anew.")
+        raise ResultError(f"{path} is damaged. Run `vplog map join {root}` to write it again.")
     return record
 
 
-def _is_component(told: Any) -> bool:
-    drives = told.get("drives") if isinstance(told, dict) else None
-    return isinstance(drives, list) and is_below(told.get("folder")) and all(isinstance(one, str) for one in drives)
+def _is_component(record: Any) -> bool:
+    drives = record.get("drives") if isinstance(record, dict) else None
+    return isinstance(drives, list) and is_below(record.get("folder")) and all(isinstance(one, str) for one in drives)
 
 
 def components_of(root: Path) -> list[dict[str, Any]]:
@@ -55,7 +55,7 @@ def components_of(root: Path) -> list[dict[str, Any]]:
 
 
 def components_in(store: Store) -> list[dict[str, Any]] | None:
-    """The same of any map; None where nothing was joined yet. Raises ResultError where the record is damaged."""
+    """`components_of` of any map; None where nothing was joined yet. Raises ResultError where the record is damaged."""
     if store.mirror is not None:
         store.mirror.rest(["joint.json"])
     return components_of(store.root) if (store.root / "joint.json").is_file() else None
@@ -69,7 +69,7 @@ def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[
 
 
 def write_joint(root: Path, record: dict[str, Any]) -> None:
-    """joint.json, unless it says that already."""
+    """Write joint.json, unless it holds the record already."""
     record, path = run_record.plain({"format": FORMAT, **record}), root / "joint.json"
     try:
         if path.is_file() and run_record.read_run_json(path) == record:

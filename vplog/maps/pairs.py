@@ -1,7 +1,7 @@
 """Closures between two drives of a map: a task that any process can do, and the file that keeps what came of it.
 
-    MAP/joins/drive=NEW/camera.json          how the drive sees, for those that come after it
-    MAP/joins/drive=NEW/features.parquet     the features of its keyframes that are looked at, for the same
+    MAP/joins/drive=NEW/camera.json          the drive's camera, for those that come after it
+    MAP/joins/drive=NEW/features.parquet     the features of its keyframes for verification, likewise
     MAP/joins/drive=NEW/match=OLD.parquet    the ledger of its keyframes in a drive before it
     MAP/joins/drive=NEW/joins.json           after which drives it came, and which of them it was verified against
 
@@ -19,28 +19,27 @@ from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.maps.keys import key_of
 from vplog.maps.layout import folder_name, quoted
-from vplog.maps.seen import Sight, checked_with, keep_features, sight_of
+from vplog.maps.seen import CameraTrust, camera_trust, keep_features, opened_drive
 from vplog.results import run_record, tables
 from vplog.results.atomic import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Closures
+    from vplog.data import Closures, SharedReferences
     from vplog.loops.propose import Proposals
     from vplog.maps.members import Member
     from vplog.maps.store import Store
     from vplog.pipeline import Pipeline
-    from vplog.places.shared import Shared
 
 
 _CODE = ("vplog.between", "vplog.extract", "vplog.features.sift", "vplog.results.tables")
 """Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
 less than another search of all drives is worth, and drive.json has them."""
 KEPT = ("camera.json", "features.parquet")
-"""Of a drive by itself, whatever it is called and whichever drives it is with."""
+"""Files that depend on the drive alone, not on its name or the other drives."""
 _SEARCH = "vplog.maps.candidates"
-"""What chooses the drives that one is searched in."""
+"""The module that chooses the drives that one is searched in."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +48,11 @@ class PairTask:
 
     later: Member
     earlier: Member
-    later_sight: Sight
-    earlier_sight: Sight
+    later_camera: CameraTrust
+    earlier_camera: CameraTrust
     proposals: Proposals
-    shared: Shared
-    """Of each of the proposals."""
+    shared: SharedReferences
+    """One row for each proposal."""
     pipeline: Pipeline
     library: str
     threads: int
@@ -63,8 +62,8 @@ class PairTask:
         """sha256 over all that the ledger depends on."""
         proposed = [getattr(self.proposals, name).tolist() for name in ("query", "match", "rank", "score", "support")]
         members = [
-            [one.drive, one.key, asdict(sight)]
-            for one, sight in ((self.later, self.later_sight), (self.earlier, self.earlier_sight))
+            [one.drive, one.key, asdict(camera)]
+            for one, camera in ((self.later, self.later_camera), (self.earlier, self.earlier_camera))
         ]
         return key_of({"members": members, "proposed": proposed, **depends(self.pipeline)})
 
@@ -77,34 +76,34 @@ def depends(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def compute_pair(task: PairTask) -> bytes:
-    """The table of the ledger. The same on any machine and any number of threads.
+    """The table of the ledger, the same on any machine and any number of threads.
 
     Raises LogError where features have to be extracted again and a log is gone or another one.
     """
     verify, threads = task.pipeline.verify, task.threads
     with (
-        checked_with(task.later, task.later_sight, verify, threads) as (later, of_later),
-        checked_with(task.earlier, task.earlier_sight, verify, threads) as (earlier, of_earlier),
+        opened_drive(task.later, task.later_camera, verify, threads) as (later, of_later),
+        opened_drive(task.earlier, task.earlier_camera, verify, threads) as (earlier, of_earlier),
     ):
 
         def fetch(queries: Any, matches: Any) -> None:
             of_later(queries)
             of_earlier(matches)
 
-        share = max(task.later_sight.rotation_share, task.earlier_sight.rotation_share)
+        share = max(task.later_camera.rotation_share, task.earlier_camera.rotation_share)
         ledger = closures_between(
-            task.proposals, later, earlier, task.pipeline.join, threads, share=share, fetch=fetch
+            task.proposals, later, earlier, task.pipeline.join, share, threads, fetch=fetch
         )  # fmt: skip
         ledger = with_shared(ledger, task.proposals, task.shared)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
         return tables.joins_as_bytes([(later.keyframes, earlier.keyframes, ledger)], header, task.key)
 
 
-def compute_sight(member: Member, pipeline: Pipeline, threads: int) -> Sight:
-    """How a drive sees, as a task; what its run left of features is kept for those that come later."""
+def compute_camera(member: Member, pipeline: Pipeline, threads: int) -> CameraTrust:
+    """The camera of a drive, as a task; features in the cache of its run are stored for later drives."""
     if pipeline.join.keep_features:
         keep_features(member, pipeline.verify)
-    return sight_of(member, pipeline.verify, threads)
+    return camera_trust(member, pipeline.verify, threads)
 
 
 def folder_of(store: Store, drive: str) -> Path:
@@ -116,7 +115,7 @@ def ledger_path(store: Store, later: str, earlier: str) -> Path:
 
 
 def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
-    """Write what `compute_pair` gave, as a whole. Raises ResultError."""
+    """Write the table of `compute_pair` as a whole. Raises ResultError."""
     path = ledger_path(store, task.later.drive, task.earlier.drive)
     _make(path.parent)
     with replacing(path) as stream:
@@ -124,11 +123,11 @@ def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
 
 
 def is_stored(store: Store, task: PairTask) -> bool:
-    """Whether the ledger is there, made from the same."""
+    """Whether the ledger is stored, made from the same."""
     path = ledger_path(store, task.later.drive, task.earlier.drive)
     try:
         return path.is_file() and tables.read_metadata(path).get("vplog.made_from") == task.key
-    except ResultError:  # damaged: it is made anew
+    except ResultError:  # damaged: it is computed again
         return False
 
 
@@ -138,7 +137,7 @@ def read_ledger(store: Store, later: str, earlier: str) -> Closures | None:
 
 
 def made_from(store: Store, later: str, earlier: str) -> str:
-    """Key of the ledger of a pair, as the table says. Raises ResultError."""
+    """Key of the stored ledger of a pair. Raises ResultError."""
     return tables.read_metadata(ledger_path(store, later, earlier)).get("vplog.made_from", "")
 
 
@@ -146,25 +145,25 @@ def verified(ledger: Closures | None) -> int:
     return 0 if ledger is None else sum(verdict is Verdict.ACCEPTED for verdict in ledger.verdict)
 
 
-def known_sight(store: Store, member: Member, pipeline: Pipeline) -> Sight | None:
-    """How a drive sees, where that is stored and was made from the same."""
+def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrust | None:
+    """The stored camera of a drive, unless it was made from something else."""
     record = _read(folder_of(store, member.drive) / "camera.json")
-    if record.get("made_from") != _sight_key(member, pipeline):
+    if record.get("made_from") != _camera_key(member, pipeline):
         return None
     try:
-        return Sight(dict(record["camera"]), float(record["rotation_share"]))
+        return CameraTrust(dict(record["camera"]), float(record["rotation_share"]))
     except (KeyError, TypeError, ValueError):
         return None
 
 
-def put_sight(store: Store, member: Member, pipeline: Pipeline, sight: Sight) -> None:
+def put_camera(store: Store, member: Member, pipeline: Pipeline, camera: CameraTrust) -> None:
     folder = folder_of(store, member.drive)
     _make(folder)
-    record = {"drive": member.drive, **asdict(sight), "made_from": _sight_key(member, pipeline)}
+    record = {"drive": member.drive, **asdict(camera), "made_from": _camera_key(member, pipeline)}
     run_record.write_run_json(folder / "camera.json", record, checksum=True)
 
 
-def _sight_key(member: Member, pipeline: Pipeline) -> str:
+def _camera_key(member: Member, pipeline: Pipeline) -> str:
     verify = pipeline.verify.model_dump(mode="json")
     return key_of(
         {"member": member.key, "verify": verify, "code": code_of("vplog.loops.verify", "vplog.extract")["code"]}
@@ -216,10 +215,10 @@ def put_joins(store: Store, drive: str, joins: Joins) -> None:
     run_record.write_run_json(folder / "joins.json", {"drive": drive, **asdict(joins)}, checksum=True)
 
 
-def forget(store: Store, drive: str, kept: set[str]) -> None:
-    """Remove ledgers of a drive in others than these, and what a killed writer left."""
+def forget(store: Store, drive: str, but: set[str]) -> None:
+    """Remove the ledgers of a drive in other drives than these, and files that a killed writer left."""
     folder = folder_of(store, drive)
-    known = {ledger_path(store, drive, earlier) for earlier in kept}
+    known = {ledger_path(store, drive, earlier) for earlier in but}
     for path in set(folder.glob("match=*.parquet")) - known:
         path.unlink(missing_ok=True)
     for path in folder.glob(".*.part"):
@@ -227,7 +226,7 @@ def forget(store: Store, drive: str, kept: set[str]) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """A record; empty where there is none, or a damaged one: it is made anew."""
+    """A record; empty where there is none or a damaged one, which is written again."""
     try:
         return run_record.read_run_json(path)
     except ResultError:

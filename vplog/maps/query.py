@@ -18,11 +18,11 @@ from vplog.maps.index import update_index
 from vplog.maps.search import best_places
 from vplog.maps.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
 from vplog.pipeline import Pipeline
-from vplog.places.bobb import BobbState
 from vplog.places.sequence import SequenceSettings
 from vplog.remote import RemotePath
 from vplog.results import tables
 from vplog.results.placed import placed_table, write_placed
+from vplog.stages import CodedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -109,7 +109,7 @@ def index_map(
         raise ResultError(f"The index of {root} is kept in a cache alone, and there is none. Name one with --cache.")
     with map_store.reading(root, cache) as store:
         _, _, state = open_map(store, threads)
-        if not isinstance(state, BobbState):
+        if not isinstance(state, CodedState):
             raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
 
         def update() -> tuple[dict[str, Any], list[Part], list[str]]:
@@ -193,7 +193,7 @@ def search(
     `bobb`. Lines are drawn in every drive of a map of up to EXACT_PLACES, else in the likely ones (`sequences.py`).
     """
     numbered = dict(enumerate(drives))
-    if not isinstance(state, BobbState):
+    if not isinstance(state, CodedState):
         top = min(top, sum(store.rows("descriptors", drive) for drive in drives))
         told = [] if executor is None else ["Ray was not used: a map of another recogniser than bobb is searched here."]
         return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told

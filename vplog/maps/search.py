@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Int32s, Ranking
     from vplog.maps.answers import Answers
     from vplog.maps.index import Part
-    from vplog.places.bobb import BobbState, Place
+    from vplog.places.bobb import Place
     from vplog.places.code_search import Pairing
+    from vplog.stages import CodedState
 
     Progress = Callable[[str, int, int], None]
 
@@ -53,7 +54,7 @@ class Shard:
 
 def best_places(
     parts: Sequence[Part],
-    state: BobbState,
+    state: CodedState,
     views: Sequence[Place],
     top: int,
     threads: int = 1,
@@ -64,7 +65,7 @@ def best_places(
     whose files they must see under the same path; without one `threads` do here. The same answers for any of them."""
     every = Shard(
         [part.path if part.path and executor else part.segment for part in parts],
-        [part.numbers for part in parts], views, state.overlaps(), state.settings.pairing, top, threads,
+        [part.numbers for part in parts], views, state.overlaps(), state.pairing, top, threads,
     )  # fmt: skip
     if executor is None:
         return search_shard(every, progress)

@@ -1,4 +1,4 @@
-"""Drives of a map as closures between them are checked: how they see, and their features, kept or made again."""
+"""Cameras and features of the drives of a map, as the verification of closures between drives needs them."""
 
 from __future__ import annotations
 
@@ -36,40 +36,40 @@ if TYPE_CHECKING:
     Fetch = Callable[[Int32s | Ints], None]
 
 _BLOCK = 16
-"""Keyframes extracted together where one was not foreseen: its neighbours are asked for next, and to read a log again
+"""Keyframes extracted together where one was not announced: its neighbours are needed next, and to read a log again
 costs as much as several."""
 
 
 @dataclass(frozen=True)
-class Sight:
-    """How a drive sees, and how far that is trusted."""
+class CameraTrust:
+    """The camera of a drive, and how far its calibration is trusted."""
 
     camera: dict[str, Any]
-    """As plain values."""
+    """Plain values."""
     rotation_share: float
-    """By what share of a rotation camera and odometry disagree; 0 without calibration."""
+    """Share of a rotation by which camera and odometry disagree; 0 without calibration."""
 
 
-def sight_of(member: Member, verify: VerifySettings, threads: int = 1) -> Sight:
-    """Read the camera, and hold its rotations against the odometry's. Raises LogError where the log is gone."""
+def camera_trust(member: Member, verify: VerifySettings, threads: int = 1) -> CameraTrust:
+    """The camera of the log, its rotations compared with the odometry's. Raises LogError where the log is gone."""
     camera = opened_log(member).camera()
     if camera.matrix is None:
-        return Sight(plain_camera(camera), 0.0)
-    with checked_with(member, Sight(plain_camera(camera), 0.0), verify, threads) as (drive, fetch):
+        return CameraTrust(plain_camera(camera), 0.0)
+    with opened_drive(member, CameraTrust(plain_camera(camera), 0.0), verify, threads) as (drive, fetch):
         pairs, around = turning_pairs(drive.keyframes, verify.calibration), verify.landmarks.neighbours
         near = pairs[:, :1] + np.arange(-around, around + 1)
         rows = np.concatenate([near.ravel(), pairs[:, 1]])
         fetch(np.unique(rows[(rows >= 0) & (rows < len(drive.keyframes.stamp_ns))]))
-        return Sight(plain_camera(camera), calibration_share(drive, threads))
+        return CameraTrust(plain_camera(camera), calibration_share(drive, threads))
 
 
 def keep_features(member: Member, verify: VerifySettings) -> bool:
-    """Keep what verification looks at of the features that the drive's run left; False where it left none."""
-    kept = _kept(member, verify)
-    if kept is not None:
-        kept.close()
+    """Store the features for verification that the drive's run left in its cache; False where it left none."""
+    stored = _stored(member, verify)
+    if stored is not None:
+        stored.close()
         return True
-    found = _left_by_run(member)
+    found = _from_run(member)
     if found is None:
         return False
     member.features.parent.mkdir(parents=True, exist_ok=True)
@@ -77,58 +77,58 @@ def keep_features(member: Member, verify: VerifySettings) -> bool:
     return True
 
 
-def _kept(member: Member, verify: VerifySettings) -> KeptFeatures | None:
-    """The features that the map keeps of the drive as it is now, as many as are looked at."""
+def _stored(member: Member, verify: VerifySettings) -> KeptFeatures | None:
+    """The features that the map stores of the drive, unless they are of another state of it or too few."""
     try:
-        kept = KeptFeatures(member.features, member.key, verify.matching.features)
+        stored = KeptFeatures(member.features, member.key, verify.matching.features)
     except ResultError:
         return None
-    if len(kept) == len(tables.read_keyframes(member.keyframes)[0].stamp_ns):
-        return kept
-    kept.close()
+    if len(stored) == len(tables.read_keyframes(member.keyframes)[0].stamp_ns):
+        return stored
+    stored.close()
     return None
 
 
-def _left_by_run(member: Member) -> Extracted | None:
-    """All features of the drive, where its run left them: they are those of its keyframes."""
+def _from_run(member: Member) -> Extracted | None:
+    """All features of the drive in the cache of its run; None where they are not there or of other keyframes."""
     found = stored_features(member.cache)
     keyframes, _ = tables.read_keyframes(member.keyframes)
     return found if found is not None and np.array_equal(found.stamp_ns, keyframes.stamp_ns) else None
 
 
 @contextmanager
-def checked_with(
-    member: Member, sight: Sight, verify: VerifySettings, threads: int = 1
+def opened_drive(
+    member: Member, known: CameraTrust, verify: VerifySettings, threads: int = 1
 ) -> Iterator[tuple[Drive, Fetch]]:
-    """The drive as candidates are checked with, and what gets the features of some keyframes at once.
+    """The drive for verification, and a function that extracts the features of some keyframes at once.
 
-    Features are those that the map keeps, or that its run left, or are extracted again from its log, which then has to
-    be there and the same. Raises LogError where it is not.
+    Features are those that the map stores, or in the cache of its run, or extracted again from its log. Raises LogError
+    where that is gone or another one.
     """
     keyframes, _ = tables.read_keyframes(member.keyframes)
-    keyframes, camera = replace(keyframes, drive=member.drive), camera_from(sight.camera)
+    keyframes, camera = replace(keyframes, drive=member.drive), camera_from(known.camera)
 
     def checked(features: Callable[[int], Features]) -> Drive:
         return drive_of(keyframes, camera, features, verify, camera.baseline_m)
 
-    kept = _kept(member, verify)
-    if kept is not None:
-        with contextlib.closing(kept):
-            yield checked(kept.__getitem__), lambda _: None
+    stored = _stored(member, verify)
+    if stored is not None:
+        with contextlib.closing(stored):
+            yield checked(stored.__getitem__), lambda _: None
         return
-    left = _left_by_run(member)
-    if left is not None:
-        yield checked(left.__getitem__), lambda _: None
+    cached = _from_run(member)
+    if cached is not None:
+        yield checked(cached.__getitem__), lambda _: None
         return
     log = opened_log(member)
     check_unchanged(member)
     with scratch("features") as folder, FeatureStore(folder / "features") as store:
-        again = _Again(log, keyframes.stamp_ns, member, store, threads)
-        yield checked(again.__getitem__), again.fetch
+        extracted = ReextractedFeatures(log, keyframes.stamp_ns, member, store, threads)
+        yield checked(extracted.__getitem__), extracted.fetch
 
 
-class _Again:
-    """Features of keyframes, extracted from the log when they are asked for. Reads are safe from any thread."""
+class ReextractedFeatures:
+    """Features of keyframes, extracted from the log on demand. Reads are safe from any thread."""
 
     def __init__(self, log: Log, stamp_ns: Ints, member: Member, store: FeatureStore, threads: int) -> None:
         self._log, self._stamp_ns, self._member, self._threads = log, stamp_ns, member, threads
@@ -136,7 +136,7 @@ class _Again:
         self._lock = threading.Lock()
 
     def fetch(self, rows: Iterable[int]) -> None:
-        """Extract what of these rows is not there yet, in one pass of the log. Raises LogError."""
+        """Extract the features of those rows that lack them, in one pass of the log. Raises LogError."""
         with self._lock:
             missing = [row for row in sorted({int(row) for row in rows}) if row not in self._at]
             if not missing:

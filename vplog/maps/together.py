@@ -27,23 +27,22 @@ def solve_groups(
     store: Store, drives: Drives, ties: Sequence[Tie], pipeline: Pipeline, progress: Progress
 ) -> dict[str, Any]:
     """Solve the groups that are not solved yet, and let joint.json say so; then the folders of others go."""
-    solving = components.Solving(pipeline.solve, pipeline.join, pipeline.refine, drives.library)
-    groups = components.groups_of([member.drive for member in drives.members], drives.keys, ties, solving)
+    groups = components.groups_of([member.drive for member in drives.members], drives.keys, ties, pipeline)
     known = {group["key"]: group for group in _joint(store).get("groups", [])}
-    folder, told = store.root / "joint", []
+    folder, solved = store.root / "joint", []
     for done, group in enumerate(groups):
         progress("solve together", done, len(groups))
         if not _is_there(folder, known.get(group.key)):
-            known[group.key] = _solved(store, group, drives, solving)
-        told.append(known[group.key])
+            known[group.key] = _solved(store, group, pipeline, drives.library)
+        solved.append(known[group.key])
     progress("solve together", len(groups), len(groups))
-    together = {drive for group in told for component in group["components"] for drive in component["drives"]}
+    together = {drive for group in solved for component in group["components"] for drive in component["drives"]}
     alone = [member.drive for member in drives.members if member.drive not in together]
     keys = {drive: drives.keys[drive] for drive in sorted(together)}
-    record = {"groups": told, "alone": sorted([*alone, *drives.apart]), "apart": drives.apart, "keys": keys}
-    if told or (store.root / "joint.json").exists():
+    record = {"groups": solved, "alone": sorted([*alone, *drives.apart]), "apart": drives.apart, "keys": keys}
+    if solved or (store.root / "joint.json").exists():
         write_joint(store.root, record)
-    named = {component["folder"] for group in told for component in group["components"]}
+    named = {component["folder"] for group in solved for component in group["components"]}
     for path in folder.glob("component=*"):
         if path.name not in named:
             shutil.rmtree(path, ignore_errors=True)
@@ -63,18 +62,18 @@ def _is_there(folder: Path, known: dict[str, Any] | None) -> bool:
     )
 
 
-def _solved(store: Store, group: Group, drives: Drives, solving: components.Solving) -> dict[str, Any]:
+def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
     """Solve a group, and rename in its components."""
     staging = store.staging / "joint"
     shutil.rmtree(staging, ignore_errors=True)
     runs = {drive: store.run(drive) for drive in group.drives}
     try:
-        told = components.solve_group(group, runs, solving, staging)
+        record = components.solve_group(group, runs, pipeline, library, staging)
     except DamagedDriveError:  # the others are solved without it
         raise
     except VplogError as error:  # one group must not take the others along; it is tried again
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
-    for component in told["components"]:
+    for component in record["components"]:
         place = store.root / "joint" / component["folder"]
         if (place / "component.json").is_file():  # of a join that was killed; its name says that it is the same
             continue
@@ -82,4 +81,4 @@ def _solved(store: Store, group: Group, drives: Drives, solving: components.Solv
         shutil.rmtree(place, ignore_errors=True)
         put_in_place(staging / component["folder"], place)
     shutil.rmtree(staging, ignore_errors=True)
-    return told
+    return record

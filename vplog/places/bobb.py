@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
 
+from vplog.data import Boxes
 from vplog.errors import LibraryError
 from vplog.places import expected_votes, stored
 from vplog.places.code_lists import BLOCK, CodeLists, build_lists
@@ -31,20 +32,22 @@ from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
 from vplog.places.once import Once
 from vplog.places.relearn import relearn
-from vplog.places.shared import Shared, list_shared
+from vplog.places.shared import list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference
-    from vplog.places.code_search import Uint16s
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
+    from vplog.places.code_search import Pairing, Uint16s
     from vplog.places.matches import Matcher
 
 NOBODY = 65_535
 """The number of no reference, where fewer than J share anything."""
 NOWHERE = 255
 """The number of no box, where nothing of a window is found."""
+_MAP_COLUMNS, _MAP_ROWS = 64, 36
+"""Cells of a voting map that is drawn: finer than the patches it sums, 10 px of a 640 x 360 image."""
 
 
 class BobbSettings(WeighedMatchSettings):
@@ -258,8 +261,48 @@ class BobbState:
         here, there, weight = matches.here[part], matches.there[part], matches.weight[part]
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
+    @property
+    def references(self) -> list[Reference]:
+        """The library."""
+        return self.matcher.references
+
+    def windows(self, rank: int) -> Floats:
+        """(I, 4) the same windows on the reference of any rank."""
+        return self._windows
+
+    def boxes(self, place: Place) -> Boxes:
+        """The boxes of a place as shares of the reference's sides."""
+        s = self.settings
+        used = place.references != NOBODY
+        codes = place.boxes[used].astype(np.int64)
+        row, column = np.divmod(codes, s.columns - s.box_columns + 1)
+        ends = [column / s.columns, row / s.rows, (column + s.box_columns) / s.columns, (row + s.box_rows) / s.rows]
+        corners = np.stack(ends, axis=-1)
+        corners[codes == NOWHERE] = np.nan
+        return Boxes(place.references[used].astype(np.int64), corners)
+
+    def voting_map(self, features: Features, reference: int) -> Floats:
+        """(36, 64) expected vote at the middle of every cell, by the closed form of `expected_votes`."""
+        s = self.settings
+        _, there, weight = self.agreed(self.matcher.match(features), reference)
+        x, y = (np.arange(_MAP_COLUMNS) + 0.5) / _MAP_COLUMNS, (np.arange(_MAP_ROWS) + 0.5) / _MAP_ROWS
+        along_x = (1.0 - np.abs(x[:, None] - there[:, 0])) ** (s.patches_x - 1)
+        along_y = (1.0 - np.abs(y[:, None] - there[:, 1])) ** (s.patches_y - 1)
+        votes = np.einsum("ye,xe,e->yx", along_y, along_x, weight.astype(np.float64))
+        return votes / max(float(votes.max()), 1e-12)
+
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
         return CodeIndex(*self._arrays(descriptors), self.overlaps(), len(self.matcher), self.settings.pairing)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of references, and boxes on each."""
+        return len(self.matcher), self.settings.boxes
+
+    @property
+    def pairing(self) -> Pairing:
+        """Which boxes of two places are compared."""
+        return self.settings.pairing
 
     def lists(self, *columns: pa.Array) -> CodeLists:
         """The inverted lists of the places of tables' columns, one after the other: what an index on disk holds.
@@ -274,7 +317,7 @@ class BobbState:
             s.columns - s.box_columns + 1, s.rows - s.box_rows + 1, s.box_columns, s.box_rows
         )
 
-    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> Shared:
+    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> SharedReferences:
         """The parts of the score of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
         s = self.settings
         references, weights, boxes = self._arrays(places)

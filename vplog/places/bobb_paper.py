@@ -16,19 +16,23 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field, PositiveFloat, model_validator
 
+from vplog.data import Boxes
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp, stored
 from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.relearn import RelearnedSettings
 from vplog.places.search import BoxIndex
-from vplog.places.shared import Shared, list_shared
+from vplog.places.shared import list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
+
+
+_WHOLE_IMAGE = np.array([0.0, 0.0, 1.0, 1.0])
 
 
 class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
@@ -206,6 +210,30 @@ class PaperBobbState:
             pattern.x_cuts, pattern.y_cuts, pattern.grid_x, pattern.grid_y,
         )  # fmt: skip
 
+    @property
+    def references(self) -> list[Reference]:
+        """The library."""
+        return self.library.references
+
+    def windows(self, rank: int) -> Floats:
+        """(I, 4) windows that are searched on the reference of that rank."""
+        return self._windows[rank]
+
+    def boxes(self, place: Place) -> Boxes:
+        """The boxes of a place as shares of the reference's sides."""
+        used = place.references >= 0
+        corners = place.boxes[used] / float(self.settings.grid)
+        corners[np.all(place.boxes[used] == 0, axis=-1)] = np.nan
+        return Boxes(place.references[used].astype(np.int64), corners)
+
+    def voting_map(self, features: Features, reference: int) -> Floats:
+        """(N, M) votes of the features of a whole image for a reference, 1 at most."""
+        words = self.library.translate(features.descriptors[: self.settings.features])
+        points, pattern = features.points[: self.settings.features], self.patterns[reference]
+        cells = self.votes(words, points, (features.width, features.height), reference, _WHOLE_IMAGE)
+        votes = rvp.voting_map(cells, pattern.grid_x, pattern.grid_y)
+        return votes / max(float(votes.max()), 1e-12)
+
     def index(self, descriptors: Sequence[Place]) -> BoxIndex:
         return BoxIndex(*self._arrays(descriptors), len(self.library), self.settings.grid)
 
@@ -216,7 +244,7 @@ class PaperBobbState:
             np.array([place.boxes for place in places], np.uint8).reshape(-1, s.references, s.boxes, 4),
         )
 
-    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> Shared:
+    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> SharedReferences:
         """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
         references, boxes = (part.astype(np.int64) for part in self._arrays(places))
 

@@ -31,10 +31,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference
+    from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
     from vplog.places.bobb import BobbState, Place
     from vplog.places.code_search import CodeIndex
-    from vplog.places.shared import Shared
 
 _STEPS = 4096
 """Of 1: what is summed over features is rounded to whole ones, so sums stay below 2^53 and exact in any order, and no
@@ -255,7 +254,19 @@ class HybridState(ReferencesState):
             boxes, np.array([p.signs for p in descriptors], np.uint8), self._signs_type.list_size, self.share
         )
 
-    def shared(self, places: Sequence[Described], query: Int32s, match: Int32s) -> Shared:
+    def windows(self, rank: int) -> Floats:
+        """(I, 4) windows of the boxes."""
+        return self.bobb.windows(rank)
+
+    def boxes(self, place: Described) -> Boxes:
+        """The boxes of a place as shares of the reference's sides."""
+        return self.bobb.boxes(place.boxes)
+
+    def voting_map(self, features: Features, reference: int) -> Floats:
+        """(rows, columns) votes of the boxes' matches."""
+        return self.bobb.voting_map(features, reference)
+
+    def shared(self, places: Sequence[Described], query: Int32s, match: Int32s) -> SharedReferences:
         """The references that explain both places of pairs (C,) of rows, by the boxes."""
         return self.bobb.shared([place.boxes for place in places], query, match)
 

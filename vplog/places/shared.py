@@ -1,17 +1,16 @@
-"""Which references explain both places of a pair, and how far their boxes lie on each other there.
-
-It is what the score of a recogniser with boxes is made of, told apart by reference, for the ledger of closures.
-"""
+"""The references that explain both places of a pair, and the overlap of their boxes: the terms of the score of a
+recogniser with boxes, by reference, for the ledger of closures."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import SharedReferences
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from vplog.data import Float32s, Floats, Int32s, Ints, Uint16s
 
@@ -21,26 +20,7 @@ _PAIRS = 4096
 """Pairs of places that are compared at once: their references and boxes take some ten MB."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shared:
-    """Of C pairs of places, what they share."""
-
-    references: list[Uint16s]
-    """(C,) of (S,) numbers of references that explain both, those that count most in the score first."""
-    overlap: list[Float32s]
-    """(C,) of (S,) share of a box that the two have in common, mean over the boxes, 0..1."""
-
-
-@runtime_checkable
-class SharesReferences(Protocol):
-    """A state of a recogniser with boxes."""
-
-    def shared(self, places: Sequence[Any], query: Int32s, match: Int32s) -> Shared:
-        """Of pairs (C,) of rows of `places`, the references that explain both."""
-        ...
-
-
-def list_shared(references: Ints, query: Int32s, match: Int32s, compare: Compare) -> Shared:
+def list_shared(references: Ints, query: Int32s, match: Int32s, compare: Compare) -> SharedReferences:
     """The references (N, J) of places that two of them share, for C pairs of rows; a negative number is none.
 
     `compare` gets rows (S,) of the query places, the ranks (S,) of their reference, and the same of the match places,
@@ -58,4 +38,4 @@ def list_shared(references: Ints, query: Int32s, match: Int32s, compare: Compare
         ends = np.cumsum(np.bincount(pair, minlength=len(rows)))[:-1]
         numbers += np.split(number[order].astype(np.uint16), ends)
         shares += np.split(overlap[order].astype(np.float32), ends)
-    return Shared(numbers, shares)
+    return SharedReferences(numbers, shares)

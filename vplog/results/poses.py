@@ -8,7 +8,7 @@ import numpy as np
 
 from vplog import geometry
 from vplog.results.atomic import replacing
-from vplog.results.tum import seconds
+from vplog.tum import seconds
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.boxes import boxes_of, references_of, voting_map, windows_of
 from vplog.drawing import as_text, drawn
 from vplog.study.experiments import boxed
 from vplog.study.style import explain
@@ -17,8 +16,8 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from vplog.boxes import Boxes, BoxState
-    from vplog.data import Bytes, Floats
+    from vplog.data import Boxes, Bytes, Floats
+    from vplog.stages import BoxState
     from vplog.study.bench import Bench
     from vplog.study.experiments import Plan
 
@@ -35,13 +34,13 @@ _CLOSE_UP = 10
 def references(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[str]]:
     """Fig. 9: how often each reference of the first drive explains a frame of any drive."""
     name, state = _learned(bench, plan, 0)
-    count = np.zeros(len(references_of(state)), np.int64)
+    count = np.zeros(len(state.references), np.int64)
     on: list[list[Floats]] = [[] for _ in count]
     images = 0
     total = sum(len(frames) for frames in bench.frames)
     for drive in range(len(bench.names)):
         for place in _places(bench, state, drive, "references", images, total):
-            found = boxes_of(state, place)
+            found = state.boxes(place)
             count[found.references] += 1
             for reference, corners in zip(found.references.tolist(), found.corners, strict=True):
                 on[reference].append(corners)
@@ -106,7 +105,7 @@ def sequence(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
     query, other = bench.pairs[0]
     name, state = _learned(bench, plan, other)
     places = _places(bench, state, query, "sequence", 0, len(bench.frames[query]))
-    found = [boxes_of(state, place) for place in places]
+    found = [state.boxes(place) for place in places]
     length = min(_FRAMES, len(found))
     # the run whose frames agree most on three references: Fig. 7 is about what boxes tell where the numbers do not
     agreed = []
@@ -115,7 +114,7 @@ def sequence(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
         agreed.append(int(np.sort(used)[-3:].sum()))
     start = int(np.argmax(agreed))
     run = found[start : start + length]
-    used = np.bincount(np.concatenate([one.references for one in run]), minlength=len(references_of(state)))
+    used = np.bincount(np.concatenate([one.references for one in run]), minlength=len(state.references))
     order = [int(r) for r in np.argsort(-used, kind="stable") if used[r]]
     rows = list(range(start, start + length))
     _draw_sequence(bench, state, query, other, rows, run, order, out)
@@ -149,7 +148,7 @@ def _places(bench: Bench, state: BoxState, drive: int, stage: str, before: int, 
 
 
 def _shared(state: BoxState, a: Any, b: Any) -> int:
-    return len(np.intersect1d(boxes_of(state, a).references, boxes_of(state, b).references))
+    return len(np.intersect1d(state.boxes(a).references, state.boxes(b).references))
 
 
 def _draw_references(
@@ -175,10 +174,10 @@ def _draw_references(
         ):
             for column, reference in enumerate(rows.tolist()):
                 axes = figure.add_subplot(grid[1 + line, column])
-                _show(axes, references_of(state)[reference].image)
+                _show(axes, state.references[reference].image)
                 corners = np.concatenate(on[reference]) if on[reference] else np.zeros((0, 4))
                 corners = corners[~np.isnan(corners).any(axis=-1)]
-                image = references_of(state)[reference].image
+                image = state.references[reference].image
                 _overlay(axes, image, _coverage(corners))
                 kinds, often = np.unique(corners, axis=0, return_counts=True)
                 for box, times in zip(kinds, often, strict=True):
@@ -199,7 +198,7 @@ def _draw_example(
     bench: Bench, state: BoxState, query: tuple[int, int, Any], match: tuple[int, int, Any], said: str, file: str,
     out: Path,
 ) -> None:  # fmt: skip
-    mine, other = boxes_of(state, query[2]), boxes_of(state, match[2])
+    mine, other = state.boxes(query[2]), state.boxes(match[2])
     # the query's best references, those that the true frame has too first: there Eq. (1) compares boxes
     both = set(other.references.tolist())
     chosen = sorted(range(len(mine.references)), key=lambda j: (int(mine.references[j]) not in both, j))[:_SHOWN]
@@ -211,22 +210,22 @@ def _draw_example(
             axes = grid[line, 0]
             image = bench.images(drive, [row])[0]
             _show(axes, image)
-            _windows(axes, image, windows_of(state, 0))
+            _windows(axes, image, state.windows(0))
             axes.set_title(
                 as_text(f"{role}: {bench.names[drive]}, frame {int(bench.walk(drive).frames[row])}"), fontsize=8.5
             )
             features = bench.walk(drive).store[row]
             for column, j in enumerate(chosen, start=1):
                 reference = int(mine.references[j])
-                picture = references_of(state)[reference].image
+                picture = state.references[reference].image
                 _show(grid[line, column], picture)
-                _overlay(grid[line, column], picture, voting_map(state, features, reference))
+                _overlay(grid[line, column], picture, state.voting_map(features, reference))
                 rank = np.flatnonzero(boxes.references == reference)
                 if len(rank):
                     _coloured(grid[line, column], picture, boxes, int(rank[0]))
                     text = f"reference {reference}, no. {int(rank[0]) + 1} of {role.split()[-1]}"
                 else:
-                    itself = references_of(state)[reference].stamp_ns == int(bench.walk(drive).stamp_ns[row])
+                    itself = state.references[reference].stamp_ns == int(bench.walk(drive).stamp_ns[row])
                     text = f"reference {reference}, {'this very frame' if itself else 'not chosen'}"
                 grid[line, column].set_title(text, fontsize=8.5, color="black" if len(rank) else "#999999")
         explain(
@@ -281,7 +280,7 @@ def _draw_sequence(
         axes.tick_params(axis="x", length=0)
         close_ups = shown[:3]
         for axes, reference in zip(np.atleast_1d(below.subplots(1, max(len(close_ups), 1))), close_ups, strict=False):
-            image = references_of(state)[reference].image
+            image = state.references[reference].image
             _show(axes, image)
             seen: dict[tuple[float, ...], int] = {}
             for boxes, colour in zip(run, colours, strict=True):

@@ -49,7 +49,7 @@ _TWO_DRIVES = {
     "conditions": "a change of condition between drives",
 }
 """What these experiments need two drives for."""
-_NOT_SCORES = {"charts.py", "pictures.py", "style.py", "experiments.py", "study.py", "ablations.py", "boxes.py"}
+_NOT_SCORES = {"charts.py", "pictures.py", "style.py", "experiments.py", "study.py", "ablations.py"}
 """Files of the study that what a trial finds does not depend on."""
 
 
