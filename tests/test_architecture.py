@@ -93,6 +93,22 @@ def test_imports_point_one_way(file: Path) -> None:
     assert not wrong, f"{name_of(file)} may not import {sorted(wrong)}"
 
 
+def test_no_circle_of_imports_among_the_readers_of_logs() -> None:
+    """File by file, with imports inside functions and those for type checkers counted."""
+    modules = {f"vplog.{name_of(file).removesuffix('.py').replace('/', '.')}": file for file in FILES}
+    logs = {name: file for name, file in modules.items() if name.startswith("vplog.logs.")}
+    uses = {
+        name: {
+            known for one in imports(file) for known in (one, one.rpartition(".")[0]) if known in logs and known != name
+        }
+        for name, file in logs.items()
+    }
+    while free := [name for name, used in uses.items() if not used & uses.keys()]:
+        for name in free:
+            del uses[name]
+    assert not uses, f"each of these imports another of them, or one that does: {sorted(uses)}"
+
+
 def test_the_check_sees_imports() -> None:
     assert "loops" in parts_used(PACKAGE / "pipeline.py")
     assert "pipeline" in parts_used(PACKAGE / "cli.py")
