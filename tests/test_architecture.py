@@ -102,6 +102,20 @@ def test_no_stage_asks_for_a_certain_recogniser() -> None:
                 kinds = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
                 asked += [f"{name_of(file)}:{node.lineno}" for kind in kinds if re.search("(Bobb|Hybrid)State", kind)]
     assert not asked
+def test_no_circle_of_imports_among_the_readers_of_logs() -> None:
+    """File by file, with imports inside functions and those for type checkers counted."""
+    modules = {f"vplog.{name_of(file).removesuffix('.py').replace('/', '.')}": file for file in FILES}
+    logs = {name: file for name, file in modules.items() if name.startswith("vplog.logs.")}
+    uses = {
+        name: {
+            known for one in imports(file) for known in (one, one.rpartition(".")[0]) if known in logs and known != name
+        }
+        for name, file in logs.items()
+    }
+    while free := [name for name, used in uses.items() if not used & uses.keys()]:
+        for name in free:
+            del uses[name]
+    assert not uses, f"each of these imports another of them, or one that does: {sorted(uses)}"
 
 
 def test_the_check_sees_imports() -> None:

@@ -26,7 +26,6 @@ from vplog.maps.imports import ALONE
 from vplog.maps.join import join as join_drives
 from vplog.maps.join import load_places
 from vplog.maps.layout import drive_record, folder_name
-from vplog.own_processes import known_ahead
 from vplog.pipeline import load_pipeline, pipeline_from
 from vplog.remote import RemotePath, located
 from vplog.urls import shown
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from vplog.engine import Engine
     from vplog.logs import TopicChoice
     from vplog.maps.store import Store
+    from vplog.own_processes import OwnProcesses
     from vplog.pipeline import Pipeline
 
     Progress = Callable[[str, int, int], None]
@@ -112,6 +112,7 @@ def run_batch(
     join: bool = True,
     keep_cache: bool = False,
     tell: Callable[[Drive], None] = lambda _: None,
+    processes: OwnProcesses | None = None,
 ) -> dict[str, Any]:
     """Drives in, a map in `root` out: what of it is missing or made from something else is computed, `jobs` at once.
 
@@ -121,20 +122,22 @@ def run_batch(
     A drive whose worker dies is tried again, `retries` times; one that fails is recorded and stops no other; `tell` is
     given each as it ends, and every log's fate is in the answer. At the end closures `join` what the map then has
     (vplog/maps/join.py); where that fails, `join_error` of the answer says why. With `keep_cache` what the stages came
-    to stays in MAP/.cache, so that other settings do not need the images again.
+    to stays in MAP/.cache, so that other settings do not need the images again. `processes` are those of this machine
+    that the caller has begun.
     Raises VplogError where the map as a whole cannot be written or does not fit the library or the settings.
     """
     topics = topics or logs.TopicChoice()
     began = time.perf_counter()
+    jobs = jobs or 1 if engine == "local" else jobs
     given = [_place(path) for path in paths]
-    twice = [log for log, count in Counter(given).items() if count > 1]
-    if twice:
+    if twice := [log for log, count in Counter(given).items() if count > 1]:
         raise SettingsError(f"{shown(twice[0])} is given twice. Give each log once.")
     with (
         map_store.writing(root) as store,
         ThreadPoolExecutor(1) as aside,
-        opened(engine, address, jobs, threads, store.staging) as workers,
+        opened(engine, address, jobs or 1, threads, store.staging, processes) as workers,
     ):
+        maker = aside.submit(made_by)
         digest = map_library(store, paths, library, pipeline, topics, threads, progress)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
@@ -144,7 +147,7 @@ def run_batch(
         drives = keys.drive_names(
             [_name(path) for path in paths], list(map(shown, given)), {**_failed(store), **known}, inputs
         )
-        alike = _alike(pipeline, topics, digest)
+        alike = _alike(pipeline, topics, digest) | maker.result()
         done, wanted = dict[str, Drive](), list[dict[str, Any]]()
         urls = dict(zip(drives, given, strict=True))
         for drive, content in zip(drives, inputs, strict=True):
@@ -159,10 +162,9 @@ def run_batch(
             else:
                 wanted.append(about)
         each = _threads_each(workers, jobs, len(wanted))
-        at_once = jobs or workers.at_once(each)
         progress("drives", len(done), len(paths))
         like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, join or keep_cache)
-        tasks = _tasks(store, wanted if at_once == 1 else _longest_first(wanted, urls), like, urls)
+        tasks = _tasks(store, wanted, like, urls, longest_first=(jobs or workers.at_once(each)) > 1)
         places = None
         if join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
             places = aside.submit(load_places, like.library, pipeline, threads)
@@ -186,7 +188,7 @@ def run_batch(
         "map": str(root),
         "library": digest,
         "engine": engine,
-        "jobs": at_once,
+        "jobs": jobs or workers.at_once(each),
         "threads_per_job": each,
         "seconds": round(time.perf_counter() - began, 3),
         "failed": sum(one.state == "failed" for one in fate),
@@ -291,28 +293,32 @@ def _has_room(store: Store) -> bool:
     return shutil.disk_usage(store.root).free > _FREE_BYTES
 
 
-def _tasks(store: Store, wanted: Sequence[dict[str, Any]], like: Task, urls: Mapping[str, str]) -> list[Task]:
-    """A task for each drive that is to be computed, by what drive.json will say of it."""
+def _tasks(
+    store: Store, wanted: Sequence[dict[str, Any]], like: Task, urls: Mapping[str, str], longest_first: bool
+) -> list[Task]:
+    """A task for each drive that is to be computed, by its drive.json.
+
+    With `longest_first` none of the long drives is begun when all others are done.
+    """
+    sizes = {about["drive"]: _log_bytes(urls[about["drive"]]) for about in wanted}
+    order = sorted(wanted, key=lambda about: -sizes[about["drive"]]) if longest_first else wanted
     return [
         replace(
             like, drive=about["drive"], log=urls[about["drive"]], about=about, cache=_cache(store, about["drive"]),
             folder=like.folder / f"{os.getpid()}-{number}",
+            in_parts=len(wanted) == 1 or 2 * sizes[about["drive"]] > sum(sizes.values()),
         )
-        for number, about in enumerate(wanted)
+        for number, about in enumerate(order)
     ]  # fmt: skip
 
 
-def _longest_first(wanted: Sequence[dict[str, Any]], urls: Mapping[str, str]) -> list[dict[str, Any]]:
-    """By the bytes of the logs, so that none of the long ones is begun when all others are done."""
-
-    def size(about: dict[str, Any]) -> int:
-        path = located(urls[about["drive"]])
-        try:
-            return 0 if isinstance(path, RemotePath) else bytes_of(path)  # of a URL it would be asked for again
-        except OSError:  # its own run says why
-            return 0
-
-    return sorted(wanted, key=size, reverse=True)
+def _log_bytes(url: str) -> int:
+    """Length of the log of a drive; 0 where it is remote, as that would be another request, or cannot be read."""
+    path = located(url)
+    try:
+        return 0 if isinstance(path, RemotePath) else bytes_of(path)
+    except OSError:  # its own run says why
+        return 0
 
 
 def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:
@@ -359,7 +365,6 @@ def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, A
         "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file"}),
         "settings": keys.key_of(pipeline.model_dump(mode="json")),
         "library": library,
-        **(known_ahead() or made_by()),
     }
 
 

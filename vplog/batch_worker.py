@@ -42,6 +42,8 @@ class Task:
     """Where what an attempt had done stays when it ends before its time; None to keep nothing."""
     keep_cache: bool = False
     """Whether that is wanted of a drive that is finished, too."""
+    in_parts: bool = False
+    """Whether its frames are extracted on all machines at once: it is longer than all other drives together."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from contextlib import nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,11 +34,11 @@ from vplog.cli_print import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractContextManager
+    from collections.abc import Callable, Iterator
     from typing import Any
 
     from vplog.maps.cache import Cache
+    from vplog.own_processes import OwnProcesses
 
 
 def export_map(arguments: argparse.Namespace) -> None:
@@ -86,22 +86,29 @@ def remove_drives(arguments: argparse.Namespace) -> None:
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """The drives of a map in another map, described with another library; their logs are read again."""
-    with _drive_ahead(arguments), Progress(arguments) as progress:
+    with _processes(arguments) as processes, Progress(arguments) as progress:
         from vplog.redescribe import redescribe_map as redescribe
 
         found = redescribe(
             arguments.map, arguments.library, arguments.target, arguments.jobs, arguments.threads, progress,
-            engine=arguments.engine, address=arguments.address, retries=arguments.retries,
+            engine=arguments.engine, address=arguments.address, retries=arguments.retries, processes=processes,
         )  # fmt: skip
     wrong = f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}."
     _end(arguments, found, print_redescribed, wrong)
 
 
-def _drive_ahead(arguments: argparse.Namespace) -> AbstractContextManager[None]:
-    """The process of the first drive loads while this one does."""
-    from vplog.own_processes import begun_ahead
+@contextmanager
+def _processes(arguments: argparse.Namespace, drives: int | None = None) -> Iterator[OwnProcesses | None]:
+    """The processes of drives, which load while this one does; of so many drives where that is known."""
+    if arguments.engine != "local":
+        yield None
+        return
+    from vplog.own_processes import OwnProcesses
 
-    return begun_ahead() if arguments.engine == "local" else nullcontext()
+    count = (arguments.jobs or 1) + 1
+    with OwnProcesses(count if drives is None else min(count, drives)) as processes:
+        processes.begin()
+        yield processes
 
 
 def batch(arguments: argparse.Namespace) -> None:
@@ -113,7 +120,7 @@ def batch(arguments: argparse.Namespace) -> None:
             f"--odometry-file {arguments.odometry_file} is of one drive, and {len(arguments.logs)} logs are given. "
             "Give each log by itself with its own file; each command adds a drive to the map."
         )
-    with _drive_ahead(arguments), Progress(arguments) as progress:
+    with _processes(arguments, len(arguments.logs)) as processes, Progress(arguments) as progress:
         from vplog.batch import run_batch, settings_for
 
         pipeline = settings_for(arguments.map, arguments.pipeline, arguments.set)
@@ -121,6 +128,7 @@ def batch(arguments: argparse.Namespace) -> None:
             arguments.logs, arguments.map, pipeline, arguments.library, topics_of(arguments), arguments.jobs,
             arguments.threads, progress, engine=arguments.engine, address=arguments.address,
             retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache, tell=progress.tell_drive,
+            processes=processes,
         )  # fmt: skip
     wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
     _end(arguments, found, print_batch, wrong)
@@ -161,13 +169,14 @@ def query_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.query import query_map as find_places
 
     cache = _cache(arguments)
-    with opened(arguments.engine, arguments.address, None, arguments.threads) as engine:
-        workers = engine.executor if arguments.engine == "ray" else None
-        with Progress(arguments) as progress:
-            found = find_places(
-                arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
-                arguments.output, arguments.threads, progress, workers, cache,
-            )  # fmt: skip
+    with (
+        opened(arguments.engine, arguments.address, 1, arguments.threads) as engine,
+        Progress(arguments) as progress,
+    ):
+        found = find_places(
+            arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
+            arguments.output, arguments.threads, progress, engine.executor, cache,
+        )  # fmt: skip
     print_result(arguments, found, print_answers)
 
 

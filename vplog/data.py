@@ -258,7 +258,6 @@ class Closures:
 class EdgeKind(StrEnum):
     ODOMETRY = "odometry"
     LOOP = "loop"
-    GPS = "gps"
 
 
 @dataclass(frozen=True, eq=False)

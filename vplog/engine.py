@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from vplog.batch_worker import Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError
-from vplog.own_processes import OwnProcesses
+from vplog.own_processes import OwnProcesses, ProcessExpired
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -21,15 +21,16 @@ if TYPE_CHECKING:
 ENGINES = ("local", "ray")
 RETRIES = 2
 """More attempts at a drive whose worker died: one that dies three times will most likely die again."""
+_KILLED = "Its process was killed, as for want of memory. Make room or use fewer --jobs, and run again."
 
 
 class Engine(Protocol):
-    """An executor, and how the folder of a drive comes out of it."""
+    """Computes drives elsewhere and brings their run folders here."""
 
     @property
-    def executor(self) -> Executor:
-        """submit(function, *arguments) runs a function of a module elsewhere. Its future raises BrokenExecutor, with
-        one line, where process or machine died, so that the same may end well another time."""
+    def executor(self) -> Executor | None:
+        """Runs functions of modules on other machines, a core each; None where there are none. A future raises
+        BrokenExecutor, with one line, where process or machine died, so that the same may end well another time."""
         ...
 
     @property
@@ -46,8 +47,8 @@ class Engine(Protocol):
         """Drives with so many threads each that keep it busy."""
         ...
 
-    def start(self, task: Task, cores: int) -> Future[Outcome]:
-        """Begin a drive, which may use so many cores."""
+    def start(self, task: Task) -> Future[Outcome]:
+        """Begin a drive."""
         ...
 
     def helpers(self, threads: int) -> Executor | None:
@@ -58,18 +59,20 @@ class Engine(Protocol):
         """Have the finished run folder in `task.folder`. Raises BrokenExecutor where it is lost, ResultError."""
         ...
 
-    def forget(self, task: Task) -> None:
-        """Let go what is kept of a drive for another attempt: it is in, or given up."""
-        ...
-
 
 @contextmanager
 def opened(
-    name: str, address: str | None, jobs: int | None, threads: int, folder: Path | None = None
+    name: str,
+    address: str | None,
+    jobs: int,
+    threads: int,
+    folder: Path | None = None,
+    processes: OwnProcesses | None = None,
 ) -> Iterator[Engine]:
     """The engine of this name, for a writer of a map with this folder; what it started ends with the block.
 
-    Raises SettingsError where there is none.
+    `processes` are those of this machine that a caller has begun; there is one more than `jobs` otherwise. Raises
+    SettingsError where there is no such engine.
     """
     if name not in ENGINES:
         raise SettingsError(f"No engine {name!r}. Engines: {', '.join(ENGINES)}.")
@@ -81,8 +84,8 @@ def opened(
         return
     if address is not None:
         raise SettingsError(f"--address {address} is that of a Ray cluster. Add --engine ray.")
-    with OwnProcesses(jobs or 1) as executor:
-        yield LocalEngine(executor, threads)
+    with nullcontext(processes) if processes is not None else OwnProcesses(jobs + 1) as own:
+        yield LocalEngine(own, threads)
 
 
 def computed(
@@ -98,15 +101,13 @@ def computed(
         # without `jobs` one stands in line behind each, so that no core waits for this loop
         while waiting and len(running) < (jobs or 2 * engine.at_once(waiting[0][0].threads)):
             task, attempt = waiting.popleft()
-            share = engine.cores // (len(waiting) + len(running) + 1)
-            running[engine.start(task, max(share, task.threads))] = task, attempt
+            running[engine.start(task)] = task, attempt
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             task, attempt = running.pop(future)
             outcome = _brought(engine, task, future)
             if outcome.may_pass and attempt <= retries:
                 waiting.append((task, attempt + 1))
             else:
-                engine.forget(task)
                 yield task, outcome, attempt
 
 
@@ -116,6 +117,8 @@ def _brought(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
         outcome = future.result()
         if not outcome.error:
             engine.take(task, outcome)
+    except ProcessExpired:
+        return Outcome(_KILLED, may_pass=True)
     except BrokenExecutor as error:
         return Outcome(str(error), may_pass=True)
     except OSError as error:  # no process more, or no room for what a machine brings
@@ -130,21 +133,20 @@ def _brought(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
 class LocalEngine:
     """This machine."""
 
-    def __init__(self, executor: Executor, threads: int) -> None:
-        self.executor, self.cores, self.widest = executor, threads, threads
+    executor = None
+
+    def __init__(self, processes: OwnProcesses, threads: int) -> None:
+        self._processes, self.cores, self.widest = processes, threads, threads
 
     def at_once(self, threads: int) -> int:
         return 1
 
-    def start(self, task: Task, cores: int) -> Future[Outcome]:
-        return self.executor.submit(compute_drive, task)
+    def start(self, task: Task) -> Future[Outcome]:
+        return self._processes.submit(compute_drive, task)
 
     def helpers(self, threads: int) -> Executor | None:
         """This process has the threads itself."""
         return None
 
     def take(self, task: Task, outcome: Outcome) -> None:
-        """It is there already."""
-
-    def forget(self, task: Task) -> None:
-        """Nothing is kept."""
+        """No-op: the folder is local."""

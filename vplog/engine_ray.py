@@ -7,7 +7,6 @@ worker's own disk and comes back in pieces. This module is imported where Ray is
 from __future__ import annotations
 
 import secrets
-import time
 from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     from vplog.parts import Part
     from vplog.ray_cluster import Head
-    from vplog.ray_tasks import Away
+    from vplog.ray_tasks import RemoteOutcome
 
 _PROBE_S = 60.0
 """Until the machines of a cluster have told what they run; a slower one is asked again with each drive."""
@@ -35,8 +34,6 @@ _DRIVE_BYTES = 2**30
 """Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
 _FETCH_S = 5.0
 """Until it is asked again whether the cluster is there from which a piece is to come."""
-_PART_S = 6.0
-"""What the frames of a part take one core. Whoever computes it opens the log for it, which may take longer."""
 
 
 @contextmanager
@@ -65,8 +62,7 @@ class RayEngine:
         self.executor = RayExecutor(ray, head, ray_tasks.call)
         # a process of its own for each drive, so that memory is given back
         self._drive = ray.remote(max_calls=1, max_retries=0)(ray_tasks.call)
-        self._part = ray.remote(num_cpus=1, num_returns=2)(ray_tasks.compute_part_away)
-        self._parts: dict[str, list[tuple[Part, Any, Any]]] = {}
+        self._part = ray.remote(num_cpus=1)(ray_tasks.compute_remote_part)
         self._library: tuple[Path, Any] | None = None
 
     @property
@@ -80,8 +76,8 @@ class RayEngine:
     def at_once(self, threads: int) -> int:
         return max(sum(int(cores) // threads for cores in self._of_nodes("CPU")), 1)
 
-    def start(self, task: Task, cores: int) -> Future[Outcome]:
-        """Begin a drive; one that has more cores than any machine begins with its frames, on all of them."""
+    def start(self, task: Task) -> Future[Outcome]:
+        """Begin a drive; one in parts with its frames, on all machines."""
         task = task if self._shares_disk else replace(task, cache=None)
         if self._library is None or self._library[0] != task.library:
             self._library = task.library, self._ray.put(packed(task.library))
@@ -89,56 +85,25 @@ class RayEngine:
         drive = self._drive.options(num_cpus=task.threads, memory=memory, name=f"vplog {task.drive}")
         if self._is_ours:  # nobody else's tasks are there, and the system shares out the cores, the last drive has all
             task = replace(task, threads=self.widest)
-        parts = self._scattered(task, cores)
-        data, failed = [(part, data) for part, _, data in parts], [failed for _, failed, _ in parts]
-        # Ray begins it when `failed` is known of every part; their bytes it takes one after the other
-        answer = drive.remote(self._tasks.compute_away, task, self._library[1], data, *failed)
-        return self.executor.follow(answer)
+        parts = self._parts(task) if task.in_parts and self.cores > self.widest else []
+        return self.executor.follow(drive.remote(self._tasks.compute_remote_drive, task, self._library[1], parts))
 
-    def _scattered(self, task: Task, cores: int) -> list[tuple[Part, Any, Any]]:
-        """The parts of a drive as tasks of their own: each with why it failed and its bytes, when they are there.
-
-        None where the threads of one machine are as fast: parts go over the cluster at `cores` in the time that one
-        takes along with opening the log, and on one machine at its cores in the time of the part alone.
-        """
-        if task.drive in self._parts:  # another attempt
-            return [part for part in self._parts[task.drive] if self._is_there(part[1])]
-        found, widest = [], self.widest
-        if cores > widest:
-            began = time.perf_counter()
-            try:
-                found = parts_of(located(task.log), task.pipeline, task.topics, task.cache)
-            except (VplogError, OSError):
-                return []  # the drive's own task says why
-            opening_s = time.perf_counter() - began
-            if task.cache is not None:
-                found = missing_parts(task.cache, found)
-            over_all = -(-len(found) // cores) * (_PART_S + opening_s)
-            if over_all >= -(-len(found) // widest) * _PART_S:
-                found = []
-        wanted = made_by()
-        self._parts[task.drive] = [(part, *self._part.remote(part, wanted)) for part in found]
-        return self._parts[task.drive]
-
-    def _is_there(self, answer: Any) -> bool:
-        """Whether a task has ended, and neither its worker nor its answer was lost."""
+    def _parts(self, task: Task) -> list[tuple[Part, Any]]:
+        """The parts of a drive that are to be extracted, and the task of each, which gives its bytes."""
         try:
-            return bool(self._ray.wait([answer], timeout=0)[0]) and self._ray.get(answer) is not None
-        except self._ray.exceptions.RayError:
-            return False
+            found = parts_of(located(task.log), task.pipeline, task.topics, task.cache)
+        except (VplogError, OSError):
+            return []  # the drive's own task says why
+        missing, wanted = found if task.cache is None else missing_parts(task.cache, found), made_by()
+        return [(part, self._part.remote(part, wanted)) for part in missing]
 
     def take(self, task: Task, outcome: Outcome) -> None:
         """Write the files from their pieces."""
-        away = cast("Away", outcome)
-        places = [(task.folder, away.files)] + ([(task.cache, away.cache)] if task.cache is not None else [])
+        remote = cast("RemoteOutcome", outcome)
+        places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
         for folder, files in places:
             for name, parts in files:
                 write_pieces(folder, name, map(self._fetched, parts))
-        self.forget(task)
-
-    def forget(self, task: Task) -> None:
-        """Let the parts of a drive go, which is in the map or given up."""
-        self._parts.pop(task.drive, None)
 
     def helpers(self, threads: int) -> Executor | None:
         """Tasks over all machines, if each of them sees the map."""
@@ -150,7 +115,7 @@ class RayEngine:
         """Whether all machines see a folder of this one."""
         sign, content = folder / "seen", secrets.token_hex(16)
         sign.write_text(content, encoding="utf-8")
-        answers = self._asked(self._tasks.is_here, str(sign), content)
+        answers = self._on_every_node(self._tasks.is_here, str(sign), content)
         self._shares_disk = all(self._answer(answer) is True for answer in answers)
         sign.unlink()
 
@@ -160,7 +125,7 @@ class RayEngine:
             raise SettingsError(
                 "No machine of the Ray cluster has CPUs, as with `ray start --num-cpus 0`. Add one that has some."
             )
-        own, answers = made_by(), self._asked(self._tasks.about_node)
+        own, answers = made_by(), self._on_every_node(self._tasks.about_node)
         for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
             found, same = self._answer(answer), f"Install the same there: vplog {vplog.__version__}."
             if isinstance(found, self._ray.exceptions.RayTaskError):
@@ -173,7 +138,7 @@ class RayEngine:
                 if theirs != told:
                     raise SettingsError(f"{where} has {name} {theirs[:12]}, and this machine {told[:12]}. {same}")
 
-    def _asked(self, function: Callable[..., Any], *args: Any) -> dict[Any, str]:
+    def _on_every_node(self, function: Callable[..., Any], *args: Any) -> dict[Any, str]:
         """A task on every machine, whatever else it does; each with the machine's name."""
         affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
         task = self._ray.remote(num_cpus=0, max_retries=0)(function)

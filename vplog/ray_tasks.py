@@ -31,7 +31,7 @@ _OTHER = "{} has another vplog, or other packages, than the machine of the batch
 
 
 @dataclass(frozen=True)
-class Away(Outcome):
+class RemoteOutcome(Outcome):
     """How an attempt ended on another machine."""
 
     files: Files = ()
@@ -63,46 +63,40 @@ def node_name() -> str:
     return f"{platform.node()}/{ray.get_runtime_context().get_node_id()[:6]}"
 
 
-def compute_part_away(part: Part, wanted: dict[str, Any]) -> tuple[str, bytes]:
-    """A stretch of a drive's frames: why not, and its bytes. `wanted` is what the batch computes with."""
+def compute_remote_part(part: Part, wanted: dict[str, Any]) -> bytes:
+    """A stretch of a drive's frames. `wanted` is what the batch computes with. Raises VplogError."""
     if made_by() != wanted:
-        return _OTHER.format(node_name()), b""
-    try:
-        return "", compute_part(part)
-    except Exception as error:  # the drive's own task meets it again, and says it
-        return str(error), b""
+        raise VplogError(_OTHER.format(node_name()))
+    return compute_part(part)
 
 
-def compute_away(
-    task: Task, library: dict[str, Bytes], scattered: list[tuple[Part, Any]] | None = None, *failed: str
-) -> Away:
+def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tuple[Part, Any]]) -> RemoteOutcome:
     """A drive with everything on this machine's own disk; its run folder goes into the object store.
 
-    Of the parts that others have computed, with their bytes in the object store, those are used that did not fail.
+    Parts that other tasks compute are waited for, one after the other, while Ray lends out this task's cores.
     """
     where = node_name()
     if any(task.about[name] != value for name, value in made_by().items()):
-        return Away(_OTHER.format(where), worker=where)
+        return RemoteOutcome(_OTHER.format(where), worker=where)
     try:
         with scratch("run") as folder:
             place, made = unpacked(library, f"library-{task.about['library']}"), folder / "run"
             cache = task.cache or folder / "cache"
-            for (part, data), why in zip(scattered or [], failed, strict=True):
-                if not why:
-                    with suppress(exceptions.RayError, VplogError):  # lost or damaged: it is computed here
-                        put_part(cache, part, ray.get(data))
+            for part, data in parts:
+                with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here
+                    put_part(cache, part, ray.get(data))
             outcome = compute_drive(replace(task, folder=made, library=place, cache=cache))
             told = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
             if outcome.error:
-                return Away(**told)
+                return RemoteOutcome(**told)
             _name_library(made, task.library)
             kept = _given_back(cache) if task.keep_cache and task.cache is None else ()
-            return Away(**told, files=_given_back(made), cache=kept)
+            return RemoteOutcome(**told, files=_given_back(made), cache=kept)
     except VplogError as error:
-        return Away(str(error), worker=where)
+        return RemoteOutcome(str(error), worker=where)
     except OSError as error:
         why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
-        return Away(why, may_pass=True, worker=where)
+        return RemoteOutcome(why, may_pass=True, worker=where)
 
 
 def _name_library(made: Path, library: Path) -> None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.maps.store import Store
+    from vplog.own_processes import OwnProcesses
 
     Progress = Callable[[str, int, int], None]
 
@@ -44,6 +45,7 @@ def redescribe_map(
     engine: str = "local",
     address: str | None = None,
     retries: int = RETRIES,
+    processes: OwnProcesses | None = None,
 ) -> dict[str, Any]:
     """The drives of a map in a new map `target`, described with another library: one on disk, or one of a log's frames.
 
@@ -83,7 +85,7 @@ def redescribe_map(
             last = number + 1 == len(groups)
             found = run_batch(
                 paths, target, pipeline, folder, choice, jobs, threads, progress,
-                engine=engine, address=address, retries=retries, join=last,
+                engine=engine, address=address, retries=retries, join=last, processes=processes,
             )  # fmt: skip
             joined, join_error = found["joined"], found["join_error"]
             fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]

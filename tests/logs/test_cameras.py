@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vplog.logs.messages import CalibrationMessage
+from vplog.logs.message_records import CalibrationMessage
 from vplog.logs.ros_messages import decode_ros
 
 from .drives import store

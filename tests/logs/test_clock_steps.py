@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vplog import logs
 from vplog.logs.containers import Notes
-from vplog.logs.messages import PoseMessage
+from vplog.logs.message_records import PoseMessage
 from vplog.logs.stamps import Stamps, find_steps_back, share_clock
 from vplog.logs.tracks import PoseTrack
 

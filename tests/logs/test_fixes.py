@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from vplog import geodesy, logs
 from vplog.logs.containers import Notes
-from vplog.logs.messages import FixMessage
+from vplog.logs.message_records import FixMessage
 from vplog.logs.tracks import FixTrack
 
 from .drives import FRAMES, START_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros1, write_ros2

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from vplog import logs
 from vplog.logs.containers import Channel
-from vplog.logs.messages import BadMessageError, decode
+from vplog.logs.message_records import BadMessageError
+from vplog.logs.messages import decode
 
 from .drives import HEIGHT, WIDTH, D, Drive, K, foxglove_messages, png, write_raw
 

@@ -19,7 +19,8 @@ from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.containers import Channel
 from vplog.logs.image_folder import ImageFolder, stamps_of
-from vplog.logs.messages import PoseMessage, decode
+from vplog.logs.message_records import PoseMessage
+from vplog.logs.messages import decode
 from vplog.logs.odometry_message import read_odometry
 from vplog.stages import Log
 

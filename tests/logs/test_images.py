@@ -13,7 +13,7 @@ from PIL import Image
 
 from vplog.image_file import image_size
 from vplog.logs.images import Levels, depth_m, grey, is_depth
-from vplog.logs.messages import BadMessageError, ImageMessage
+from vplog.logs.message_records import BadMessageError, ImageMessage
 
 RNG = np.random.default_rng(1)
 

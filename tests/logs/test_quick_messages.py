@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from vplog.logs.containers import Channel
 from vplog.logs.fix_message import read_fix
 from vplog.logs.image_message import read_image
-from vplog.logs.messages import BadMessageError, decode_generally, stamp_of
+from vplog.logs.message_records import BadMessageError
+from vplog.logs.messages import decode_generally, stamp_of
 from vplog.logs.odometry_message import read_poses
 
 from .drives import store

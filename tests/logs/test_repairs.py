@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from vplog import logs
 from vplog.logs.cameras import body_from_camera, camera_of
 from vplog.logs.containers import Notes
-from vplog.logs.messages import CalibrationMessage, PoseMessage, TransformMessage
+from vplog.logs.message_records import CalibrationMessage, PoseMessage, TransformMessage
 from vplog.logs.stamps import Stamps, increasing, nearest
 from vplog.logs.tracks import PoseTrack
 from vplog.logs.transforms import FrameTree

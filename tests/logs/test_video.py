@@ -17,7 +17,7 @@ from vplog import logs
 from vplog.errors import LogError
 from vplog.logs import video as video_module
 from vplog.logs.h264 import FrameNumbers
-from vplog.logs.messages import BadMessageError
+from vplog.logs.message_records import BadMessageError
 from vplog.logs.video import VideoStream, codec_of, packet_kind
 
 from .drives import START_NS, Written, store, write_foxglove, write_raw

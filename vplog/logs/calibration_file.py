@@ -11,7 +11,7 @@ import yaml
 
 from vplog import geometry
 from vplog.errors import LogError
-from vplog.logs.messages import CalibrationMessage
+from vplog.logs.message_records import CalibrationMessage
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,7 +12,7 @@ from vplog.logs.containers import Notes
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.logs.messages import CalibrationMessage
+    from vplog.logs.message_records import CalibrationMessage
     from vplog.logs.transforms import FrameTree
 
 _MODELS = {

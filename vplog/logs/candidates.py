@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from vplog.image_file import image_size
 from vplog.logs.images import is_depth, is_image, may_be_thermal
-from vplog.logs.messages import BadMessageError, CalibrationMessage, ImageMessage, decode, kind_of
+from vplog.logs.message_records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
+from vplog.logs.messages import decode
 from vplog.logs.select import Candidate
 from vplog.logs.transforms import clean
 from vplog.logs.video import codec_of

@@ -19,7 +19,7 @@ from vplog.logs.transforms import FrameTree
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry, OdometrySource
     from vplog.logs.containers import Channel, Container, Notes, Place
-    from vplog.logs.messages import CalibrationMessage
+    from vplog.logs.message_records import CalibrationMessage
     from vplog.logs.select import Selection
 
 

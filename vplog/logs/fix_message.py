@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.messages import FixMessage, nanoseconds, short_type
+from vplog.logs.message_records import FixMessage, nanoseconds, short_type
 
 if TYPE_CHECKING:
     from vplog.logs.containers import Channel, Octets

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Any
 
-from vplog.logs.messages import BadMessageError
+from vplog.logs.message_records import BadMessageError
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Proto

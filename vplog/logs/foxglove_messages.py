@@ -23,7 +23,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from vplog.logs.flat_messages import fill_flat
-from vplog.logs.messages import (
+from vplog.logs.message_records import (
     BadMessageError,
     CalibrationMessage,
     FixMessage,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Floats
     from vplog.logs.containers import Octets
-    from vplog.logs.messages import Record
+    from vplog.logs.message_records import Record
 
 _LENGTH = 2
 """Wire type of protobuf's fields that are bytes behind their length (protobuf.dev/programming-guides/encoding)."""

@@ -14,7 +14,8 @@ from vplog.errors import LogError
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.image_message import read_image
 from vplog.logs.images import depth_m, grey
-from vplog.logs.messages import BadMessageError, ImageMessage, decode
+from vplog.logs.message_records import BadMessageError, ImageMessage
+from vplog.logs.messages import decode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Camera, Float32s, Floats
     from vplog.logs.containers import Channel, Notes, Octets
     from vplog.logs.images import Levels
-    from vplog.logs.messages import CalibrationMessage
+    from vplog.logs.message_records import CalibrationMessage
     from vplog.logs.stereo import Pair
 
 

@@ -10,16 +10,15 @@ import numpy as np
 
 from vplog.logs.containers import Message, plural
 from vplog.logs.losses import Runs
-from vplog.logs.messages import (
+from vplog.logs.message_records import (
     BadMessageError,
     CalibrationMessage,
     FixMessage,
     ImageMessage,
     PoseMessage,
     TransformMessage,
-    decode,
-    stamp_of,
 )
+from vplog.logs.messages import decode, stamp_of
 from vplog.logs.moving import MovingFrames
 from vplog.logs.odometry_message import read_poses
 from vplog.logs.stamps import NONE, Stamps, find_steps_back

@@ -18,7 +18,7 @@ from vplog.logs.cameras import camera_of
 from vplog.logs.frames import affine_to_camera, warped
 from vplog.logs.image_groups import of_one_camera
 from vplog.logs.images import drive_levels, grey, spread
-from vplog.logs.messages import BadMessageError, ImageMessage
+from vplog.logs.message_records import BadMessageError, ImageMessage
 from vplog.logs.stamps import increasing, rate_hz, rows_of
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import struct
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vplog.logs.messages import ImageMessage, kind_of, nanoseconds, short_type
+from vplog.logs.message_records import ImageMessage, kind_of, nanoseconds, short_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable

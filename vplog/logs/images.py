@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 
 from vplog.image_file import PNG, BadImageError, decode_image, image_size
-from vplog.logs.messages import BadMessageError
+from vplog.logs.message_records import BadMessageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from vplog.data import Bytes, Float32s
     from vplog.logs.containers import Octets
-    from vplog.logs.messages import ImageMessage
+    from vplog.logs.message_records import ImageMessage
 
 _DEPTH_HEADER = 12
 """Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""

@@ -19,7 +19,7 @@ from vplog.logs.transforms import are_usable, clean
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
     from vplog.logs.containers import Notes
-    from vplog.logs.messages import TransformMessage
+    from vplog.logs.message_records import TransformMessage
     from vplog.logs.transforms import FrameTree
 
 _BODIES = ("base_link", "base_footprint")

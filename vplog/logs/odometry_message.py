@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.logs.messages import BadMessageError, PoseMessage, decode_generally, nanoseconds, short_type
+from vplog.logs.message_records import BadMessageError, PoseMessage, nanoseconds, short_type
+from vplog.logs.messages import decode_generally
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints

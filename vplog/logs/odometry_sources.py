@@ -15,7 +15,7 @@ import numpy as np
 from vplog.data import OdometrySource
 from vplog.logs.containers import Notes, plural
 from vplog.logs.continuity import find_jumps
-from vplog.logs.messages import short_type
+from vplog.logs.message_records import short_type
 from vplog.logs.stamps import NONE, share_clock
 from vplog.logs.transforms import FrameTree
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.messages import kind_of
+from vplog.logs.message_records import kind_of
 
 if TYPE_CHECKING:
     from pathlib import Path

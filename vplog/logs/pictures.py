@@ -13,7 +13,8 @@ from vplog.errors import LogError
 from vplog.logs.containers import plural
 from vplog.logs.frames import Decoded, Encoded, image_in
 from vplog.logs.images import drive_levels, grey, spread
-from vplog.logs.messages import BadMessageError, ImageMessage, decode
+from vplog.logs.message_records import BadMessageError, ImageMessage
+from vplog.logs.messages import decode
 from vplog.logs.video import VideoStream
 
 if TYPE_CHECKING:

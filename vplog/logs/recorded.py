@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from vplog.logs.containers import Channel, Container, Contents
     from vplog.logs.content import Content
     from vplog.logs.losses import Account, Loss
-    from vplog.logs.messages import CalibrationMessage
+    from vplog.logs.message_records import CalibrationMessage
     from vplog.logs.stereo import Pair
 
 _LISTED = 8

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from vplog.logs.messages import (
+from vplog.logs.message_records import (
     CalibrationMessage,
     FixMessage,
     ImageMessage,
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
     from vplog.data import Floats
-    from vplog.logs.messages import Record
+    from vplog.logs.message_records import Record
 
 _UNKNOWN_COVARIANCE = 0
 """NavSatFix.COVARIANCE_TYPE_UNKNOWN."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from vplog.logs.messages import BadMessageError
+from vplog.logs.message_records import BadMessageError
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Uint16s

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Bytes, Camera, Floats
-    from vplog.logs.messages import CalibrationMessage
+    from vplog.logs.message_records import CalibrationMessage
 
     Maps = tuple[np.ndarray, np.ndarray]
 

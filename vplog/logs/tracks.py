@@ -20,7 +20,7 @@ from vplog.logs.transforms import are_usable, clean
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
-    from vplog.logs.messages import FixMessage, PoseMessage
+    from vplog.logs.message_records import FixMessage, PoseMessage
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Floats
-    from vplog.logs.messages import TransformMessage
+    from vplog.logs.message_records import TransformMessage
 
 FARTHEST_M = 1e9
 """m; positions in map coordinates reach 1e7, so a coordinate beyond this is damage."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from vplog.errors import LogError
 from vplog.logs.h264 import FrameNumbers
-from vplog.logs.messages import BadMessageError
+from vplog.logs.message_records import BadMessageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

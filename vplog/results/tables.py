@@ -129,7 +129,7 @@ EDGES = pa.schema(
     [
         _column("a", pa.int32(), "row", "Keyframe."),
         _column("b", pa.int32(), "row", "Keyframe."),
-        _column("kind", pa.string(), "", "`odometry`, `loop` or `gps`."),
+        _column("kind", pa.string(), "", "`odometry` or `loop`. GPS fixes are no edges: see run.json."),
         *_pose_columns("", "a_from_b, as measured"),
         _column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
         _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1."),
