@@ -13,6 +13,7 @@ from hypothesis import settings
 
 from vplog import cli
 from vplog.demo import SMALL, make_drive
+from vplog.execution_value import Execution
 from vplog.pipeline import load_pipeline, run
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 def finished(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a default run on the small drive, with two threads. Tests read it and leave it as it is."""
     out = tmp_path_factory.mktemp("finished") / "run"
-    run(drive.log, out, load_pipeline("default"), threads=2)
+    run(drive.log, out, load_pipeline("default"), execution=Execution(2))
     return out
 
 

@@ -8,6 +8,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from vplog.demo import SMALL, make_drive
+from vplog.execution_value import Execution
 from vplog.joint import run_joint
 from vplog.pipeline import load_pipeline
 
@@ -47,5 +48,5 @@ def run_together(drive: Drive, folder: Path) -> Path:
     """The folder of the joint run."""
     parts = cut(drive.log, int(drive.stamp_ns[-14]), folder)
     elsewhere = make_drive(folder / "elsewhere", SMALL.model_copy(update={"seed": SMALL.seed + 1})).log
-    run_joint([*parts, elsewhere], folder / "out", load_pipeline("default", QUICK), threads=2)
+    run_joint([*parts, elsewhere], folder / "out", load_pipeline("default", QUICK), execution=Execution(2))
     return folder / "out"

@@ -22,17 +22,28 @@ PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors"},
     {"folders", "urls"},
-    {"data", "settings", "timing", "cores", "google_store", "web", "scratch", "own_processes", "parquet_bounds"},
+    {
+        "data",
+        "settings",
+        "timing",
+        "execution_value",
+        "cores",
+        "google_store",
+        "web",
+        "scratch",
+        "own_processes",
+        "parquet_bounds",
+    },
     {"image_file"},
     {"geometry", "geodesy", "remote"},
     {"tum"},
     {"stages", "references", "inputs", "code_hash", "cache_file"},
     {"logs", "keyframes", "features", "places", "loops", "graph", "results", "evaluate", "demo"},
-    {"extract", "record", "drawing", "back_end", "stage_codecs"},
-    {"stage_cache", "run_folder", "extracted", "shared_view", "libraries", "recognise"},
-    {"parts", "ledger"},
-    {"show"},
-    {"report"},
+    {"extract", "record", "drawing", "stage_codecs"},
+    {"stage_cache", "run_folder", "extracted", "shared_view"},
+    {"steps", "show"},
+    {"parts", "ledger", "libraries", "recognise", "back_end", "report"},
+    {"outputs"},
     {"pipeline", "evaluation", "walks", "compare_figures", "optimize"},
     {"between", "joint_graph"},
     {"methods", "trials", "joint", "retell", "resume"},
@@ -102,6 +113,8 @@ def test_no_stage_asks_for_a_certain_recogniser() -> None:
                 kinds = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
                 asked += [f"{name_of(file)}:{node.lineno}" for kind in kinds if re.search("(Bobb|Hybrid)State", kind)]
     assert not asked
+
+
 def test_no_circle_of_imports_among_the_readers_of_logs() -> None:
     """File by file, with imports inside functions and those for type checkers counted."""
     modules = {f"vplog.{name_of(file).removesuffix('.py').replace('/', '.')}": file for file in FILES}

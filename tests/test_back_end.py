@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 
 from tests.graph.drive import ODOMETRY_SIGMA, ledger, position_error, ring
-from vplog.back_end import back_end
+from vplog.back_end import solve
 from vplog.data import Odometry, Verdict
+from vplog.execution_value import Execution
 from vplog.graph.consistency import is_loop
 from vplog.pipeline import Pipeline
 
 if TYPE_CHECKING:
     from tests.graph.drive import Drive
     from vplog.back_end import Solved
-    from vplog.stages import Log
+    from vplog.data import Camera
 
-NO_LOG = cast("Log", None)
-"""Only GPS and directions would ask it."""
+NO_CAMERA = cast("Camera", None)
+"""Only directions would need it."""
 
 
 def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
@@ -35,7 +36,7 @@ def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
         drive.odometry.odom_from_body,
         np.tile(np.diag(claimed * ODOMETRY_SIGMA**2), (count, 1, 1)),
     )
-    return back_end(NO_LOG, odometry, drive.keyframes, closures, Pipeline())
+    return solve(odometry, drive.keyframes, closures, NO_CAMERA, None, Pipeline(), execution=Execution())
 
 
 @pytest.mark.parametrize("claimed", [1e-6, 1 / 64, 1.0, 64.0])

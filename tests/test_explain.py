@@ -14,6 +14,7 @@ import pytest
 
 from vplog import geometry
 from vplog.data import Camera, Features, Keyframes, Verdict
+from vplog.execution_value import Execution
 from vplog.explain_words import tell
 from vplog.loops import undistort
 from vplog.pipeline import Pipeline, load_pipeline, run
@@ -243,7 +244,7 @@ def test_without_its_library_a_run_is_shown_without_boxes(verb: Verb, copied: Pa
 
 @pytest.mark.parametrize("kind", ["bovf", "bobb_paper"])
 def test_other_recognisers_are_shown_with_what_they_have(verb: Verb, drive: Drive, tmp_path: Path, kind: str) -> None:
-    run(drive.log, tmp_path / "run", load_pipeline("default", [*QUICK, f"places.kind={kind}"]), threads=2)
+    run(drive.log, tmp_path / "run", load_pipeline("default", [*QUICK, f"places.kind={kind}"]), execution=Execution(2))
     picture = tmp_path / "a.png"
     found = verb("explain", tmp_path / "run", "--closure", 0, "-o", picture, "--json").json
     assert picture.is_file()

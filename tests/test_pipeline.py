@@ -22,8 +22,9 @@ from mcap.reader import make_reader
 from vplog import geometry
 from vplog.data import Verdict
 from vplog.evaluation import evaluate
+from vplog.execution_value import Execution
 from vplog.libraries import build_library
-from vplog.pipeline import load_pipeline, pipeline_schema, run
+from vplog.pipeline import CacheOptions, load_pipeline, pipeline_schema, run
 from vplog.results import tables
 
 if TYPE_CHECKING:
@@ -90,10 +91,10 @@ def test_settings_of_a_run_give_the_run_again(finished: Path, tmp_path: Path) ->
 def test_the_same_bytes_from_any_number_of_threads_and_over_an_old_run(
     drive: Drive, finished: Path, tmp_path: Path
 ) -> None:
-    run(drive.log, tmp_path, load_pipeline("default"), threads=1)
+    run(drive.log, tmp_path, load_pipeline("default"), execution=Execution(1))
     one = contents(tmp_path)
     (tmp_path / ".cache" / ".extract-000000.stage.1.part").write_bytes(b"left by a run that was killed")
-    run(drive.log, tmp_path, load_pipeline("default"), threads=4, use_cache=False)
+    run(drive.log, tmp_path, load_pipeline("default"), execution=Execution(4), cache=CacheOptions(use=False))
     for name, data in contents(finished).items():
         assert one[name] == data, f"{name} differs between one thread and two"
         assert (tmp_path / name).read_bytes() == data, f"{name} differs between four threads and two"
@@ -234,7 +235,7 @@ def test_accepted_closures_are_whole_and_the_others_are_not_in_the_graph(finishe
 def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, tmp_path: Path) -> None:
     """A gate this narrow turns away closures that are right."""
     strict = load_pipeline("default", [*QUICK, "solve.kind=pcm", "solve.gate_probability=0.001"])
-    ledger = run(drive.log, tmp_path, strict, threads=4).closures
+    ledger = run(drive.log, tmp_path, strict, execution=Execution(4)).closures
     rejected = np.array([verdict == Verdict.REJECTED_BY_SOLVER for verdict in ledger.verdict])
     assert rejected.any()
     assert (ledger.weight[rejected] == 0).all()
@@ -249,7 +250,7 @@ def test_a_library_of_another_drive_is_used_and_named(drive: Drive, tmp_path: Pa
     state = build_library([drive.log], tmp_path / "library", pipeline, threads=4)
     known = json.loads((tmp_path / "library" / "library.json").read_text())
     assert known["references"] == 5
-    record = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", threads=4).record
+    record = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", execution=Execution(4)).record
     about = record["library"]
     assert (about["hash"], about["from"], about["references"]) == (known["hash"], str(tmp_path / "library"), 5)
     assert about["coverage"]["explained"] > 0.5

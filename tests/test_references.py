@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from vplog import logs
 from vplog.errors import SettingsError
+from vplog.execution_value import Execution
 from vplog.libraries import build_library
 from vplog.pipeline import load_pipeline, run
 from vplog.places.stored import load_references
@@ -74,7 +75,10 @@ def test_an_unknown_way_is_refused_with_the_choices() -> None:
 def test_a_run_keeps_the_images_that_its_features_chose(drive: Drive, tmp_path: Path) -> None:
     """The images are read from the log a second time: each must be the one at its reference's stamp."""
     done = run(
-        drive.log, tmp_path, load_pipeline("default", [*QUICK, "library.size=9", "propose.per_query=1"]), threads=2
+        drive.log,
+        tmp_path,
+        load_pipeline("default", [*QUICK, "library.size=9", "propose.per_query=1"]),
+        execution=Execution(2),
     )
     references = load_references(tmp_path / "library")
     stamps = np.array([reference.stamp_ns for reference in references])
@@ -97,6 +101,6 @@ def test_a_library_without_keypoints_serves_other_drives(drive: Drive, tmp_path:
     """Places described by patches alone, as `quick` has them."""
     pipeline = load_pipeline("quick", ["pictures.megapixels=0", "library.size=12"])
     build_library([drive.log], tmp_path / "library", pipeline)
-    done = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", threads=2)
+    done = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", execution=Execution(2))
     assert done.record["library"]["coverage"]["frames"] == 0, "nothing tells"
     assert not any("The library explains" in text for text in done.record["warnings"])

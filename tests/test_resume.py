@@ -24,16 +24,17 @@ from vplog import code_hash, extracted, ledger, logs, parts
 from vplog.cache_file import CONTENT_AT, DamagedError, sealed
 from vplog.data import Closures, Keyframes
 from vplog.errors import LogError, ResultError
+from vplog.execution_value import Execution
 from vplog.extracted import Extracted
 from vplog.logs.frames import RecordedFrame
 from vplog.loops.propose import Proposals
 from vplog.parts import compute_part, cut, extract, missing_parts, parts_of, put_part, stored_features
-from vplog.pipeline import Pipeline, load_pipeline, run
+from vplog.pipeline import CacheOptions, Pipeline, load_pipeline, run
 from vplog.record import head
 from vplog.run_folder import begun
 from vplog.stage_cache import StageCache, digest_of, inputs_of
 from vplog.stage_codecs import arrays_codec, closures_codec, images_codec
-from vplog.timing import Watch
+from vplog.steps import Steps
 
 from .logs import drives
 from .logs.drives import ros_messages, write_raw, write_ros2
@@ -191,7 +192,7 @@ def test_settings_of_features_and_pictures_extract_anew(log: Path, again: Path, 
 
 
 def test_without_a_cache_nothing_is_found_and_nothing_stays(log: Path, whole: Path, again: Path) -> None:
-    run(log, again, load_pipeline("default", QUICK), use_cache=False)
+    run(log, again, load_pipeline("default", QUICK), cache=CacheOptions(use=False))
     assert computed(again) == list(KEPT)
     assert not (again / ".cache").exists()
     assert results(again) == results(whole)
@@ -266,7 +267,7 @@ def test_a_full_disk_costs_the_cache_but_not_the_run(
         file.unlink()
     monkeypatch.setattr(StageCache, "put", full)
     record = run(log, again, load_pipeline("default", QUICK)).record
-    assert [said for said in record["warnings"] if "is not kept" in said and "No space left" in said]
+    assert [said for said in record["warnings"] if "are not stored" in said and "No space left" in said]
     assert len(record["warnings"]) == 1
     assert results(again) == results(whole)
 
@@ -287,7 +288,7 @@ def test_parts_computed_elsewhere_spare_the_run_all_images(
     with pytest.raises(LogError, match="is not what it was"):
         compute_part(replace(todo[0], lengths=""))
     decoded.clear()
-    run(log, tmp_path / "run", pipeline, cache=cache)
+    run(log, tmp_path / "run", pipeline, cache=CacheOptions(cache))
     assert len(decoded) == 6, "the references alone"
     assert results(tmp_path / "run") == results(whole)
     assert not (tmp_path / "run" / ".cache").exists()
@@ -318,10 +319,10 @@ def test_parts_are_those_of_the_whole_drive(kind: str, tmp_path: Path, monkeypat
             payloads[15] = b"\0" * len(payloads[15])
         path = write_raw(tmp_path / "drive.mcap", messages("foxglove", payloads))
     log, keyframes, todo = drive_of(path)
-    cache = StageCache(tmp_path / "cache", Watch(), [])
-    found = extract(log, todo, cache, threads=2)
+    with Steps(path, tmp_path / "cache", Execution(2)) as do:
+        found = do(extract, log, logs.TopicChoice(), keyframes, Pipeline())
     for part in todo:
-        assert compute_part(part) == (cache.folder / part.file).read_bytes()
+        assert compute_part(part) == (tmp_path / "cache" / part.file).read_bytes()
     assert len(todo) > 2
     assert len(found) + len(found.lost) == len(keyframes.stamp_ns)
     assert bool(found.lost) == (kind == "damaged video")
@@ -397,7 +398,7 @@ def test_a_ledger_in_parts_is_the_ledger(size: int, monkeypatch: pytest.MonkeyPa
     matches = [set(known.match[part].tolist()) for part in rows]
     assert sum(map(len, matches)) == len(set.union(*matches))
     taken = [_taken(known, part) for part in rows]
-    found = ledger._together([codec.from_bytes(codec.to_bytes(part)) for part in taken], rows)
+    found = ledger.merged([codec.from_bytes(codec.to_bytes(part)) for part in taken], rows)
     assert digest_of(found) == digest_of(known)
     assert found.verdict == known.verdict
     nothing = _taken(known, np.empty(0, np.int64))

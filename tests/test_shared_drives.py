@@ -9,6 +9,7 @@ import pytest
 
 from vplog.data import Verdict
 from vplog.evaluation import evaluate
+from vplog.execution_value import Execution
 from vplog.pipeline import Run, load_pipeline, run
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ GARDENS = ("gardens_day_left", "gardens_night_right")
 def run_default(log: Path, out: Path) -> Run:
     if not log.exists():
         pytest.skip(f"no {log}: set VPLOG_DATA to the folder with the real drives")
-    return run(log, out, load_pipeline("default"), threads=os.cpu_count() or 1)
+    return run(log, out, load_pipeline("default"), execution=Execution(os.cpu_count() or 1))
 
 
 @pytest.fixture(scope="module")

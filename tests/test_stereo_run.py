@@ -10,6 +10,7 @@ import pytest
 from vplog.data import Verdict
 from vplog.demo import SMALL, make_drive
 from vplog.evaluation import evaluate
+from vplog.execution_value import Execution
 from vplog.pipeline import load_pipeline, run
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ QUICK = ("features.max_features=800", "propose.per_query=2", "pictures.closures=
 
 def test_metres_come_from_the_pair(tmp_path: Path) -> None:
     drive = make_drive(tmp_path / "drive", SMALL.model_copy(update={"stereo_baseline_m": BASELINE_M}))
-    done = run(drive.log, tmp_path / "run", load_pipeline("default", QUICK), threads=2)
+    done = run(drive.log, tmp_path / "run", load_pipeline("default", QUICK), execution=Execution(2))
     accepted = [row for row, verdict in enumerate(done.closures.verdict) if verdict is Verdict.ACCEPTED]
     assert len(accepted) >= 10
     assert {done.closures.scale[row] for row in accepted} == {"stereo"}

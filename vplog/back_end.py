@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from vplog.cores import limited
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
 from vplog.graph.consistency import is_loop
@@ -17,18 +19,21 @@ from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.satellites import fixes_on
 from vplog.graph.solve import gated
+from vplog.steps import step
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Closures, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.data import Camera, Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.execution_value import Execution
     from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.noise import NoiseSettings
     from vplog.graph.refine import Refined, RefineSettings
     from vplog.graph.satellites import Fixes, GpsSettings
     from vplog.graph.solve import OptimiserSettings
-    from vplog.stages import Log
 
+
+_log = logging.getLogger(__name__)
 
 _CONTRADICTED = (
     "The odometry's covariance was not believed: with it no closure is left, and with the drift model {kept} of the "
@@ -66,8 +71,28 @@ class Solved:
     warnings: list[str]
 
 
-def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures, settings: BackEnd) -> Solved:
-    """The best trajectory of a drive. Raises GraphError where there is none."""
+@step("solve")
+def solve(
+    odometry: Odometry,
+    keyframes: Keyframes,
+    closures: Closures,
+    camera: Camera,
+    gps: Gps | None,
+    settings: BackEnd,
+    *,
+    execution: Execution,
+) -> Solved:
+    """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
+    with limited(execution.threads):
+        solved = _solve(odometry, keyframes, closures, camera, gps, settings)
+    for warning in solved.warnings:
+        _log.warning(warning)
+    return solved
+
+
+def _solve(
+    odometry: Odometry, keyframes: Keyframes, closures: Closures, camera: Camera, gps: Gps | None, settings: BackEnd
+) -> Solved:
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
     solution = solve_gated(graph, settings)
@@ -86,11 +111,11 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
             closures.query[lines].astype(np.int64),
             closures.match_from_query[lines],
             closures.information[lines],
-            log.camera().body_from_camera,
+            camera.body_from_camera,
         )
         graph, solution = with_directions(graph, solution, directions, settings.solve)
         rows = np.concatenate([rows, lines])
-    fixes = fixes_on(log.gps(), odometry, keyframes, settings.gps) if settings.gps.use else None
+    fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
     if fixes is not None:
         solution = keep_odometry_if_further(graph, solution, fixes)
     refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
@@ -122,8 +147,9 @@ def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.
     return result
 
 
-def about_gps(fixes: Fixes | None, refined: Refined) -> dict[str, Any] | None:
+def about_gps(solved: Solved) -> dict[str, Any] | None:
     """What run.json says of GPS: how many fixes were kept, and where on earth the trajectory's frame is."""
+    fixes, refined = solved.fixes, solved.refined
     if fixes is None or refined.world_from_enu is None:
         return None
     latitude, longitude, altitude = fixes.origin

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from vplog import record
 from vplog.cores import limited
 from vplog.errors import VplogError
+from vplog.execution_value import Execution
 from vplog.maps import keys
-from vplog.pipeline import Pipeline
+from vplog.pipeline import CacheOptions, Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.remote import located
 from vplog.results import run_record
@@ -80,8 +81,8 @@ def compute_drive(task: Task) -> Outcome:
         log = located(task.log)
         with limited(task.threads):
             done = run_alone(
-                log, task.folder, task.pipeline, task.library, task.topics, task.threads, cache=task.cache,
-                use_cache=task.cache is not None,
+                log, task.folder, task.pipeline, task.library, task.topics, Execution(task.threads),
+                CacheOptions(task.cache, use=task.cache is not None),
             )  # fmt: skip
         peak = done.record["totals"]["peak_memory_mb"]
         if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):

@@ -42,6 +42,7 @@ from vplog.cli_results import add_results
 from vplog.cli_study import add_studies
 from vplog.cores import available, limited
 from vplog.errors import LogError, VplogError, was_interrupted
+from vplog.execution_value import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -215,15 +216,16 @@ def run(arguments: argparse.Namespace) -> None:
             from vplog.joint import run_joint
 
             found = run_joint(
-                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache,
+                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress), use_cache,
                 arguments.force,
             )  # fmt: skip
         else:
+            from vplog.pipeline import CacheOptions
             from vplog.pipeline import run as run_pipeline
 
             found = run_pipeline(
-                paths, arguments.output, pipeline, library, topics, arguments.threads, progress, use_cache=use_cache,
-                force=arguments.force,
+                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress),
+                CacheOptions(use=use_cache, force=arguments.force),
             ).record  # fmt: skip
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
@@ -293,6 +295,7 @@ def demo(arguments: argparse.Namespace) -> None:
     """Render a small drive, run on it, evaluate it."""
     from vplog.demo import DemoSettings, make_drive
     from vplog.evaluation import evaluate as evaluate_run
+    from vplog.pipeline import CacheOptions
     from vplog.pipeline import run as run_pipeline
     from vplog.report import outcome_of
     from vplog.retell import report as write_report
@@ -304,8 +307,8 @@ def demo(arguments: argparse.Namespace) -> None:
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
         progress("render", 1, 1)
         done = run_pipeline(
-            drive.log, arguments.output / "run", pipeline, threads=arguments.threads, progress=progress,
-            force=arguments.force,
+            drive.log, arguments.output / "run", pipeline, execution=Execution(arguments.threads, progress),
+            cache=CacheOptions(force=arguments.force),
         )  # fmt: skip
     found = evaluate_run(arguments.output / "run", str(drive.truth))
     write_report(arguments.output / "run", truth=str(drive.truth))

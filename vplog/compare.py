@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import vplog
-from vplog import compare_figures, logs, record
+from vplog import compare_figures, logs
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
+from vplog.execution_value import logged_warnings
 from vplog.features.store import FeatureStore
 from vplog.methods import read_methods
 from vplog.places.sequence import SequenceSettings
@@ -83,7 +84,7 @@ def compare(
     warnings: list[str] = []
     with ExitStack() as stack:
         made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out)))
-        stack.enter_context(record.heard(warnings))
+        stack.enter_context(logged_warnings(warnings))
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
         query_log = logs.open(query, topics)
         map_log = query_log if itself else logs.open(other, topics)

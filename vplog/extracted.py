@@ -84,6 +84,11 @@ class Extracted:
         self.files.append(path.name)
         self._rows += [(path, begin, row) for row in rows]
 
+    @property
+    def token(self) -> str:
+        """Stands for all that the features were made from: the names of the files hold the hashes of that."""
+        return " ".join(self.files)
+
     def __len__(self) -> int:
         return len(self._rows)
 

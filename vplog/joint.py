@@ -11,10 +11,12 @@ from vplog import logs, record, tum
 from vplog.between import candidates_among, closures_between, likely_pairs, with_shared
 from vplog.cores import limited
 from vplog.errors import SettingsError
+from vplog.execution_value import Execution
 from vplog.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.libraries import build_library, check_library
 from vplog.loops.verify import calibration_share, drive_of, no_closures
 from vplog.parts import odometry_of
+from vplog.pipeline import CacheOptions
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
@@ -52,8 +54,7 @@ def run_joint(
     pipeline: Pipeline,
     library: Path | None = None,
     topics: logs.TopicChoice | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    execution: Execution | None = None,
     use_cache: bool = True,
     force: bool = False,
 ) -> dict[str, Any]:
@@ -69,7 +70,8 @@ def run_joint(
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
         odometry_of(log)
-    watch = Watch()
+    execution, watch = execution or Execution(), Watch()
+    threads, progress = execution.threads, execution.progress
     with ExitStack() as stack:
         made = stack.enter_context(
             begun(out, pipeline, paths[0], threads, library, topics, drives_at, resumable=use_cache, force=force)
@@ -85,9 +87,8 @@ def run_joint(
         for name, path in drives_at.items():
             with watch.stage(name):
                 done = run_alone(
-                    path, made / name, pipeline, library, topics, threads,
-                    lambda stage, count, total, name=name: progress(f"{name}: {stage}", count, total), caches / name,
-                )  # fmt: skip
+                    path, made / name, pipeline, library, topics, execution.within(name), CacheOptions(caches / name)
+                )
                 drives.append(_alone(name, done, pipeline))
         with watch.stage("between"):
             state = pipeline.places.load(library, threads)

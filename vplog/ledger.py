@@ -8,62 +8,79 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Closures
+from vplog.execution_value import Execution
 from vplog.loops.verify import calibration_share, drive_of, verify_between
 from vplog.stage_codecs import closures_codec, json_codec
+from vplog.steps import step
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from vplog.data import Camera, Ints, Keyframes
-    from vplog.features.store import FeaturesOf
+    from vplog.extracted import Extracted
     from vplog.loops.propose import Proposals
-    from vplog.loops.verify import VerifySettings
-    from vplog.stage_cache import StageCache
+    from vplog.loops.verify import Drive, VerifySettings
+    from vplog.steps import Steps
 
-_CODE = ("vplog.loops.verify",)
 _PART_CANDIDATES = 1000
 """Candidates of a part: 5 to 10 s of one core, as a part of the keyframes."""
 
 
-def verify_in_parts(
+@step("verify", items=lambda proposals, *_: len(proposals.query))
+def verify(
     proposals: Proposals,
     keyframes: Keyframes,
     camera: Camera,
-    features: FeaturesOf,
+    features: Extracted,
     settings: VerifySettings,
-    cache: StageCache,
-    threads: int,
-    progress: Callable[[int, int], None],
+    *,
+    steps: Steps,
 ) -> Closures:
     """The ledger of `loops.verify.verify_between`, whose row depends on its two frames and the calibration alone.
 
     A part has all candidates of some map frames, whose landmarks are made once all the same.
     """
-    drive = drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
-    of = ["extract", "keyframes", "camera"]
-    if not len(proposals.query):
-        return verify_between(proposals, drive, drive)
-    share = 0.0
-    if camera.matrix is not None:
-        exact = json_codec(float, float)
-        share = cache.result("calibrate", of, [settings], _CODE, exact, lambda: calibration_share(drive, threads))
-    found, reused, done, places = [], 0, 0, _parts(proposals.match)
-    for number, rows in enumerate(places):
-        part = proposals.rows(rows)
-        cache.saw(candidates=[part.query, part.match, part.rank, part.score, part.support], share=share)
-        name = f"verify-{number:06d}"
-        found.append(
-            cache.result(
-                name, [*of, "candidates", "share"], [settings], _CODE, closures_codec(),
-                lambda part=part, done=done: verify_between(
-                    part, drive, drive, threads, lambda count, _: progress(done + count, len(proposals.query)), share
-                ),
-            )
-        )  # fmt: skip
-        reused += cache.told.pop(name)["result"] == "reused"
-        done += len(rows)
-    cache.tell("verify", len(places), reused)
-    return merged(found, places)
+    drive = keyframes, camera, features, settings
+    places = _parts(proposals.match)
+    if not places:
+        return verify_part.function(proposals, 0.0, 0, 0, *drive, execution=Execution())
+    share = 0.0 if camera.matrix is None else steps.part(calibrate, *drive)
+    total, before = len(proposals.query), np.cumsum([0, *map(len, places)]).tolist()
+    parts = [(proposals.rows(rows), share, done, total, *drive) for rows, done in zip(places, before, strict=False)]
+    return merged(steps.in_parts(verify_part, parts), places)
+
+
+@step("calibrate", lambda *_: json_codec(float, float))
+def calibrate(
+    keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings, *, execution: Execution
+) -> float:
+    """By what share of a rotation the calibration is wrong at most."""
+    return calibration_share(_drive(keyframes, camera, features, settings), execution.threads)
+
+
+@step("verify", lambda *_: closures_codec(), without=("done", "total"))
+def verify_part(
+    proposals: Proposals,
+    share: float,
+    done: int,
+    total: int,
+    keyframes: Keyframes,
+    camera: Camera,
+    features: Extracted,
+    settings: VerifySettings,
+    *,
+    execution: Execution,
+) -> Closures:
+    """The ledger of some candidates; `done` of the `total` were checked before them."""
+    drive = _drive(keyframes, camera, features, settings)
+    tell = execution.progress
+    return verify_between(
+        proposals, drive, drive, execution.threads, lambda count, _: tell("verify", done + count, total), share
+    )
+
+
+def _drive(keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings) -> Drive:
+    return drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
 
 
 def _parts(match: np.ndarray) -> list[Ints]:

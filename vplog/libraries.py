@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -22,24 +23,29 @@ from vplog.places.coverage import (
 )
 from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
-from vplog.places.stored import read_library_record, references_hash
+from vplog.places.stored import load_references, read_library_record
 from vplog.references import PAPER_SIZE, choose, evenly
 from vplog.results.staging import recover, staged
-from vplog.stage_codecs import json_codec
+from vplog.stage_codecs import images_codec, json_codec
+from vplog.steps import step
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from vplog.data import Bytes, Ints, Keyframes
+    from vplog.execution_value import Execution
+    from vplog.extracted import Extracted
     from vplog.features.sift import SiftSettings
-    from vplog.features.store import FeaturesOf
     from vplog.places import PlaceSettings
     from vplog.references import LibrarySettings
     from vplog.stage_codecs import Codec
     from vplog.stages import Log, PlaceState
 
     Progress = Callable[[str, int, int], None]
+
+
+_log = logging.getLogger(__name__)
 
 
 class Describing(Protocol):
@@ -67,15 +73,22 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
             )
 
 
+@step("choose", lambda *_: images_codec(), without=("log",))  # the features stand for the log's images
 def own_images(
-    log: Log, selected: Keyframes, keyframes: Keyframes, features: FeaturesOf, settings: LibrarySettings, threads: int
+    log: Log,
+    selected: Keyframes,
+    keyframes: Keyframes,
+    features: Extracted,
+    settings: LibrarySettings,
+    *,
+    execution: Execution,
 ) -> list[tuple[int, Bytes]]:
     """Rows and images of the keyframes that become the drive's own references; these images are read once more.
 
     `keyframes` are those of the `selected` that decode.
     """
     if settings.choose == "coverage":
-        rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, threads)
+        rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, execution.threads)
     else:
         chosen_ns = selected.stamp_ns[choose(selected.stamp_ns, settings)]
         rows = np.flatnonzero(np.isin(keyframes.stamp_ns, chosen_ns))
@@ -83,37 +96,50 @@ def own_images(
     return [(row, encoded.decode().image) for row, encoded in zip(rows.tolist(), frames, strict=True)]
 
 
+def own_references(keyframes: Keyframes, features: Extracted, images: Sequence[tuple[int, Bytes]]) -> list[Reference]:
+    """References of a drive's own keyframes, by row and image."""
+    stamps = keyframes.stamp_ns.tolist()
+    return [Reference(image, features[row], keyframes.drive, stamps[row]) for row, image in images]
+
+
+@step("choose")
+def given_references(library: Path, *, execution: Execution) -> list[Reference]:
+    """The references of a library in a folder. Raises LibraryError."""
+    return load_references(library, execution.threads)
+
+
+@step("learn", items=lambda places, references, library: len(references))
+def learn(
+    places: PlaceSettings, references: list[Reference], library: Path | None, *, execution: Execution
+) -> PlaceState:
+    """The recogniser with its library: the folder given, or one of these references."""
+    if library is not None:
+        return places.load(library, execution.threads)
+    return places.learn(references, execution.threads)
+
+
+@step("cover", lambda *_: coverage_codec())
 def cover(
-    drive: str,
-    keyframes: Keyframes,
-    references: list[Reference],
-    given: bool,
-    features: FeaturesOf,
-    threads: int,
-) -> tuple[Coverage, list[str]]:
-    """How far the references explain the drive, and what to do where that is little; of no frames where the library
-    keeps no features that could tell (`places.features: 0`)."""
+    keyframes: Keyframes, references: list[Reference], given: bool, features: Extracted, *, execution: Execution
+) -> Coverage:
+    """How far the references explain the drive, with a warning where that is little; of no frames where the library
+    has no features that could tell (`places.features: 0`)."""
     if not any(len(one.features) for one in references):
-        return Coverage(0.0, 0.0, 0), []
-    library = index_words(references, WordSettings(), threads, own=False)
-    coverage = measure_coverage(len(features), features.__getitem__, keyframes.stamp_ns, drive, library, threads)
-    doubt = coverage_warning(coverage, len(features), given, len(library))
-    return coverage, [doubt] if doubt else []
+        return Coverage(0.0, 0.0, 0)
+    library = index_words(references, WordSettings(), execution.threads, own=False)
+    coverage = measure_coverage(
+        len(features), features.__getitem__, keyframes.stamp_ns, keyframes.drive, library, execution.threads
+    )
+    if doubt := coverage_warning(coverage, len(features), given, len(library)):
+        _log.warning(doubt)
+    return coverage
 
 
-def coverage_codec() -> Codec[tuple[Coverage, list[str]]]:
-    """Of what `cover` gives."""
-
-    def made(tree: Any) -> tuple[Coverage, list[str]]:
-        coverage, doubt = tree
-        return Coverage(float(coverage["explained"]), float(coverage["median"]), int(coverage["frames"])), list(doubt)
-
-    return json_codec(made, lambda found: [asdict(found[0]), found[1]])
-
-
-def about_references(references: Sequence[Reference]) -> list[Any]:
-    """All that coverage depends on of them."""
-    return [references_hash(references, WordSettings()), [[one.drive, one.stamp_ns] for one in references]]
+def coverage_codec() -> Codec[Coverage]:
+    """JSON of how far references explain a drive."""
+    return json_codec(
+        lambda tree: Coverage(float(tree["explained"]), float(tree["median"]), int(tree["frames"])), asdict
+    )
 
 
 def build_library(

@@ -12,6 +12,7 @@ keyframes become references.
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
@@ -31,23 +32,31 @@ from vplog.remote import address, located
 from vplog.results.atomic import replacing
 from vplog.results.previews import preview
 from vplog.stage_cache import StageCache, finished_parts, inputs_of, key_of
+from vplog.steps import step
 from vplog.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.data import Features, Frame, Odometry
+    from vplog.data import Camera, Features, Frame, Odometry
+    from vplog.execution_value import Execution
     from vplog.features.sift import SiftSettings
     from vplog.keyframes import KeyframeSettings
     from vplog.loops.stereo import StereoSettings
     from vplog.results.previews import PictureSettings
     from vplog.stage_cache import Inputs
     from vplog.stages import Log
+    from vplog.steps import Steps
 
-    Progress = Callable[[str, int, int], None]
     Decoded = tuple[int, Frame | None, Features | None, str]
     """Of `extract_frames`: stamp, frame, features, and why there are none."""
+
+_log = logging.getLogger(__name__)
+_UNCALIBRATED = (
+    "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
+    "Record its camera_info, or name it with --camera-info-topic."
+)
 
 PART_KEYFRAMES = 64
 """Keyframes of a part: about 6 s of one core and 20 MB. A kill costs at most one part, and who computes one elsewhere
@@ -101,7 +110,7 @@ def parts_of(
     """
     log = logs.open_drive(files_of(path), topics)
     keyframes, _ = select_keyframes(log.name, log.stamps(), odometry_of(log), pipeline.keyframes)
-    return cut(files_of(path), topics, pipeline, keyframes, inputs_of(path, cache))
+    return cut(path, topics, pipeline, keyframes, inputs_of(path, cache))
 
 
 def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
@@ -159,7 +168,11 @@ def stored_features(cache: Path) -> Extracted | None:
 
 
 def cut(
-    files: Sequence[Path], topics: logs.TopicChoice | None, settings: Extraction, keyframes: Keyframes, inputs: Inputs
+    drive: Path | Sequence[Path],
+    topics: logs.TopicChoice | None,
+    settings: Extraction,
+    keyframes: Keyframes,
+    inputs: Inputs,
 ) -> list[Part]:
     """The keyframes in parts. Raises LogError where there is only one."""
     stamp_ns = keyframes.stamp_ns
@@ -168,7 +181,7 @@ def cut(
             f"{keyframes.drive}: by the odometry nothing moves far enough for a second keyframe, and a graph needs "
             "two. Set keyframes.distance_m lower, or choose another topic with --odometry-topic."
         )
-    topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files)
+    topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files_of(drive))
     alike = {
         "inputs": inputs.token,
         "topics": images_topics(topics),
@@ -194,6 +207,18 @@ def images_topics(topics: logs.TopicChoice) -> dict[str, Any]:
     return named
 
 
+@step("read")
+def read(log: Log, settings: KeyframeSettings) -> tuple[Odometry, Camera, Keyframes]:
+    """Odometry, camera and selected keyframes of a drive. Raises LogError where there is no odometry."""
+    odometry = odometry_of(log)
+    selected, doubts = select_keyframes(log.name, log.stamps(), odometry, settings)
+    for doubt in doubts:
+        _log.warning(doubt)
+    if (camera := log.camera()).matrix is None:
+        _log.warning(_UNCALIBRATED, camera.name)
+    return odometry, camera, selected
+
+
 def odometry_of(log: Log) -> Odometry:
     """Raises LogError where there is none."""
     odometry = log.odometry()
@@ -205,21 +230,30 @@ def odometry_of(log: Log) -> Odometry:
     return odometry
 
 
+@step("extract", items=lambda log, topics, keyframes, settings: len(keyframes.stamp_ns))
 def extract(
-    log: Log, parts: Sequence[Part], cache: StageCache, threads: int = 1, progress: Progress = lambda *_: None
+    log: Log,
+    topics: logs.TopicChoice,
+    keyframes: Keyframes,
+    settings: Extraction,
+    *,
+    steps: Steps,
+    execution: Execution,
 ) -> Extracted:
     """The keyframes' features: of the parts that the cache holds from there, of the others from the log's images.
 
     Raises LogError where fewer than two keyframes decode, and ResultError where the disk is full.
     """
+    cache = steps.cache
+    parts = cut(cache.drive, topics, settings, keyframes, cache.inputs)
     missing = [part for part in parts if not _held(cache, part)]
     total = sum(len(part.stamp_ns) for part in parts)
     done = total - sum(len(part.stamp_ns) for part in missing)
     # one stream over all that is missing: workers do not wait at the end of a part
-    frames = _frames(log, missing, threads) if missing else ()
-    told = _told(frames, lambda count: progress("extract", done + count, total))
+    frames = _frames(log, missing, execution.threads) if missing else ()
+    counted = _counted(frames, lambda count: execution.progress("extract", done + count, total))
     for part in missing:
-        cache.put(part.file, sealed(part.key, _content(log, part, told)))
+        cache.put(part.file, sealed(part.key, _content(log, part, counted)))
     found = Extracted()
     for part in parts:
         found.add(cache.folder / part.file)
@@ -227,18 +261,16 @@ def extract(
     if len(found) < 2:
         why = f" The first: {found.lost[0]}" if found.lost else ""
         raise LogError(f"{log.name}: {len(found)} of {total} keyframes could be decoded, and a graph needs two.{why}")
-    cache.tell("extract", len(parts), len(parts) - len(missing))
-    cache.saw(extract=[part.key for part in parts])
+    steps.count("extract", len(parts), len(parts) - len(missing))
     return found
 
 
-def kept(keyframes: Keyframes, found: Extracted) -> tuple[Keyframes, list[str]]:
-    """The keyframes that were decoded, and a warning where that is not all of them."""
+def decoded(keyframes: Keyframes, found: Extracted) -> Keyframes:
+    """The keyframes whose images decode, with a warning where that is not all of them."""
     rows, total = np.searchsorted(keyframes.stamp_ns, found.stamp_ns), len(keyframes.stamp_ns)
-    warnings = [
-        f"{total - len(rows)} of {total} keyframes were lost to damaged images. First: {why}" for why in found.lost[:1]
-    ]
-    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows]), warnings
+    for why in found.lost[:1]:
+        _log.warning("%d of %d keyframes were lost to damaged images. First: %s", total - len(rows), total, why)
+    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows])
 
 
 def _held(cache: StageCache, part: Part) -> bool:
@@ -287,7 +319,7 @@ def _frames(log: Log, parts: Sequence[Part], threads: int) -> Iterator[Decoded]:
     return extract_frames(log.frames(stamp_ns), settings.features, threads, settings.stereo)
 
 
-def _told(frames: Iterable[Decoded], tell: Callable[[int], None]) -> Iterator[Decoded]:
+def _counted(frames: Iterable[Decoded], tell: Callable[[int], None]) -> Iterator[Decoded]:
     for count, frame in enumerate(frames, start=1):
         tell(count)
         yield frame

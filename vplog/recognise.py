@@ -7,44 +7,52 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vplog.extract import map_in_order, one_thread_each
-from vplog.loops.propose import candidate_stops, propose
+from vplog.loops.propose import Proposals, candidate_stops, propose
 from vplog.places.sequence import rank_places
+from vplog.stage_codecs import arrays_codec, descriptors_codec
 from vplog.stages import BoxState
+from vplog.steps import step
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from vplog.data import Closures, Keyframes
-    from vplog.features.store import FeaturesOf
-    from vplog.loops.propose import Proposals, ProposeSettings
+    from vplog.execution_value import Execution
+    from vplog.extracted import Extracted
+    from vplog.loops.propose import ProposeSettings
     from vplog.places.sequence import SequenceSettings
     from vplog.stages import PlaceState
 
-    Progress = Callable[[str, int, int], None]
 
-
-def describe(state: PlaceState, features: FeaturesOf, threads: int, progress: Progress) -> Sequence[Any]:
+@step(
+    "describe",
+    lambda state, features: descriptors_codec(state, len(features)),
+    items=lambda state, features: len(features),
+)
+def describe(state: PlaceState, features: Extracted, *, execution: Execution) -> Sequence[Any]:
     """A descriptor for every keyframe, in order."""
-    result = []
+    result, threads = [], execution.threads
     with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
         work = map_in_order(pool, lambda row: state.describe(features[row]), range(len(features)), ahead=4 * threads)
         for descriptor in work:
             result.append(descriptor)
-            progress("describe", len(result), len(features))
+            execution.progress("describe", len(result), len(features))
     return result
 
 
+@step("propose", lambda *_: arrays_codec(Proposals), items=lambda state, descriptors, *_: len(descriptors))
 def find_candidates(
     state: PlaceState,
     descriptors: Sequence[Any],
     keyframes: Keyframes,
     settings: ProposeSettings,
     sequence: SequenceSettings,
-    threads: int,
+    *,
+    execution: Execution,
 ) -> Proposals:
     """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
     index, stops = state.index(descriptors), candidate_stops(keyframes, settings)
-    return propose(rank_places(index, descriptors, stops, settings.asked, sequence, threads), settings)
+    return propose(rank_places(index, descriptors, stops, settings.asked, sequence, execution.threads), settings)
 
 
 def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:

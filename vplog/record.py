@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import platform
 from contextlib import contextmanager
-from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import vplog
 from vplog import logs
-from vplog.data import Verdict
 from vplog.errors import LogError, ResultError
 from vplog.inputs import bytes_of, files_of, look_of
 from vplog.remote import local_copy, located, original, reason
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from vplog.data import Closures, Keyframes, Odometry
     from vplog.settings import Settings
     from vplog.stages import Log
 
@@ -96,7 +92,6 @@ def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
 
 def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[str, Any]:
     files = [str(file.resolve()) for file in files_of(path)]
-    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
     return {
         "format": run_record.FORMAT,
         "vplog": vplog.__version__,
@@ -105,8 +100,14 @@ def head(pipeline: Settings, path: Path | Sequence[Path], threads: int) -> dict[
         "log_stat": stat_of(files_of(path)),
         "threads": threads,
         "settings": pipeline.model_dump(mode="json"),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in packages}},
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on."""
+    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
+    return {"python": platform.python_version(), **{name: _version(name) for name in packages}}
 
 
 def _version(package: str) -> str:
@@ -114,32 +115,3 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "unknown"
-
-
-def counts(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closures) -> dict[str, Any]:
-    verdicts = {verdict.value: closures.verdict.count(verdict) for verdict in Verdict if verdict in closures.verdict}
-    return {
-        "frames": len(log.stamps()),
-        "odometry": len(odometry.stamp_ns),
-        "keyframes": len(keyframes.stamp_ns),
-        "candidates": len(closures),
-        "verdicts": verdicts,
-    }
-
-
-def losses(log: Log) -> list[dict[str, Any]]:
-    """What of the log could not be used, by reason and topic, with counts and times."""
-    return [asdict(loss) for loss in getattr(log, "losses", [])]
-
-
-@contextmanager
-def heard(warnings: list[str]) -> Iterator[None]:
-    """What the stages log as warnings goes into run.json too."""
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: warnings.append(record.getMessage())
-    logger = logging.getLogger("vplog")
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)

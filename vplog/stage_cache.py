@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -16,7 +17,6 @@ import numpy as np
 
 from vplog.cache_file import (
     CACHE_FILES,
-    CONTENT_AT,
     ENDING,
     INPUTS,
     AbsentError,
@@ -25,19 +25,17 @@ from vplog.cache_file import (
     file_name,
     sealed,
 )
-from vplog.code_hash import code_of
 from vplog.errors import ResultError
 from vplog.inputs import hash_inputs, look_of
 from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json, write_run_json
+from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
-    from vplog.settings import Settings
     from vplog.stage_codecs import Codec
-    from vplog.timing import Watch
 
 T = TypeVar("T")
 
@@ -68,15 +66,20 @@ def key_of(made_from: Any) -> str:
 
 
 def digest_of(value: Any) -> str:
-    """sha256 over a value: of a dataclass all its fields, of an array type, shape and bytes."""
+    """sha256 over a value: of settings and dataclasses all fields, of arrays type, shape and bytes, of a recogniser's
+    state its hash, of stored features their token."""
     digest = hashlib.sha256()
-    if is_dataclass(value):
+    if isinstance(stands_for := getattr(value, "token", getattr(value, "hash", None)), str):
+        digest.update(stands_for.encode())
+    elif is_dataclass(value):
         for field in fields(value):
             digest.update(f"{field.name} {digest_of(getattr(value, field.name))}\n".encode())
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str} {value.shape}\n".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, list | tuple):
+        digest.update("".join(map(digest_of, value)).encode())
     else:
-        digest.update(canonical_json(value).encode())
+        digest.update(canonical_json(value.model_dump(mode="json") if isinstance(value, Settings) else value).encode())
     return digest.hexdigest()
 
 
@@ -120,17 +123,13 @@ def _known_inputs(cache: Path) -> dict[str, Any]:
 class StageCache:
     """The results of one drive's stages, those of this run and those found."""
 
-    def __init__(self, folder: Path, watch: Watch, warnings: list[str], keep: bool = True) -> None:
-        """`watch` measures the stages; `warnings` are those of the run.
+    def __init__(self, folder: Path, drive: Path | Sequence[Path], warnings: list[str], keep: bool = True) -> None:
+        """`warnings` are those of the run.
 
-        What a stage adds to the warnings is told again when its result is found. Without `keep` nothing is found, and
+        What a stage adds to the warnings is repeated when its result is found. Without `keep` nothing is found, and
         what has to be written is gone when the block ends. Raises ResultError where the folder cannot be made.
         """
-        self.folder, self.watch, self.keep = folder, watch, keep
-        self.digests: dict[str, str] = {}
-        """What stages are made from, by name: sha256 of the results of those before, and of what else was read."""
-        self.told: dict[str, dict[str, Any]] = {}
-        """Of each stage whether its result was `computed` or `reused`."""
+        self.folder, self.keep, self.drive = folder, keep, drive
         self._warnings, self._used, self._full = warnings, set[str](), False
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -140,99 +139,49 @@ class StageCache:
             self._remove(set())
 
     def __enter__(self) -> Self:
+        """Begin to read the drive's files for their hashes, beside the stages."""
+        self.inputs = inputs_of(self.drive, self.folder)
+        self._aside = ThreadPoolExecutor(1)
+        self._hashes = self._aside.submit(self._know_inputs)
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._aside.shutdown()
         if not self.keep or not any(self.folder.glob(f"*{ENDING}")):  # nothing came of the run: no log, no odometry
             self.drop()
 
-    def saw(self, **made_from: Any) -> None:
-        """What stages are made from that no stage has made: plain values, arrays, dataclasses of them."""
-        self.digests |= {name: digest_of(value) for name, value in made_from.items()}
+    def hashes(self) -> dict[str, str]:
+        """sha256 of the files of the drive, by name."""
+        return self._hashes.result()
 
-    def stage(
-        self,
-        name: str,
-        of: Iterable[str],
-        settings: Iterable[Settings],
-        code: Iterable[str],
-        codec: Codec[T],
-        compute: Callable[[], T],
-        items: int | None = None,
-    ) -> T:
-        """`result`, measured as a stage of the run that works off so many `items`."""
-        with self.watch.stage(name, items):
-            return self.result(name, of, settings, code, codec, compute)
-
-    def result(
-        self,
-        name: str,
-        of: Iterable[str],
-        settings: Iterable[Settings],
-        code: Iterable[str],
-        codec: Codec[T],
-        compute: Callable[[], T],
-    ) -> T:
-        """What a stage comes to: found where it was computed before from the same, computed else.
-
-        `of` names the results it is made from, `settings` are those that it uses, `code` the modules that compute it.
-        """
-        made_from = {
-            "stage": name,
-            "of": {one: self.digests[one] for one in of},
-            "settings": [one.model_dump(mode="json") for one in settings],
-            **code_of("vplog.stage_codecs", *code),
-        }
-        key = key_of(made_from)
-        if self.keep:
-            try:
-                value = self._found(name, key, codec)
-                self.told[name] = {"result": "reused"}
-                return value
-            except AbsentError:
-                pass
-        said = len(self._warnings)
-        value = compute()
-        self.told[name] = {"result": "computed"}
-        if self.keep:
-            self.digests[name] = self._keep(name, key, self._warnings[said:], codec.to_bytes(value))
-        else:
-            self.digests[name] = key
-        return value
-
-    def tell(self, name: str, parts: int, reused: int) -> None:
-        """Of a stage in parts, how many of them were found."""
-        result = "computed" if not reused else "reused" if reused == parts else "partly reused"
-        self.told[name] = {"result": result, "parts": parts, "parts_reused": reused}
-
-    def _found(self, name: str, key: str, codec: Codec[T]) -> T:
+    def find(self, name: str, key: str, codec: Codec[T]) -> T:
+        """A result that an earlier run stored. Raises AbsentError where there is none that is whole."""
+        if not self.keep:
+            raise AbsentError
         path = self.folder / file_name(name, key)
         try:
-            data = path.read_bytes()
-            head, _, content = content_of(data, key).tobytes().partition(b"\n")
-            said, value = json.loads(head), codec.from_bytes(content)
-            if not isinstance(said, list):
+            head, _, content = content_of(path.read_bytes(), key).tobytes().partition(b"\n")
+            warnings, value = json.loads(head), codec.from_bytes(content)
+            if not isinstance(warnings, list):
                 raise DamagedError("it holds something else")
         except FileNotFoundError:
             raise AbsentError from None
         except Exception as error:  # whatever bytes do to a reader
             self.damaged(path, error)
             raise AbsentError from None
-        self._warnings += map(str, said)
+        self._warnings += map(str, warnings)
         self._used.add(path.name)
-        self.digests[name] = hashlib.sha256(data[CONTENT_AT:]).hexdigest()
         return value
 
-    def _keep(self, name: str, key: str, said: list[str], content: bytes) -> str:
-        """Write a result, as long as the disk takes it; its sha256."""
-        content = json.dumps(said).encode() + b"\n" + content
-        if not self._full:
-            try:
-                self.put(file_name(name, key), sealed(key, content))
-            except ResultError as error:
-                self._full = True
-                self._warnings.append(f"What the stages came to is not kept for another run. {error}")
-        return hashlib.sha256(content).hexdigest()
+    def store(self, name: str, key: str, warnings: list[str], content: bytes) -> None:
+        """Write a result with the warnings that came with it, as long as the disk takes it."""
+        if not self.keep or self._full:
+            return
+        try:
+            self.put(file_name(name, key), sealed(key, json.dumps(warnings).encode() + b"\n" + content))
+        except ResultError as error:
+            self._full = True
+            self._warnings.append(f"The results of the stages are not stored for another run. {error}")
 
     def put(self, name: str, data: bytes) -> Path:
         """Write a file as a whole. Raises ResultError."""
@@ -250,32 +199,30 @@ class StageCache:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         self._warnings.append(f"{path.name} in {self.folder} is not used, and made anew: {reason}.")
 
-    def know_inputs(self, drive: Path | Sequence[Path], inputs: Inputs) -> dict[str, str]:
+    def _know_inputs(self) -> dict[str, str]:
         """sha256 of the files of the drive, which are read unless it is known; a later run then knows it.
 
         Not if they change meanwhile: what is made from them may be of what they were before.
         """
-        hashes = hash_inputs(drive) if inputs.hashes is None else inputs.hashes
-        if self.keep and look_of(drive) == inputs.look:
+        inputs = self.inputs
+        hashes = hash_inputs(self.drive) if inputs.hashes is None else inputs.hashes
+        if self.keep and look_of(self.drive) == inputs.look:
             known = _known_inputs(self.folder)
             known = known if known.get("token") == inputs.token else {}
             self._write_inputs({**known, "look": inputs.look, "token": inputs.token, "hashes": hashes})
         return hashes
 
-    def account(self) -> dict[str, Any]:
-        """Of every stage so far what it took, and whether its result was `computed` or `reused`."""
-        return {name: {"result": "computed", **self.told.get(name, {}), **it} for name, it in self.watch.stages.items()}
-
-    def finish(self, drive: Path | Sequence[Path], inputs: Inputs, parts: Sequence[str]) -> None:
+    def finish(self, parts: Sequence[str]) -> None:
         """The run is done: remove what it did not use. `parts` are the files of its features, in order."""
-        if look_of(drive) != inputs.look:
-            self._warnings.append("The log changed while it was read, so nothing is kept for another run.")
+        self.hashes()
+        inputs, changed = self.inputs, look_of(self.drive) != self.inputs.look
+        if changed:
+            self._warnings.append("The log changed while it was read, so nothing is stored for another run.")
             self._remove(set())
-        if not self.keep or look_of(drive) != inputs.look:
-            return
-        known = {"look": inputs.look, "token": inputs.token, "hashes": inputs.hashes, **_known_inputs(self.folder)}
-        self._write_inputs({**known, "parts": list(parts)})
-        self._remove({*self._used, INPUTS})
+        if self.keep and not changed:
+            known = {"look": inputs.look, "token": inputs.token, "hashes": inputs.hashes, **_known_inputs(self.folder)}
+            self._write_inputs({**known, "parts": list(parts)})
+            self._remove({*self._used, INPUTS})
 
     def drop(self) -> None:
         """Remove all of the cache, and its folder if nothing else is in it."""

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import vplog
-from vplog import logs, record
+from vplog import logs
 from vplog.compare import check_truth, same_drive
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import TruthChoice, open_truth
+from vplog.execution_value import logged_warnings
 from vplog.inputs import hash_inputs
 from vplog.methods import read_methods
 from vplog.references import PAPER_SIZE
@@ -80,7 +81,7 @@ def study(
     warnings: list[str] = []
     with ExitStack() as stack:
         _begin(out, stack)
-        stack.enter_context(record.heard(warnings))
+        stack.enter_context(logged_warnings(warnings))
         opened = [logs.open(path, topics) for path in drives]
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=out)))
         names = short_names([log.name for log in opened])
