@@ -28,8 +28,8 @@ def check_values(*arrays: pa.Array) -> None:
 
 
 def words_by_place(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: int) -> list[slice]:
-    """The slice of all words (K,) for each list of the column. Raises LibraryError where the words of a place do not rise
-    or are beyond the `vocabulary`."""
+    """The slice of all words (K,) for each list of the column. Raises LibraryError where the words of a place do not
+    rise or are beyond the `vocabulary`."""
     if len(words) and words.max() >= vocabulary:
         raise LibraryError(
             "The descriptors name words that this library does not have; compute them again with `vplog run`."
