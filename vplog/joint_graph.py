@@ -70,7 +70,7 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor
 
 
 def pair_record(query_drive: str, match_drive: str, ledger: Closures) -> dict[str, Any]:
-    """What run.json and component.json say of a pair of drives."""
+    """A pair of drives as run.json and component.json have it."""
     kept = int(np.nansum(ledger.weight))
     return {
         "query_drive": query_drive,

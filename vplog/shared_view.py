@@ -1,4 +1,4 @@
-"""What two frames of a closure share: the matches that agree with one geometry, and boxes on the references of both."""
+"""Matches of the two frames of a closure that agree with one geometry, and boxes of both on their references."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Agreement:
     agrees: np.ndarray
     """(K,) bool."""
     model: str
-    """What they agree with; empty where no more agree with any one geometry than would by chance."""
+    """The geometry that they agree with; empty where no more agree with any than would by chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], cam
 
 
 def find_boxes(state: BoxState, query: Any, match: Any, references: list[int]) -> list[SharedBoxes]:
-    """Of the references shared, best first, those drawn: their boxes, and the windows whose boxes agree best.
+    """The shared references that are drawn, best first: their boxes, and the windows whose boxes agree best.
 
     Of windows that agree alike one is taken that no other reference has shown yet.
     """

@@ -1,4 +1,4 @@
-"""What a run shows beside its tables: the keyframes' pictures with their boxes, closures drawn, the way on earth."""
+"""Figures of a run: the keyframes' pictures with their boxes, closures drawn, the trajectory on earth."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceState
 
 _REFERENCE_MEGAPIXELS = 0.05
-"""Of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""
+"""Size of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""
 _MOST_REFERENCES = 1000
 """References whose pictures are kept: 8 MB. Libraries of a drive have some hundred."""
 _VOTED = 1
-"""Of the references that a closure shares, those drawn with voting maps: each costs a search of the library."""
+"""Shared references of a closure that are drawn with voting maps: each costs a search of the library."""
 _LEAST_FIXES = 3
 """Fixes that say where a trajectory is and how it is turned."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What was seen of a drive: all that pictures of its closures are made of."""
+    """Images, features and places of a drive, for pictures of its closures."""
 
     image: Callable[[int], Bytes]
     """A keyframe's picture (h, w) by its row."""
     features: Callable[[int], Features]
-    """Of the keyframe's whole image."""
+    """Features of a keyframe's whole image by its row."""
     camera: Camera
     state: PlaceState
     places: Sequence[Any]
@@ -85,7 +85,7 @@ def explain(state: BoxState, place: Any) -> Explained | None:
 
 
 def reference_use(state: PlaceState, places: Sequence[Any]) -> list[int] | None:
-    """How many keyframes each reference explains, or None for a recogniser without boxes."""
+    """Number of keyframes that each reference explains; None for a recogniser without boxes."""
     if not isinstance(state, BoxState):
         return None
     count = np.zeros(len(state.references), np.int64)

@@ -1,4 +1,4 @@
-"""Which drives of a map hold places like those of a new one."""
+"""Candidates for the places of new drives in the earlier drives of a map."""
 
 from __future__ import annotations
 

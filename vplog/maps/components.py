@@ -1,4 +1,4 @@
-"""The joint graph of the drives of a map that closures join, and the folder that keeps what came of it.
+"""The joint graph of the drives of a map that closures join, and the folder of its results.
 
     MAP/joint.json                                     which of the folders below count; replaced as a whole
     MAP/joint/component=KEY/component.json             drives, what holds them together, what was learned of odometry
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tie:
-    """What joins two drives."""
+    """A pair of drives with a ledger."""
 
     later: str
     earlier: str
     path: Path
     """Table of the ledger."""
     key: str
-    """Of all that the ledger depends on."""
+    """sha256 over all that the ledger depends on."""
     verified: int
 
 
@@ -100,7 +100,7 @@ def solve_group(
 ) -> dict[str, Any]:
     """Solve a group, and make a folder in `staging` for each component that comes of it.
 
-    What joint.json says of the group: its `components`, and which pairs are kept `apart`, and why. Raises GraphError
+    Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Raises GraphError
     where it cannot be solved, and ResultError where a drive's folder is damaged.
     """
     drives = []

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     Progress = Callable[[str, int, int], None]
 
 _KEEP_EVERY_S = 300.0
-"""Of a map on an object store what is verified is sent this often: each time what is there already is copied there."""
+"""Interval at which ledgers are sent to a map on an object store, each time with a copy of those there."""
 
 
 def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceState:

@@ -20,7 +20,7 @@ FORMAT = run_record.FORMAT
 
 
 def read_joint(root: Path) -> dict[str, Any]:
-    """What joins the drives of a map; empty where nothing was joined yet. Raises ResultError where it is damaged.
+    """joint.json as plain values; empty where nothing was joined yet. Raises ResultError where it is damaged.
 
     `groups` are the drives that verified closures join, each with the `components` that came of it (`folder` in
     MAP/joint, `drives`) and the pairs kept `apart`; `alone` are the drives in no component, `apart` says of some why;

@@ -1,4 +1,4 @@
-"""Drives of a map read back from disk: where all is that closures between them are checked by."""
+"""Drives of a map as on disk: paths and settings that the verification of closures between them needs."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Member:
     keyframes: Path
     """Their table."""
     cache: Path
-    """Where its features may be while it is new."""
+    """Stage cache of its run, with its features while it is new."""
     features: Path
-    """Where they may be kept for those that come later."""
+    """Stored features, for later drives."""
     log: str
     inputs: dict[str, str]
     """sha256 of the log's files, by name."""
     topics: logs.TopicChoice
     pipeline: Pipeline
-    """What it was made with."""
+    """Settings of its run."""
     key: str
     """sha256 over all that its keyframes, features and places depend on."""
 

@@ -181,7 +181,7 @@ class Joins:
     made_from: str = ""
     """sha256 over what the pairs depend on, beside the drives before it; empty as long as they are not all there."""
     pairs: tuple[dict[str, Any], ...] = ()
-    """Of each: `match`, `match_key` (the drive's), `candidates`, `verified`, and `ledger`, its key, empty where it is
+    """`match`, `match_key` (the drive's), `candidates`, `verified`, and `ledger`, its key, empty where it is
     left out; `reason` then says why."""
 
 

@@ -1,4 +1,4 @@
-"""The drives of a map in the order in which they are joined, and what is known between them."""
+"""The drives of a map in the order in which they are joined, and the pairs that have ledgers."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Drives:
 
     members: list[Member]
     joins: list[Joins]
-    """Of each, where it comes in the order, and what it was verified against."""
+    """The place of each in the order, and the drives that it was verified against."""
     keys: dict[str, str]
-    """Of drive.json, by ID."""
+    """Keys of drive.json, by ID."""
     apart: dict[str, str]
     """Why others are not joined, by ID."""
     library: str

@@ -120,7 +120,7 @@ class BobbSettings(WeighedMatchSettings):
         return state
 
     def prepare(self, references: Iterable[Reference], threads: int) -> BobbState:
-        """The same, but not indexed before it is asked to describe: places are compared without. Raises as `learn`."""
+        """`learn` without the index, which the first image to describe makes: comparing places needs none."""
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
             raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
@@ -199,7 +199,7 @@ class BobbState:
 
     @property
     def bits(self) -> int:
-        """Of the references, their weights and boxes, as stored."""
+        """Size of the references, their weights and boxes, as stored."""
         return 8 * self.settings.references * (2 + 1 + self.settings.boxes)
 
     @property

@@ -59,7 +59,7 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     aspects: tuple[PositiveFloat, ...] = Field(default=(0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0), min_length=1)
     """Width to height of the boxes tried, in units of the image's own; votes never shrink a box, so all are largest."""
     seed: int = Field(default=0, ge=0)
-    """Of the windows and the partitions."""
+    """Seed of the windows and the partitions."""
 
     @model_validator(mode="after")
     def _has_boxes(self) -> Self:

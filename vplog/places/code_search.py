@@ -161,7 +161,7 @@ def _larger_bytes(typing, a, b):
 
 @numba.njit(cache=True, nogil=True)
 def _sum_bytes(word):
-    """Of the eight bytes of a word: pairs of them in 16 bits each, then all four pairs by one product."""
+    """Sum of the eight bytes of a word: pairs of them in 16 bits each, then all four pairs by one product."""
     pairs = (word & np.uint64(0x00FF00FF00FF00FF)) + ((word >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF))
     return np.int64((pairs * np.uint64(0x0001000100010001)) >> np.uint64(48))
 

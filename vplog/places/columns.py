@@ -1,4 +1,4 @@
-"""What recognisers check alike when places come back from a table's column, which anyone may have written."""
+"""Checks of the places in a table's column, which anyone may have written."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def check_values(*arrays: pa.Array) -> None:
 
 
 def words_by_place(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: int) -> list[slice]:
-    """Which of all words (K,) each list of the column has. Raises LibraryError where a place's do not increase, or
-    are beyond the `vocabulary`."""
+    """The slice of all words (K,) for each list of the column. Raises LibraryError where the words of a place do not
+    rise or are beyond the `vocabulary`."""
     if len(words) and words.max() >= vocabulary:
         raise LibraryError(
             "The descriptors name words that this library does not have; compute them again with `vplog run`."

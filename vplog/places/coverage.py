@@ -1,4 +1,4 @@
-"""How well reference images explain a drive: to choose them by, and to say of a finished run.
+"""Coverage of a drive by reference images: to choose them by, and for the record of a run.
 
 A reference explains a frame as far as the frame's features are found on it. Which frames explain which is measured
 once, by near descriptors of few strong features; references are then chosen greedily, which for a sum like this comes
@@ -75,14 +75,14 @@ elsewhere."""
 
 @dataclass(frozen=True, eq=False)
 class Explanations:
-    """Which of C candidates explain each of F frames, and how well: a sparse (F, C) matrix by rows."""
+    """Shares of the features of F frames that each of C candidates explains: a sparse (F, C) matrix by rows."""
 
     start: Ints
     """(F + 1,)."""
     candidate: Int32s
     """Increasing within a frame; never the frame itself."""
     share: Float32s
-    """Of the frame's features that are found on the candidate, 0..1."""
+    """Share of the frame's features that are found on the candidate, 0..1."""
     candidates: int
     """C."""
 
@@ -112,7 +112,7 @@ def choose_by_coverage(
 
 
 def frames_needed(size: int | None) -> int:
-    """How many frames, evenly along the drives, a choice of `size` references looks at."""
+    """Number of frames, evenly along the drives, that a choice of `size` references compares."""
     return _FRAMES_A_CANDIDATE * _candidates(size)
 
 
@@ -121,7 +121,7 @@ def _candidates(size: int | None) -> int:
 
 
 def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -> Explanations:
-    """Which candidates, rows of `descriptors` (F of (M, 128) each), explain each of the rows."""
+    """The candidates, rows of `descriptors` (F of (M, 128) each), that explain each of the rows."""
     owners = np.repeat(np.arange(len(candidates)), [len(descriptors[row]) for row in candidates])
     pool = np.concatenate([descriptors[row] for row in candidates])
     number = np.full(len(descriptors), -1)
@@ -205,7 +205,7 @@ def _greedy(start, candidate, worth, by_start, by_frame, by_worth, size):
 
 
 def _enough(found: Explanations, chosen: Ints, least_gain: float) -> int:
-    """How many of the chosen are needed: the last of them still adds `least_gain` of what is explained."""
+    """Number of the chosen that are needed: the last of them still adds `least_gain` of what is explained."""
     turn = np.full(found.candidates, -1)
     turn[chosen] = np.arange(len(chosen))
     worth, turns = _worth(found), turn[found.candidate]
@@ -222,12 +222,12 @@ def _enough(found: Explanations, chosen: Ints, least_gain: float) -> int:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How far a library explains a drive."""
+    """The part of a drive that a library explains."""
 
     explained: float
     """Share of the frames looked at that are explained, 0..1."""
     median: float
-    """Of the frames' shares of features that their best reference explains beyond chance."""
+    """Median over the frames of the share of features that the best reference explains beyond chance."""
     frames: int
     """Frames looked at."""
 

@@ -69,7 +69,7 @@ class FabmapSettings(RelearnedSettings):
     """Weigh the evidence by what it is worth among the references themselves: words that occur together are not so
     many independent observations, so without it the posterior is far too certain."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres of k-means and the samples."""
+    """Seed of the first centres of k-means and the samples."""
 
     @model_validator(mode="after")
     def _detects(self) -> Self:
@@ -137,7 +137,7 @@ class FabmapState(ReferencesState):
         return FabmapIndex(self, descriptors)
 
     def index_of_part(self, descriptors: Sequence[Words]) -> FabmapPart:
-        """Of some places of a map: what it scores compares with what other parts do."""
+        """An index of some places of a map, whose scores compare with those of its other parts."""
         return FabmapPart(self, descriptors)
 
     def to_arrow(self, descriptors: Sequence[Words]) -> pa.Array:

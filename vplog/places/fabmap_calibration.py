@@ -1,4 +1,4 @@
-"""How much FAB-MAP's evidence is worth, from the references alone: without it the posterior is far too certain."""
+"""Calibration of FAB-MAP's posterior on the references alone: without it the posterior is far too certain."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _WEIGHTS = np.geomspace(0.01, 1.0, 201)
 def calibrate(
     references: Sequence[Reference], images: Sequence[Words], model: Model, drawn: NDArray[np.int64] | None
 ) -> tuple[float, float]:
-    """What the evidence is worth, from the references alone: its weight, and nats to add to a new place's.
+    """The weight of the evidence, and nats to add to that of a new place, from the references alone.
 
     References are queries in turn, and the others of the same drive are the places: those next to it in time show its
     place, those far from it in time do not, and no truth is needed. The weight is an exponent of the likelihood (a

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     Words = NDArray[np.uint16]
 
 _UNSEEN, _SEEN, _AVERAGE = 0, 1, 2
-"""What is known of a word at a place: its one image lacks it, has it, or there is no image."""
+"""States of a word at a place: its one image lacks it, has it, or there is no image."""
 
 
 def log_likelihood_table(tree: ChowLiuTree, seen_if_there: float, seen_if_absent: float) -> Floats:

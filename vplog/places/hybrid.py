@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from vplog.places.code_search import CodeIndex
 
 _STEPS = 4096
-"""Of 1: what is summed over features is rounded to whole ones, so sums stay below 2^53 and exact in any order, and no
-bit depends on the number of threads."""
+"""Steps of 1: values are rounded to whole ones before they are summed over features, so that sums stay below 2^53 and
+exact in any order, and no bit depends on the number of threads."""
 _DIRECTIONS = 64
 """Principal directions of descriptors that are kept, half of them: those after hold a twentieth of the variance."""
 _LEAST_VARIANCE = 1e-4
-"""Of the largest: directions with less are the noise of few features, and are not whitened further."""
+"""Share of the largest variance: directions with less are the noise of few features, and are not whitened further."""
 _ITERATIONS = 10
-"""Of k-means; with a thousand features a word its centres hardly move after."""
+"""Iterations of k-means; with a thousand features a word its centres hardly move after."""
 _MOST_FEATURES = 100_000
 """Library features that words are learned from, spread evenly: more than enough for a few hundred directions."""
 _MOST_REFERENCES = 500
@@ -74,7 +74,7 @@ class HybridSettings(RelearnedSettings):
     """How much the words count against the boxes, in standard deviations of either between the references: a half is
     as much. What the library explains badly has few boxes in common, and is then told by the words."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres, and of the directions' rotation."""
+    """Seed of the first centres and of the directions' rotation."""
 
     def learn(self, references: Iterable[Reference], threads: int) -> HybridState:
         """Index the references, learn words, and how scores vary. Raises LibraryError where there are no features."""
@@ -237,7 +237,7 @@ class HybridState(ReferencesState):
 
     @property
     def bits(self) -> int:
-        """Of the boxes and the signs, as stored."""
+        """Size of the boxes and the signs, as stored."""
         return self.bobb.bits + self.settings.words * self.settings.bits
 
     @property

@@ -62,7 +62,7 @@ class Library:
     """(F, 2) px of its reference."""
     settings: WordSettings
     words: Words
-    """Of the library's own features, where they were asked for: each has its own number at least."""
+    """Words of the library's own features, where `build_library` has `own`: each has its own number at least."""
     index: Any
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""Which library features an image's features are like, and how much each of these matches is worth.
+"""Matches of an image's features with those of a library, each with a weight.
 
 Features are of two kinds, each compared with its own: keypoints, found again where the view turns or comes nearer, and
 patches at even steps, found again in other light.
@@ -82,7 +82,7 @@ class Indexed:
     """(F, 2) as shares of the reference's sides."""
     graph: Any
     weight: float
-    """Of a match."""
+    """Weight of a match."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +101,12 @@ class Matcher:
 
     @property
     def keypoints(self) -> Indexed | None:
-        """None where they are not used, or the references have none."""
+        """The keypoints; None where they are not used, or the references have none."""
         return self._indexed()[0]
 
     @property
     def patches(self) -> Indexed | None:
-        """The same of patches."""
+        """The patches; None where they are not used, or the references have none."""
         return self._indexed()[1]
 
     def match(self, features: Features) -> Matches:
@@ -154,7 +154,7 @@ def keypoints_of(features: Features, settings: WeighedMatchSettings) -> tuple[Fl
 
 
 def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
-    """The same of patches; none where the features have no thumbnail."""
+    """`keypoints_of` of patches; none where the features have no thumbnail."""
     if settings.patch_weight == 0 or features.thumbnail is None:
         return np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32)
     return describe_patches(features.thumbnail)

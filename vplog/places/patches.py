@@ -23,7 +23,7 @@ CELL = 8
 CELLS = 4
 """Along a patch; it moves by one cell, so patches overlap by three quarters."""
 DIRECTIONS = 8
-"""Of edges, over half a turn: 4 x 4 x 8 = 128 values, as SIFT."""
+"""Directions of edges, over half a turn: 4 x 4 x 8 = 128 values, as SIFT."""
 _MOST = 0.2
 """Values of unit length are cut here, Lowe's way to keep a single strong edge from ruling."""
 

@@ -1,4 +1,4 @@
-"""What comparators share between `learn`, `save` and `load`: a saved library is its references, learned again."""
+"""Saving and loading of recognisers whose library is its references, learned again when loaded."""
 
 from __future__ import annotations
 

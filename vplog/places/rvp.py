@@ -202,7 +202,7 @@ def dominant_box(V, shapes):
 
 
 def count_boxes(grid: int, shapes: Int32s) -> int:
-    """How many different boxes there are to choose from, the empty one too: what a box's bits have to tell apart."""
+    """Number of different boxes, the empty one too: the values of a box's bits."""
     return 1 + int(sum((grid - w + 1) * (grid - h + 1) for w, h in shapes))
 
 

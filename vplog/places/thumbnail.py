@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _WIDTH, _HEIGHT, _PATCH = 64, 32, 8
 """px, the paper's table I."""
 _STEPS = 32
-"""Of a byte per standard deviation, so that it holds four to either side."""
+"""Steps of a byte per standard deviation, so that it holds four to either side."""
 _LEAST_DEVIATION = 1.0
 """Grey levels; a patch that varies less is the camera's noise, which must not be blown up to the size of a texture."""
 

@@ -46,7 +46,7 @@ class VladSettings(RelearnedSettings):
     shrinkage: float = Field(default=1.0, ge=0)
     """Multiple of the mean variance added to each direction's before whitening: few references tell it badly."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres of k-means."""
+    """Seed of the first centres of k-means."""
 
     def learn(self, references: Iterable[Reference], threads: int) -> VladState:
         """Centres and PCA from the references. Raises LibraryError where they are fewer than two or featureless."""
@@ -71,7 +71,7 @@ class VladState(VectorState):
     references: list[Reference]
     vocabulary: Vocabulary
     whitening: Whitening | None
-    """None keeps vectors as they are."""
+    """None for vectors without PCA."""
 
     @property
     def _length(self) -> int:

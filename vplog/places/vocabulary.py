@@ -25,7 +25,7 @@ keeps values below that."""
 _FEATURES_PER_WORD = 4
 """A centre that is the mean of fewer features is one image's noise, and its word would never be seen again."""
 _ITERATIONS = 6
-"""Of k-means; with some five features a word the mean distance to the centre stops falling after the fifth."""
+"""Iterations of k-means; with five features a word the mean distance to the centre stops falling after the fifth."""
 _MOST_FEATURES_PER_WORD = 256
 """More do not move a centre noticeably: a random choice of so many is learned from, as faiss' own k-means does."""
 _EXACT_WORDS = 1024
