@@ -43,7 +43,7 @@ from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run_folder import begun
 from vplog.settings import Settings, load_yaml, override
-from vplog.show import Seen, earth_of, finished_picture, reference_use
+from vplog.show import ClosureInputs, earth_of, finished_picture, reference_use
 from vplog.stage_cache import StageCache, inputs_of
 from vplog.stage_codecs import arrays_codec, descriptors_codec, images_codec
 from vplog.timing import Watch
@@ -238,7 +238,7 @@ def run(
             previews = seen.pictures
             head, on_earth = record.head(pipeline, path, threads), about_gps(solved.fixes, solved.refined)
             shown = finished_picture(
-                Seen(previews.image, seen.__getitem__, camera, state, descriptors), previews, closures, known,
+                ClosureInputs(previews.image, seen.__getitem__, camera, state, descriptors), previews, closures, known,
                 pipeline.verify, pipeline.pictures, threads,
                 gps=log.gps(), earth=earth_of(solved.trajectory, log.gps(), on_earth),
                 about={"versions": head["versions"], "inputs": hashes.result()},

@@ -1,4 +1,4 @@
-"""What a run shows beside its tables: the keyframes' pictures with their boxes, closures drawn, the way on earth."""
+"""Pictures of a run for result.mcap and the report: keyframes with boxes, closures, and the pose on earth."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceState
 
 _REFERENCE_MEGAPIXELS = 0.05
-"""Of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""
+"""Size of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""
 _MOST_REFERENCES = 1000
-"""References whose pictures are kept: 8 MB. Libraries of a drive have some hundred."""
+"""References whose pictures are written: 8 MB. Libraries of a drive have some hundred."""
 _VOTED = 1
-"""Of the references that a closure shares, those drawn with voting maps: each costs a search of the library."""
+"""Shared references of a closure drawn with voting maps: each costs a search of the library."""
 _LEAST_FIXES = 3
-"""Fixes that say where a trajectory is and how it is turned."""
+"""Fixes that determine position and heading of a trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What was seen of a drive: all that pictures of its closures are made of."""
+class ClosureInputs:
+    """What pictures of the closures of a drive are made of."""
 
     image: Callable[[int], Bytes]
     """A keyframe's picture (h, w) by its row."""
     features: Callable[[int], Features]
-    """Of the keyframe's whole image."""
+    """Features of the keyframe's whole image, by its row."""
     camera: Camera
     state: PlaceState
     places: Sequence[Any]
@@ -55,12 +55,12 @@ class Seen:
 
 
 def finished_picture(
-    seen: Seen, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
+    inputs: ClosureInputs, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
     pictures: PictureSettings, threads: int, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
 ) -> Shown:  # fmt: skip
-    """All that result.mcap shows of a run, made while its features are at hand."""
-    boxed = box_state(seen.state)
-    camera = seen.camera
+    """All that result.mcap shows of a run."""
+    boxed = box_state(inputs.state)
+    camera = inputs.camera
     small = {
         number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
         for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
@@ -68,11 +68,11 @@ def finished_picture(
     drawn = {}
     if len(previews):
         rows = choose_examples(closures, pictures.closures)
-        drawn = draw_closures(rows, seen, closures, verify, pictures.quality, threads)
+        drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, threads)
     return Shown(
         image=previews.__getitem__ if len(previews) else None,
         image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
-        explained=None if boxed is None else lambda row: explain(boxed, _boxes(seen.state, seen.places[row])),
+        explained=None if boxed is None else lambda row: explain(boxed, _boxes(inputs.state, inputs.places[row])),
         references=small,
         pictures=drawn,
         gps=gps,
@@ -108,7 +108,7 @@ def reference_use(state: Any, places: Sequence[Any]) -> list[int] | None:
 
 
 def _boxes(state: Any, place: Any) -> Any:
-    """The part of a place that is boxes."""
+    """The boxes of a place descriptor."""
     return place.boxes if isinstance(state, HybridState) else place
 
 
@@ -132,19 +132,21 @@ def choose_examples(closures: Closures, count: int) -> list[int]:
 
 
 def draw_closures(
-    rows: Sequence[int], seen: Seen, closures: Closures, verify: VerifySettings, quality: int, threads: int
+    rows: Sequence[int], inputs: ClosureInputs, closures: Closures, verify: VerifySettings, quality: int, threads: int
 ) -> dict[int, bytes]:
     """JPEGs of ledger rows."""
-    images = {node: seen.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
+    images = {node: inputs.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
     with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        drawn = pool.map(lambda row: jpeg(_draw(row, seen, images, closures, verify), quality), rows)
+        drawn = pool.map(lambda row: jpeg(_draw(row, inputs, images, closures, verify), quality), rows)
         return dict(zip(rows, drawn, strict=True))
 
 
-def _draw(row: int, seen: Seen, images: dict[int, Bytes], closures: Closures, verify: VerifySettings) -> Bytes:
+def _draw(
+    row: int, inputs: ClosureInputs, images: dict[int, Bytes], closures: Closures, verify: VerifySettings
+) -> Bytes:
     nodes = int(closures.query[row]), int(closures.match[row])
-    features = seen.features(nodes[0]), seen.features(nodes[1])
-    agreement = find_agreement(*features, _pose_columns(closures, row), seen.camera, verify)
+    features = inputs.features(nodes[0]), inputs.features(nodes[1])
+    agreement = find_agreement(*features, _pose_columns(closures, row), inputs.camera, verify)
     sides = [np.array([one.width, one.height]) for one in features]
     halves = [
         Half(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
@@ -152,18 +154,18 @@ def _draw(row: int, seen: Seen, images: dict[int, Bytes], closures: Closures, ve
             ("query", "match"), nodes, (agreement.query, agreement.match), sides, strict=True
         )
     ]
-    return collage(halves[0], halves[1], agreement.agrees, _panels(row, nodes, features, seen, closures))
+    return collage(halves[0], halves[1], agreement.agrees, _panels(row, nodes, features, inputs, closures))
 
 
 def _panels(
-    row: int, nodes: Sequence[int], features: Sequence[Features], seen: Seen, closures: Closures
+    row: int, nodes: Sequence[int], features: Sequence[Features], inputs: ClosureInputs, closures: Closures
 ) -> list[Panel]:
-    """Boxes of both on the references they share most on, and how both vote on the first of these."""
-    shared, boxed = closures.shared_references[row].tolist(), box_state(seen.state)
+    """Boxes of both frames on the references they share most, and the votes of both on the first of these."""
+    shared, boxed = closures.shared_references[row].tolist(), box_state(inputs.state)
     if boxed is None or not shared:
         return []
     panels, none = [], np.zeros((0, 4))
-    for found in find_boxes(seen.state, seen.places[nodes[0]], seen.places[nodes[1]], shared)[:2]:
+    for found in find_boxes(inputs.state, inputs.places[nodes[0]], inputs.places[nodes[1]], shared)[:2]:
         name = f"reference {found.reference}"
         panels.append(Panel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
         if len(panels) <= _VOTED:
@@ -183,8 +185,8 @@ def _pose_columns(closures: Closures, row: int) -> dict[str, Any]:
 
 
 def earth_of(trajectory: Trajectory, gps: Gps | None, known: dict[str, Any] | None) -> Earth | None:
-    """Where on earth a trajectory is: as the solve found it (`known`, the `gps` of run.json), else by laying it on
-    the fixes as a whole (Umeyama 1991). None without at least three fixes within the drive."""
+    """The pose of a trajectory on earth: that of the solve (`known`, the `gps` of run.json), else by alignment to the
+    fixes (Umeyama 1991). None without at least three fixes within the drive."""
     if known is not None:
         try:
             origin = [float(known["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]

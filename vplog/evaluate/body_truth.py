@@ -16,11 +16,7 @@ from vplog.data import Trajectory
 from vplog.evaluate.pairs import around, poses_at
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Ints
 
 _BETTER = 0.5
 """Another frame must halve the disagreement with the odometry to be taken: chance does not."""

@@ -31,12 +31,8 @@ import numpy as np
 from vplog import geometry
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats
+    from vplog.data import Bools, Closures, Floats
     from vplog.evaluate.body_truth import TruthAt
-
-    Bools = NDArray[np.bool_]
 
 _WALK_M = 0.04
 """m after 1 m: see above."""

@@ -20,13 +20,9 @@ from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes
+    from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes
     from vplog.evaluate.body_truth import BodyTruth, TruthAt
     from vplog.evaluate.closure_pose import PoseBounds
-
-    Bools = NDArray[np.bool_]
 
 _OPPOSITE_DEG = 90.0
 """Degrees; beyond it a forward camera looks the other way."""

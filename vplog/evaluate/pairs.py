@@ -14,11 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Int32s, Ints, Trajectory
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 
 _MAX_GAP_S = 2.0
 """s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.results.evenly import evenly
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -61,9 +63,9 @@ def trajectory_map(
         moved = (points @ view.T - low) * scale
         return np.stack([margin + moved[..., 0], height - 50.0 - moved[..., 1]], axis=-1)
 
-    drawn = [(f"dot {kind}", _dots(place(_thinned(points, _MOST_POINTS)))) for kind, points in dots]
-    drawn += [(f"edge {kind}", _segments(place(_thinned(ends, _MOST_SEGMENTS)))) for kind, ends in segments]
-    drawn += [(f"track {kind}", _line(place(_thinned(points, _MOST_POINTS)))) for kind, points in paths]
+    drawn = [(f"dot {kind}", _dots(place(evenly(points, _MOST_POINTS)))) for kind, points in dots]
+    drawn += [(f"edge {kind}", _segments(place(evenly(ends, _MOST_SEGMENTS)))) for kind, ends in segments]
+    drawn += [(f"track {kind}", _line(place(evenly(points, _MOST_POINTS)))) for kind, points in paths]
     bar_m = _round_length(float(extent.max()) / 4.0)
     bar = f"M20 {height - 22:.1f}h{bar_m * scale:.1f}m0 -4v8M20 {height - 26:.1f}v8"
     label = (f"{28 + bar_m * scale:.1f}", f"{height - 18:.1f}", "start", f"{bar_m:g} m ({axes})")
@@ -121,7 +123,7 @@ def curves(named: Sequence[tuple[str, Floats]]) -> Chart:
     paths = []
     for kind, points in named:
         x, y = _LEFT + points[:, 0] * _ACROSS, _TOP + (1.0 - points[:, 1]) * _DOWN
-        paths.append((f"track {kind}", _line(_thinned(np.stack([x, y], 1), _MOST_POINTS))))
+        paths.append((f"track {kind}", _line(evenly(np.stack([x, y], 1), _MOST_POINTS))))
     return _with_axes("precision over recall", paths, [], (0.0, 1.0), "recall", (0.0, 1.0), "precision")
 
 
@@ -184,11 +186,6 @@ def _segments(ends: Floats) -> str:
 def _line(points: Floats) -> str:
     """A path through points (T, 2); one point alone is a dot."""
     return _dots(points) if len(points) < 2 else "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points.tolist())
-
-
-def _thinned(points: Floats, most: int) -> Floats:
-    """At most so many, evenly, the first and the last among them."""
-    return points if len(points) <= most else points[np.linspace(0, len(points) - 1, most).astype(np.int64)]
 
 
 def _round_length(most: float) -> float:
