@@ -98,7 +98,7 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], cam
 
 
 def find_boxes(state: Any, query: Any, match: Any, references: list[int]) -> list[SharedBoxes]:
-    """Of the references shared, best first, those drawn: their boxes, and the windows whose boxes agree best.
+    """The shared references to draw, best first: their boxes, and the windows whose boxes agree best.
 
     Of windows that agree alike one is taken that no other reference has shown yet.
     """

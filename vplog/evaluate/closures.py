@@ -74,7 +74,7 @@ class ClosureScore:
     accepted: int
     """Accepted closures with a truth at both ends."""
     accepted_true: int
-    """Of these the ones whose pose is right."""
+    """Accepted closures whose pose is right."""
     accepted_false: int
     not_judged: int
     """Accepted closures that the truth does not cover, or too coarsely to tell."""

@@ -63,9 +63,9 @@ class Pairs:
         """The pairs whose row is below the query's stop, (Q,): those that are candidates at all."""
         owner = np.repeat(np.arange(len(self)), np.diff(self.start))
         stop = np.minimum(self.stop, stops[owner]).astype(np.int32)
-        kept = self.first < stop
-        counts = np.bincount(owner[kept], minlength=len(self))
-        return Pairs(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), self.first[kept], stop[kept])
+        some = self.first < stop
+        counts = np.bincount(owner[some], minlength=len(self))
+        return Pairs(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), self.first[some], stop[some])
 
 
 def index_pairs(query: Ints, match: Ints, tolerance: int) -> Pairs:
