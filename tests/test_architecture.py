@@ -65,7 +65,9 @@ LAYERS = (
 """From what depends on nothing to what depends on all. A part sees the layers above its own line, and itself."""
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
-HEAVY = ("cv2", "faiss", "gtsam", "numba", "numpy", "pyarrow", "mcap", "rosbags", "pydantic", "rich", "matplotlib")
+HEAVY = (
+    "cv2", "faiss", "gtsam", "jinja2", "matplotlib", "mcap", "numba", "numpy", "pyarrow", "pydantic", "rich", "rosbags",
+)  # fmt: skip
 
 
 def name_of(file: Path) -> str:

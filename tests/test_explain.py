@@ -15,7 +15,7 @@ import pytest
 from vplog import geometry
 from vplog.data import Camera, Features, Keyframes, Verdict
 from vplog.execution_value import Execution
-from vplog.explain_words import tell
+from vplog.explain_words import describe
 from vplog.loops import undistort
 from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results import tables
@@ -73,7 +73,7 @@ def told(row: dict[str, Any]) -> Any:
     poses = geometry.pose(np.eye(3), np.arange(50.0)[:, None] * [1.0, 0.0, 0.0])
     keyframes = Keyframes("d", np.arange(50) * 1_000_000_000, poses)
     solved = poses * [[1.0, 1.0, 1.0, 0.5]]
-    return tell(row, keyframes, solved, ["accepted", "too_far", "accepted"], Pipeline(), "Good.")
+    return describe(row, keyframes, solved, ["accepted", "too_far", "accepted"], Pipeline(), "Good.")
 
 
 @pytest.mark.parametrize("verdict", Verdict)

@@ -19,7 +19,10 @@ from vplog.evaluate.body_truth import BodyTruth
 from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.report import gather
 from vplog.results import mcap_read, tables
+from vplog.results.report.content import Judged
+from vplog.results.report.page import page as write_page
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -142,6 +145,23 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     gps = verb("report", finished, "--truth", "gps", "-o", tmp_path / "g.html")
     assert gps.code == 0
     assert "ATE rmse" in (tmp_path / "g.html").read_text()
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 3])
+def test_accepted_closures_that_are_false_stand_out(finished: Path, wrong: int) -> None:
+    """The map draws them apart, and the ledger has their truth beside the verdict."""
+    verdicts = tables.read_closures(finished / "closures.parquet").verdict
+    accepted = [row for row, verdict in enumerate(verdicts) if verdict is Verdict.ACCEPTED]
+    true, known = np.ones(len(verdicts), bool), np.ones(len(verdicts), bool)
+    true[accepted[:wrong]] = False
+    known[accepted[-1]] = False
+    text = write_page(gather(finished, {}, Judged("truth.tum", {}, true=true, known=known)))
+    assert ("accepted closures that are false" in text) == bool(wrong)
+    [edges] = re.findall(r'<path class="edge false" d="(.*?)"/>', text)
+    assert edges.count("M") == wrong
+    told = ledger(text)
+    assert told["columns"][1:3] == ["verdict", "true"]
+    assert [told["rows"][row][2] for row in accepted] == ["no"] * wrong + ["yes"] * (len(accepted) - 1 - wrong) + [None]
 
 
 def test_the_curves_enclose_the_average_precision(finished: Path, drive: Drive) -> None:

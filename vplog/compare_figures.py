@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from vplog.evaluate.retrieval import Ranks
 
 _DEEPEST_RANK = 25
-"""Of the curves: the usual axis of recall@N in place recognition, e.g. Arandjelovic et al., NetVLAD, CVPR 2016."""
+"""Last rank of the curves, as usual for recall@N in place recognition (Arandjelovic et al., NetVLAD, CVPR 2016)."""
 _LINES = ("-", "--", "-.", ":")
 """One kind each time the ten colours have gone round, so that forty methods are told apart."""
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 150
-"""Of the PNG: 10 x 4.5 inches then fill three quarters of a full HD screen."""
+"""Dots per inch of the PNG: 10 x 4.5 inches then fill three quarters of a full HD screen."""
 
 
 @contextmanager

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TruthOptions:
-    """How a run is held against the truth."""
+    """How a run is compared with the truth."""
 
     distance_m: float = DISTANCE_M
     """m between frames of one place."""
     heading_deg: float = HEADING_DEG
     """Degrees between their optical axes."""
     align: str = "se3"
-    """Of the ATE: a name of `trajectory.ALIGNMENTS`."""
+    """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`."""
     truth_offset_s: float = 0.0
     """s added to the stamps of the truth, as evo's --t_offset."""
 

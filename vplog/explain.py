@@ -1,4 +1,4 @@
-"""One closure of a finished run, told in words and shown in a picture."""
+"""One closure of a finished run in words and in a picture."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import explain_words, logs
-from vplog.errors import LibraryError, LogError, ResultError, SettingsError
+from vplog.errors import LibraryError, LogError, ResultError
 from vplog.explain_picture import Side, View, draw
 from vplog.extract import extract_frames
-from vplog.pipeline import Pipeline
-from vplog.record import library_at, reopened
-from vplog.remote import original
+from vplog.record import reopened
 from vplog.results import run_record, tables
+from vplog.retell import recorded_pipeline, recorded_places
+from vplog.stages import BoxState
 from vplog.shared_view import find_agreement, find_boxes
 
 if TYPE_CHECKING:
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Closures, Keyframes
-    from vplog.shared_view import SharedBoxes
+    from vplog.pipeline import Pipeline
+    from vplog.stages import BoxState
+from vplog.shared_view import SharedBoxes
 
     Choose = Callable[[Closures, Keyframes], int]
 
@@ -42,10 +44,8 @@ def explain(
     record = run_record.read_single_run(folder)
     if picture is not None and picture.suffix not in (".png", ".svg"):
         raise ResultError(f"A picture is a .png or .svg, and {picture} is neither.")
-    try:
-        pipeline = Pipeline.read(_part(record, folder, "settings"), f"{folder}/run.json")
-    except SettingsError as error:
-        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None
+    _part(record, folder, "settings")
+    pipeline = recorded_pipeline(folder, record)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     path = folder / "closures.parquet"
     closures = tables.read_closures(path)
@@ -53,7 +53,7 @@ def explain(
     row = tables.read_closure(path, number)
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
     reason = str(_part(record, folder, "solution").get("reason", ""))
-    words = explain_words.tell(row, keyframes, world_from_body, siblings, pipeline, reason)
+    words = explain_words.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
@@ -135,12 +135,8 @@ def _boxes(
     if not row["shared_references"]:
         return [], f"{pipeline.places.kind} names no reference that both views share"
     try:
-        with library_at(folder, record) as library:
-            state = pipeline.places.load(library, 1)
-            column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
-            if made_by != state.hash:
-                raise LibraryError(f"{original(library)} is not the library of this run")
+        state, column = recorded_places(folder, record, pipeline, 1)
         query, match = state.from_arrow(column.take([row["query"], row["match"]]))
     except (LibraryError, LogError) as error:
         return [], str(error).rstrip(".")
-    return find_boxes(state, query, match, row["shared_references"]), ""
+    return (find_boxes(state, query, match, row["shared_references"]) if isinstance(state, BoxState) else []), ""

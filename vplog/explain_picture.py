@@ -10,13 +10,14 @@ import numpy as np
 
 from vplog.data import Verdict
 from vplog.drawing import as_text, drawn
+from vplog.results.evenly import evenly
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.axes import Axes
 
-    from vplog.data import Bytes, Features, Floats, Ints
+    from vplog.data import Bytes, Features, Floats
     from vplog.explain_words import Words
     from vplog.shared_view import Agreement, SharedBoxes
 
@@ -27,7 +28,7 @@ _MOST_LINES = 150
 """Lines of either kind that are drawn, evenly chosen: more hide the picture."""
 _WIDTH_IN = 12.0
 _CHARACTERS = 195
-"""Of the caption, at 8 points, along that width."""
+"""Characters of a caption line, at 8 points, along that width."""
 _WIDE = 2.0
 """Images wider than this, against their height, are drawn one above the other."""
 _GAP = 0.02
@@ -77,14 +78,14 @@ def draw(path: Path, view: View) -> None:
 
 def _title(view: View) -> str:
     row = view.row
-    said = "accepted" if row["verdict"] == Verdict.ACCEPTED else f"rejected: {row['verdict'].replace('_', ' ')}"
-    return f"Closure {view.number}: keyframe {row['query']} as a return to keyframe {row['match']}, {said}"
+    outcome = "accepted" if row["verdict"] == Verdict.ACCEPTED else f"rejected: {row['verdict'].replace('_', ' ')}"
+    return f"Closure {view.number}: keyframe {row['query']} as a return to keyframe {row['match']}, {outcome}"
 
 
 def _caption(view: View) -> str:
     a = view.agreement
     count = int(a.agrees.sum())
-    said = [
+    sentences = [
         f"{view.words.verdict}",
         f"{len(a.agrees)} feature matches; "
         + (
@@ -94,15 +95,15 @@ def _caption(view: View) -> str:
         ),
     ]
     if max(count, len(a.agrees) - count) > _MOST_LINES:
-        said.append(f"Of either, {_MOST_LINES} lines at most are drawn.")
+        sentences.append(f"Of either, {_MOST_LINES} lines at most are drawn.")
     if view.boxes:
-        said.append(
+        sentences.append(
             "Coloured: parts of the two views found in one spot of a reference image below. There, whole lines are "
             "all boxes of the query, dashed ones those of the match, thick the pair shown above."
         )
     else:
-        said.append(f"No boxes: {view.missing or 'those on the references shared have nothing in common'}.")
-    return " ".join(said)
+        sentences.append(f"No boxes: {view.missing or 'those on the references shared have nothing in common'}.")
+    return " ".join(sentences)
 
 
 def _frames(axes: Axes, view: View, stacked: bool) -> None:
@@ -137,15 +138,11 @@ def _lines(axes: Axes, agreement: Agreement, offset: Floats) -> None:
     from matplotlib.collections import LineCollection
 
     for wanted, colour, width, alpha in ((False, _OTHER, 0.4, 0.6), (True, _AGREES, 0.5, 0.8)):
-        rows = _evenly(np.flatnonzero(agreement.agrees == wanted), _MOST_LINES)
+        rows = evenly(np.flatnonzero(agreement.agrees == wanted), _MOST_LINES)
         ends = np.stack([agreement.query[rows] + 0.5, agreement.match[rows] + offset], axis=1)
         axes.add_collection(LineCollection(list(ends), colors=colour, linewidths=width, alpha=alpha), autolim=False)
         points = ends.reshape(-1, 2)
         axes.scatter(points[:, 0], points[:, 1], 3.0, colour, linewidths=0, alpha=0.9)
-
-
-def _evenly(rows: Ints, count: int) -> Ints:
-    return rows if len(rows) <= count else rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
 
 
 def _rectangle(

@@ -1,4 +1,4 @@
-"""A row of the ledger in plain sentences: what was proposed and why, what geometry and the solver said, what would
+"""A row of the ledger in plain sentences: what was proposed and why, the results of geometry and solver, what would
 change the verdict."""
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _DIRECTION = "--set verify.direction.keep=true keeps the turn and the direction,
 
 @dataclass(frozen=True)
 class Words:
-    """What is said of one closure, each a paragraph of one to four sentences."""
+    """Paragraphs on one closure, each of one to four sentences."""
 
     verdict: str
     proposed: str
@@ -43,11 +43,14 @@ class Words:
     change: str
 
 
-def tell(
+def describe(
     row: Row, keyframes: Keyframes, world_from_body: Floats, siblings: list[str], pipeline: Pipeline, reason: str
 ) -> Words:
-    """Of one ledger row by column, with the solved poses (N, 4, 4), the verdicts of all candidates of its query, the
-    run's settings, and what the solver said of the whole run."""
+    """Describe one ledger row, by column.
+
+    `world_from_body` (N, 4, 4) are the solved poses, `siblings` the verdicts of all candidates of its query, `reason`
+    the solver's sentence on the whole run.
+    """
     verdict = Verdict(row["verdict"])
     became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, f"Rejected, {verdict.value}")
     return Words(
@@ -64,7 +67,7 @@ def _proposed(row: Row, keyframes: Keyframes, siblings: list[str]) -> str:
     at_s = [(row[f"{role}_stamp_ns"] - int(start)) / 1e9 for role in ("query", "match")]
     path = keyframes.odom_from_body[match : query + 1, :3, 3]
     between_m = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    said = [
+    sentences = [
         f"Keyframe {query} ({at_s[0]:.1f} s into the drive) was proposed as a return to keyframe {match} "
         f"({at_s[1]:.1f} s), {between_m:.1f} m of path earlier.",
         f"It is no. {row['rank'] + 1} of this keyframe's {len(siblings)} candidates, "
@@ -77,34 +80,36 @@ def _proposed(row: Row, keyframes: Keyframes, siblings: list[str]) -> str:
     if shared:
         named = ", ".join(f"no. {number} ({100 * share:.0f} %)" for number, share in shared[:_NAMED])
         more = f" and {len(shared) - _NAMED} more" if len(shared) > _NAMED else ""
-        said.append(
+        sentences.append(
             f"{_count(len(shared), 'reference image')} of the library {'explain' if len(shared) > 1 else 'explains'} "
             f"both views: {named}{more}; in brackets, how much of a box the two have in common there."
         )
-    return " ".join(said)
+    return " ".join(sentences)
 
 
 def _geometry(row: Row) -> str:
-    said = [f"The two images have {_count(row['matches'], 'feature match', 'es')}"]
+    sentences = [f"The two images have {_count(row['matches'], 'feature match', 'es')}"]
     if row["landmarks"]:
-        said[0] += f", {row['landmarks']} of them with a known position in the map"
-    said[0] += f"; {row['inliers']} agree with one geometry" if row["inliers"] else "; none agree with one geometry"
-    said[0] += f" and cover {100 * row['spread']:.0f} % of the image." if row["spread"] else "."
+        sentences[0] += f", {row['landmarks']} of them with a known position in the map"
+    sentences[0] += (
+        f"; {row['inliers']} agree with one geometry" if row["inliers"] else "; none agree with one geometry"
+    )
+    sentences[0] += f" and cover {100 * row['spread']:.0f} % of the image." if row["spread"] else "."
     if row["reverse_inliers"] >= 0:
-        said.append(f"Checked in reverse, {row['reverse_inliers']} agree.")
+        sentences.append(f"Checked in reverse, {row['reverse_inliers']} agree.")
     if row["tx"] is not None:
         moved = np.array([row["tx"], row["ty"], row["tz"]])
         turn = geometry.rotation(np.array([row["qx"], row["qy"], row["qz"], row["qw"]]))
         turned = f"is turned by {np.degrees(geometry.angle(turn)):.1f} degrees"
         if row["scale"] == "none":
-            said.append(f"By it keyframe {row['query']} {turned}; which way it lies is known, how far is not.")
+            sentences.append(f"By it keyframe {row['query']} {turned}; which way it lies is known, how far is not.")
         else:
-            said.append(
+            sentences.append(
                 f"By it keyframe {row['query']} lies {np.linalg.norm(moved):.2f} m from keyframe {row['match']} "
                 f"(x {moved[0]:+.2f}, y {moved[1]:+.2f}, z {moved[2]:+.2f} in its body frame) and {turned}."
             )
-            said += [_certainty(row["covariance"]), _SCALE[row["scale"]]]
-    return " ".join(said)
+            sentences += [_certainty(row["covariance"]), _SCALE[row["scale"]]]
+    return " ".join(sentences)
 
 
 def _certainty(covariance: list[float] | None) -> str:

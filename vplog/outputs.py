@@ -13,7 +13,7 @@ from vplog.data import EdgeKind, Verdict
 from vplog.graph import consistency
 from vplog.report import write_report
 from vplog.results import g2o, mcap, run_record, tables
-from vplog.show import Seen, earth_of, finished_picture, reference_use
+from vplog.show import ClosureInputs, earth_of, finished_picture, reference_use
 from vplog.steps import step
 
 if TYPE_CHECKING:
@@ -87,9 +87,9 @@ def write(
     """Write the tables, the trajectory, the graph and result.mcap of a run into its folder."""
     log, keyframes, trajectory, poses = run.log, run.keyframes, run.solved.trajectory, run.solution.world_from_body
     previews, gps = run.features.pictures, log.gps()
+    inputs = ClosureInputs(previews.image, run.features.__getitem__, run.camera, run.state, run.places)
     shown = finished_picture(
-        Seen(previews.image, run.features.__getitem__, run.camera, run.state, run.places), previews, run.closures,
-        run.references, pipeline.verify, pipeline.pictures, execution.threads, gps=gps,
+        inputs, previews, run.closures, run.references, pipeline.verify, pipeline.pictures, execution.threads, gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": record.versions(), "inputs": steps.cache.hashes()},
     )  # fmt: skip

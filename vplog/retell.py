@@ -1,4 +1,4 @@
-"""The report of a finished run, made anew: against a truth, or with pictures from the log."""
+"""The report of a finished run written again: against a truth, or with pictures from the log."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from vplog.report import write_report
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
 from vplog.results.report.content import Judged
-from vplog.show import Seen, choose_examples, draw_closures
+from vplog.show import ClosureInputs, choose_examples, draw_closures
 from vplog.urls import shown
 
 if TYPE_CHECKING:
+    from pyarrow import Array
+
     from vplog.data import Bytes, Features
+    from vplog.stages import PlaceState
 
 
 def report(
@@ -83,15 +86,10 @@ def judge(
 
 def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int) -> dict[int, bytes]:
     """Pictures of closures drawn from the log itself. Raises LogError or ResultError."""
-    pipeline = _pipeline(folder, record)
+    pipeline = recorded_pipeline(folder, record)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
-    with library_at(folder, record) as library:
-        state = pipeline.places.load(library, threads)
-        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
-        if made_by != state.hash:
-            whose = f"{original(library)} is not the library of the run in {folder}"
-            raise LibraryError(f"{whose}; its report stays without pictures.")
+    state, column = recorded_places(folder, record, pipeline, threads)
     opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
     settings = pipeline.pictures.model_copy(update={"megapixels": pipeline.pictures.megapixels or 0.15})
     rows = choose_examples(closures, settings.closures)
@@ -107,11 +105,24 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int)
             raise ResultError(why)
         images[node], features[node] = shrink(frame.image, settings.megapixels), found
     places = state.from_arrow(column)
-    seen = Seen(images.__getitem__, features.__getitem__, opened.camera(), state, places)
-    return draw_closures(rows, seen, closures, pipeline.verify, settings.quality, threads)
+    inputs = ClosureInputs(images.__getitem__, features.__getitem__, opened.camera(), state, places)
+    return draw_closures(rows, inputs, closures, pipeline.verify, settings.quality, threads)
 
 
-def _pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
+def recorded_places(folder: Path, record: dict[str, Any], pipeline: Pipeline, threads: int) -> tuple[PlaceState, Array]:
+    """The recogniser of a run and its descriptors. Raises LibraryError where its library is not there."""
+    with library_at(folder, record) as library:
+        state = pipeline.places.load(library, threads)
+        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+        if made_by != state.hash:
+            raise LibraryError(
+                f"{original(library)} is not the library of the run in {folder}, so its boxes cannot be drawn."
+            )
+    return state, column
+
+
+def recorded_pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
+    """The settings of a run. Raises ResultError."""
     try:
         return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
     except SettingsError as error:

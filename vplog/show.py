@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 _REFERENCE_MEGAPIXELS = 0.05
 """Size of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""
 _MOST_REFERENCES = 1000
-"""References whose pictures are kept: 8 MB. Libraries of a drive have some hundred."""
+"""References whose pictures are written: 8 MB. Libraries of a drive have some hundred."""
 _VOTED = 1
 """Shared references of a closure that are drawn with voting maps: each costs a search of the library."""
 _LEAST_FIXES = 3
-"""Fixes that say where a trajectory is and how it is turned."""
+"""Fixes that determine position and heading of a trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ClosureInputs:
     """Images, features and places of a drive, for pictures of its closures."""
 
     image: Callable[[int], Bytes]
@@ -51,11 +51,11 @@ class Seen:
 
 
 def finished_picture(
-    seen: Seen, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
+    inputs: ClosureInputs, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
     pictures: PictureSettings, threads: int, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
 ) -> Shown:  # fmt: skip
     """All that result.mcap shows of a run, made while its features are at hand."""
-    state, camera = seen.state, seen.camera
+    state, camera = inputs.state, inputs.camera
     small = {
         number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
         for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
@@ -63,11 +63,11 @@ def finished_picture(
     drawn = {}
     if len(previews):
         rows = choose_examples(closures, pictures.closures)
-        drawn = draw_closures(rows, seen, closures, verify, pictures.quality, threads)
+        drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, threads)
     return Shown(
         image=previews.__getitem__ if len(previews) else None,
         image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
-        explained=(lambda row: explain(state, seen.places[row])) if isinstance(state, BoxState) else None,
+        explained=(lambda row: explain(state, inputs.places[row])) if isinstance(state, BoxState) else None,
         references=small,
         pictures=drawn,
         gps=gps,
@@ -114,19 +114,21 @@ def choose_examples(closures: Closures, count: int) -> list[int]:
 
 
 def draw_closures(
-    rows: Sequence[int], seen: Seen, closures: Closures, verify: VerifySettings, quality: int, threads: int
+    rows: Sequence[int], inputs: ClosureInputs, closures: Closures, verify: VerifySettings, quality: int, threads: int
 ) -> dict[int, bytes]:
     """JPEGs of ledger rows."""
-    images = {node: seen.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
+    images = {node: inputs.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
     with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        drawn = pool.map(lambda row: jpeg(_draw(row, seen, images, closures, verify), quality), rows)
+        drawn = pool.map(lambda row: jpeg(_draw(row, inputs, images, closures, verify), quality), rows)
         return dict(zip(rows, drawn, strict=True))
 
 
-def _draw(row: int, seen: Seen, images: dict[int, Bytes], closures: Closures, verify: VerifySettings) -> Bytes:
+def _draw(
+    row: int, inputs: ClosureInputs, images: dict[int, Bytes], closures: Closures, verify: VerifySettings
+) -> Bytes:
     nodes = int(closures.query[row]), int(closures.match[row])
-    features = seen.features(nodes[0]), seen.features(nodes[1])
-    agreement = find_agreement(*features, _pose_columns(closures, row), seen.camera, verify)
+    features = inputs.features(nodes[0]), inputs.features(nodes[1])
+    agreement = find_agreement(*features, _pose_columns(closures, row), inputs.camera, verify)
     sides = [np.array([one.width, one.height]) for one in features]
     halves = [
         Half(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
@@ -134,18 +136,18 @@ def _draw(row: int, seen: Seen, images: dict[int, Bytes], closures: Closures, ve
             ("query", "match"), nodes, (agreement.query, agreement.match), sides, strict=True
         )
     ]
-    return collage(halves[0], halves[1], agreement.agrees, _panels(row, nodes, features, seen, closures))
+    return collage(halves[0], halves[1], agreement.agrees, _panels(row, nodes, features, inputs, closures))
 
 
 def _panels(
-    row: int, nodes: Sequence[int], features: Sequence[Features], seen: Seen, closures: Closures
+    row: int, nodes: Sequence[int], features: Sequence[Features], inputs: ClosureInputs, closures: Closures
 ) -> list[Panel]:
     """Boxes of both on the references they share most on, and how both vote on the first of these."""
-    shared, state = closures.shared_references[row].tolist(), seen.state
+    shared, state = closures.shared_references[row].tolist(), inputs.state
     if not isinstance(state, BoxState):
         return []
     panels, none = [], np.zeros((0, 4))
-    for found in find_boxes(state, seen.places[nodes[0]], seen.places[nodes[1]], shared)[:2]:
+    for found in find_boxes(state, inputs.places[nodes[0]], inputs.places[nodes[1]], shared)[:2]:
         name = f"reference {found.reference}"
         panels.append(Panel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
         if len(panels) <= _VOTED:
@@ -165,8 +167,8 @@ def _pose_columns(closures: Closures, row: int) -> dict[str, Any]:
 
 
 def earth_of(trajectory: Trajectory, gps: Gps | None, known: dict[str, Any] | None) -> Earth | None:
-    """Where on earth a trajectory is: as the solve found it (`known`, the `gps` of run.json), else by laying it on
-    the fixes as a whole (Umeyama 1991). None without at least three fixes within the drive."""
+    """The pose of a trajectory on earth: that of the solve (`known`, the `gps` of run.json), else by alignment to the
+    fixes (Umeyama 1991). None without at least three fixes within the drive."""
     if known is not None:
         try:
             origin = [float(known["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]

@@ -16,11 +16,7 @@ from vplog.data import Trajectory
 from vplog.evaluate.pairs import around, poses_at
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Ints
 
 _BETTER = 0.5
 """Another frame must halve the disagreement with the odometry to be taken: chance does not."""
@@ -31,7 +27,7 @@ _MOTION_SHARE = 20
 _PRIOR = 1e-3
 """Weight of no turn at all against the motions: it settles what they leave open, and nothing else."""
 _LEAST_SHOWN = 0.02
-"""Of the best seen direction of a lever: what shows by less is noise."""
+"""Singular values of the lever's equations below this share of the largest are noise."""
 _NOISE_BOUND = 2.62
 """The length of three Gaussians: its 99.9 % bound, 4.03 sigma, over its median, 1.54 sigma."""
 _LEAST_TURN_DEG = 5.0
@@ -151,8 +147,8 @@ def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tupl
 def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
     """X = truth_from_body with a X = X b for motions (W, 4, 4) of the truth and of the body (Tsai & Lenz 1989).
 
-    The odometry's metres may be off by one factor. What no motion tells, such as a lever along the one axis a car
-    turns about, stays zero.
+    The odometry's metres may be off by one factor. What no motion determines, such as a lever along the one axis
+    a car turns about, stays zero; OpenCV's calibrateHandEye has neither the factor nor motions about one axis.
     """
     size = float(np.linalg.norm(b[:, :3, 3], axis=1).mean())  # the lever in units of a motion, as the scale is
     lever, rotation, weight = np.zeros(3), np.eye(3), weight[:, None]

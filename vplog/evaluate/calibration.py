@@ -10,9 +10,9 @@ import numpy as np
 from vplog.errors import TruthError
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from vplog.data import Floats, Ints
+    from vplog.data import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Reliability:
         }
 
 
-def reliability(probability: ArrayLike, right: NDArray[np.bool_], bins: int) -> Reliability:
+def reliability(probability: ArrayLike, right: Bools, bins: int) -> Reliability:
     """Compare the probabilities (Q,) of Q answers with which of them are right (Q,).
 
     Guo et al., On calibration of modern neural networks, ICML 2017, Eq. (3). Raises TruthError without answers, and

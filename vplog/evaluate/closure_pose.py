@@ -31,12 +31,8 @@ import numpy as np
 from vplog import geometry
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats
+    from vplog.data import Bools, Closures, Floats
     from vplog.evaluate.body_truth import TruthAt
-
-    Bools = NDArray[np.bool_]
 
 _WALK_M = 0.04
 """m after 1 m: see above."""
@@ -48,7 +44,7 @@ _MOST_CLAIMED = 2.0
 _CHI = 4.033
 """sqrt of the 99.9 % quantile of chi-square with three degrees of freedom, 16.27."""
 _OPEN = 1e-12
-"""Of the largest eigenvalue of an information: below it nothing is claimed along that direction."""
+"""Eigenvalues of an information below this share of the largest claim nothing along their direction."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,7 @@ class PoseBounds:
     most: float = _MOST_CLAIMED
     """Times these, that the claimed covariance may widen them to."""
     length_m: float = 0.0
-    """Of the drive they are for."""
+    """Length of the drive they are for."""
 
     @property
     def b(self) -> Floats:

@@ -20,13 +20,9 @@ from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats, Int32s, Ints, Keyframes
+    from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes
     from vplog.evaluate.body_truth import BodyTruth, TruthAt
     from vplog.evaluate.closure_pose import PoseBounds
-
-    Bools = NDArray[np.bool_]
 
 _OPPOSITE_DEG = 90.0
 """Degrees; beyond it a forward camera looks the other way."""
@@ -78,7 +74,7 @@ class ClosureScore:
     accepted: int
     """Accepted closures with a truth at both ends."""
     accepted_true: int
-    """Of these the ones whose pose is right."""
+    """Accepted closures whose pose is right."""
     accepted_false: int
     not_judged: int
     """Accepted closures that the truth does not cover, or too coarsely to tell."""

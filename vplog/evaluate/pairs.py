@@ -14,11 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Int32s, Ints, Trajectory
-
-    Bools = NDArray[np.bool_]
+    from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 
 _MAX_GAP_S = 2.0
 """s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""
@@ -67,9 +63,9 @@ class Pairs:
         """The pairs whose row is below the query's stop, (Q,): those that are candidates at all."""
         owner = np.repeat(np.arange(len(self)), np.diff(self.start))
         stop = np.minimum(self.stop, stops[owner]).astype(np.int32)
-        kept = self.first < stop
-        counts = np.bincount(owner[kept], minlength=len(self))
-        return Pairs(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), self.first[kept], stop[kept])
+        some = self.first < stop
+        counts = np.bincount(owner[some], minlength=len(self))
+        return Pairs(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), self.first[some], stop[some])
 
 
 def index_pairs(query: Ints, match: Ints, tolerance: int) -> Pairs:

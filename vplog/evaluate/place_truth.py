@@ -1,4 +1,4 @@
-"""What a user names as the truth of two drives: the frames it covers, and which of them show the same place."""
+"""The truth of two drives that --truth names: the frames it covers, and which of them show the same place."""
 
 from __future__ import annotations
 
@@ -75,6 +75,7 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
             raise TruthError(f"--truth {shown(choice.source)} takes no --{option}: it is for {_takers(name)}.")
     distance_m = DISTANCE_M if choice.distance_m is None else choice.distance_m
     heading_deg = HEADING_DEG if choice.heading_deg is None else choice.heading_deg
+    about: dict[str, Any]
     all_query, all_map = np.arange(len(query.stamps())), np.arange(len(other.stamps()))
     if kind == "index":
         tolerance = choice.tolerance or 0
@@ -84,39 +85,30 @@ def open_truth(choice: TruthChoice, query: Log, other: Log) -> PlaceTruth:
         listed = pairs.read_pairs(Path(choice.source), len(all_query), len(all_map))
         about = {"source": shown(choice.source), "listed": len(listed)}
         return PlaceTruth(about, all_query, all_map, lambda q, m: pairs.listed_pairs(listed, q, m))
+    about = {"source": shown(choice.source), "distance_m": distance_m}
     if kind == "gps":
         (here, here_known), (there, there_known) = _fixes(query, other)
-        about = {"source": "gps", "distance_m": distance_m}
-        found = PlaceTruth(
-            about,
-            np.flatnonzero(here_known),
-            np.flatnonzero(there_known),
-            lambda q, m: pairs.position_pairs(here[q], there[m], distance_m),
-        )
+
+        def true_pairs(q: Ints, m: Ints) -> Pairs:
+            return pairs.position_pairs(here[q], there[m], distance_m)
     else:
         trajectories = _odometry(query, other) if kind == "poses" else _files(choice.source)
-        (here, here_known), (there, there_known) = (
-            pairs.poses_at(trajectory, log.stamps())
-            for trajectory, log in zip(trajectories, (query, other), strict=True)
-        )
-        axes = (
-            pairs.optical_axis(query.camera().body_from_camera, here[here_known]),
-            pairs.optical_axis(other.camera().body_from_camera, there[there_known]),
-        )
-        about = {"source": shown(choice.source), "distance_m": distance_m, "heading_deg": heading_deg}
-        found = PlaceTruth(
-            about,
-            np.flatnonzero(here_known),
-            np.flatnonzero(there_known),
-            lambda q, m: pairs.pose_pairs(here[q], there[m], distance_m, heading_deg, *axes),
-        )
-    for name, known, log in (("query", found.query_frames, query), ("map", found.map_frames, other)):
-        if not len(known):
+        here, here_known = pairs.poses_at(trajectories[0], query.stamps())
+        there, there_known = pairs.poses_at(trajectories[1], other.stamps())
+        here_axis = pairs.optical_axis(query.camera().body_from_camera, here[here_known])
+        there_axis = pairs.optical_axis(other.camera().body_from_camera, there[there_known])
+        about["heading_deg"] = heading_deg
+
+        def true_pairs(q: Ints, m: Ints) -> Pairs:
+            return pairs.pose_pairs(here[q], there[m], distance_m, heading_deg, here_axis, there_axis)
+
+    for name, known, log in (("query", here_known, query), ("map", there_known, other)):
+        if not known.any():
             raise TruthError(
                 f"--truth {shown(choice.source)} covers none of the {len(log.stamps())} frames of the {name} "
                 f"{log.name}. Give the truth of this drive, in the log's clock."
             )
-    return found
+    return PlaceTruth(about, np.flatnonzero(here_known), np.flatnonzero(there_known), true_pairs)
 
 
 def _kind(source: str) -> str:
@@ -126,8 +118,7 @@ def _kind(source: str) -> str:
 
 
 def _takers(option: str) -> str:
-    names = {"index": "index", "poses": "poses", "tum": "a TUM file", "gps": "gps"}
-    return " and ".join(names[kind] for kind in names if option in _USES[kind])
+    return " and ".join("a TUM file" if kind == "tum" else kind for kind, options in _USES.items() if option in options)
 
 
 def _files(source: str) -> tuple[Trajectory, Trajectory]:
@@ -140,13 +131,13 @@ def _files(source: str) -> tuple[Trajectory, Trajectory]:
 
 
 def _odometry(query: Log, other: Log) -> tuple[Trajectory, Trajectory]:
-    found = []
-    for log in (query, other):
+    def read(log: Log) -> Trajectory:
         odometry = log.odometry()
         if odometry is None or not len(odometry.stamp_ns):
             raise TruthError(f"{log.name} has no odometry, so --truth poses cannot tell. Choose another truth.")
-        found.append(Trajectory(odometry.stamp_ns, odometry.odom_from_body))
-    return found[0], found[1]
+        return Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+
+    return read(query), read(other)
 
 
 def _fixes(query: Log, other: Log) -> list[tuple[Floats, Any]]:

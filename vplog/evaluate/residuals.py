@@ -1,4 +1,4 @@
-"""Do closures know how well they know? Their errors against the truth, in units of what they claim."""
+"""Are the covariances of closures honest? Their errors against the truth, normalised by what they claim."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ class ResidualScore:
     closures: int
     """Accepted ones with a covariance and a truth."""
     to_truth: float | None
-    """Of the closures against the truth. A truth that is itself off between two visits counts as their error."""
+    """Median of the closures against the truth. A truth that is itself off between two visits counts as their error."""
     pairs: int
     """Closures with an accepted neighbour."""
     to_neighbours: float | None
-    """Of each closure against the next one near it, moved by the truth over the few keyframes between them: what the
-    truth is off between two visits cancels, and so does what neighbours share, so it may be less."""
+    """Median of each closure against the next one near it, moved by the truth over the few keyframes between them. What
+    the truth is off between two visits cancels, and so does what neighbours share, so it may be less."""
 
 
 def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) -> ResidualScore:
-    """Of the accepted closures of a ledger."""
+    """Score the accepted closures of a ledger."""
     at = truth.at(keyframes.stamp_ns)
     poses, known = at.world_from_body, at.known & truth.oriented
     accepted = np.array([verdict is Verdict.ACCEPTED for verdict in closures.verdict], bool)

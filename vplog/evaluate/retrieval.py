@@ -14,12 +14,8 @@ import numpy as np
 from vplog.errors import TruthError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Float32s, Floats, Int32s, Ints
+    from vplog.data import Bools, Float32s, Floats, Int32s, Ints
     from vplog.evaluate.pairs import Pairs
-
-    Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

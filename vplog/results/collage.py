@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from vplog.results.evenly import evenly
 
-    from vplog.data import Bytes, Floats, Ints
+if TYPE_CHECKING:
+    from vplog.data import Bools, Bytes, Floats
 
 _AGREES, _OTHER = (111, 224, 53), (61, 77, 255)
 """Blue, green, red: the green and red of `vplog explain`."""
 _QUERY, _MATCH = (46, 157, 255), (255, 195, 76)
-"""Of the boxes of either frame: orange and blue."""
+"""Boxes of either frame: orange and blue, as blue, green, red."""
 _MOST_LINES = 80
 """Lines of either kind, evenly chosen: more hide so small a picture."""
 _WIDE = 2.0
@@ -28,7 +28,7 @@ _PANELS = 4
 _HEAT = 0.6
 """Opacity of the most voted place of a voting map."""
 _TEXT = 0.4
-"""Of the fonts of OpenCV: letters of 9 px."""
+"""Scale of OpenCV's font: letters of 9 px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Panel:
     """(rows, columns) 0..1, drawn as heat."""
 
 
-def collage(query: Half, match: Half, agrees: NDArray[np.bool_], panels: list[Panel]) -> Bytes:
+def collage(query: Half, match: Half, agrees: Bools, panels: list[Panel]) -> Bytes:
     """(H, W, 3) blue, green, red."""
     height, width = query.image.shape
     stacked = width > _WIDE * height
@@ -71,7 +71,7 @@ def collage(query: Half, match: Half, agrees: NDArray[np.bool_], panels: list[Pa
         for half, at in ((query, np.zeros(2)), (match, offset))
     )
     for wanted, colour in ((False, _OTHER), (True, _AGREES)):
-        for row in _evenly(np.flatnonzero(agrees == wanted)).tolist():
+        for row in evenly(np.flatnonzero(agrees == wanted), _MOST_LINES).tolist():
             cv2.line(canvas, here[row].tolist(), there[row].tolist(), colour, 1, cv2.LINE_AA)
     _write(canvas, query.title, (0, 0))
     _write(canvas, match.title, (int(offset[0]), int(offset[1])))
@@ -114,7 +114,3 @@ def _write(image: Bytes, text: str, at: tuple[int, int]) -> None:
     x, y = at
     cv2.rectangle(image, (x, y), (x + width + 5, y + height + below + 3), (0, 0, 0), -1)
     cv2.putText(image, text, (x + 3, y + height + 2), cv2.FONT_HERSHEY_SIMPLEX, _TEXT, (255, 255, 255), 1, cv2.LINE_AA)
-
-
-def _evenly(rows: Ints) -> Ints:
-    return rows if len(rows) <= _MOST_LINES else rows[np.linspace(0, len(rows) - 1, _MOST_LINES).astype(np.int64)]

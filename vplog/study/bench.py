@@ -62,10 +62,10 @@ class Bench:
     """The drives of a study and what has been tried on them. Drives are decoded when first needed."""
 
     names: list[str]
-    """Of the drives, short and different."""
+    """Names of the drives, short and different."""
     logs: list[Log]
     hashes: list[str]
-    """Of the drives' files."""
+    """Hashes of the drives' files."""
     methods: dict[str, Any]
     """Recognisers by name; grows with those of the ablations."""
     truth: dict[tuple[int, int], PlaceTruth]
@@ -115,7 +115,7 @@ class Bench:
         return [found[int(walk.stamp_ns[row])] for row in rows]
 
     def references(self, library: Library) -> list[Reference]:
-        """The same that `vplog compare` takes: frames that cannot be decoded are left out after the choice."""
+        """Frames as `vplog compare` chooses them; those that cannot be decoded are left out after the choice."""
         walk, covered = self.walk(library.drive), self.frames[library.drive]
         wanted = LibrarySettings(choose="random", size=library.size, seed=library.seed)
         numbers = set(covered[choose(covered, wanted)].tolist())

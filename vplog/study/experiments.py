@@ -1,4 +1,4 @@
-"""The experiments of the paper that are numbers: which trials each takes, and what is said of them.
+"""The experiments of the paper that are numbers: which trials each takes, and its figures.
 
 Numbers of figures are those of Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014, section IV.
 """

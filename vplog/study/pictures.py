@@ -80,9 +80,9 @@ def examples(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
             true = truth.rows(row)
             match = int(ranks.top_row[row]) if right else int(true[len(true) // 2])
             file = f"examples-{len(files) + 1:02d}-{kind}"
-            said = f"{kind}: the true frame is no. {int(ranks.better[row]) + 1} of {int(ranks.candidates[row])}"
+            outcome = f"{kind}: the true frame is no. {int(ranks.better[row]) + 1} of {int(ranks.candidates[row])}"
             sides = (query, row, places[query][row]), (other, match, places[other][match])
-            _draw_example(bench, state, *sides, said, file, out)
+            _draw_example(bench, state, *sides, outcome, file, out)
             files.append(file)
             rows.append(
                 {
@@ -195,7 +195,7 @@ def _draw_references(
 
 
 def _draw_example(
-    bench: Bench, state: BoxState, query: tuple[int, int, Any], match: tuple[int, int, Any], said: str, file: str,
+    bench: Bench, state: BoxState, query: tuple[int, int, Any], match: tuple[int, int, Any], outcome: str, file: str,
     out: Path,
 ) -> None:  # fmt: skip
     mine, other = state.boxes(query[2]), state.boxes(match[2])
@@ -230,7 +230,7 @@ def _draw_example(
                 grid[line, column].set_title(text, fontsize=8.5, color="black" if len(rank) else "#999999")
         explain(
             figure,
-            f"{bench.names[query[0]]} in {bench.names[match[0]]}, {said}",
+            f"{bench.names[query[0]]} in {bench.names[match[0]]}, {outcome}",
             "Left: a query and the frame of the map that shows the same place, with the middles of the windows. "
             "Right: reference images that explain the query, with the votes of all features of the frame at the left "
             "(bright: many) and, in the colour of each window, the box it is found in. The same place: the same "

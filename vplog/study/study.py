@@ -121,8 +121,8 @@ def study(
             if name not in done:
                 done[name] = _do(name, bench, plan, out)
                 _write(out, account, inputs, done, [])
-        said = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
-        return _write(out, account, inputs, done, list(dict.fromkeys(said)))
+        warned = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
+        return _write(out, account, inputs, done, list(dict.fromkeys(warned)))
 
 
 def _do(name: str, bench: Bench, plan: Plan, out: Path) -> dict[str, Any]:
@@ -265,13 +265,13 @@ def _shown(truth: TruthChoice) -> dict[str, Any]:
 
 
 def _truth_hash(truth: TruthChoice) -> str:
-    """Of the choice, and of the files it names."""
+    """Hash of the choice, and of the files it names."""
     files = [Path(file) for file in {truth.source, *truth.source.split(",")} if Path(file).is_file()]
     return _hash([_shown(truth), [hash_inputs(file) for file in sorted(files)]])
 
 
 def _code_hash(without: set[str]) -> str:
-    """Of the package's own files: another version of a recogniser finds other places by the same settings."""
+    """Hash of the package's own files: another version of a recogniser finds other places by the same settings."""
     package = Path(vplog.__file__).parent
     digest = hashlib.sha256()
     for part in ("data.py", "evaluate", "extract.py", "features", "logs", "places", "references.py", "study",

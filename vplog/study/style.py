@@ -25,7 +25,7 @@ _OTHERS = ("#e377c2", "#17becf", "#bcbd22", "#393b79", "#637939", "#843c39")
 _DRIVES = ("#4c9f70", "#e0a43a", "#3d5a80", "#b56576", "#6d597a", "#84a59d", "#bc6c25", "#264653")
 _CAPTION_PT = 8
 _CHARACTERS_AN_INCH = 15.5
-"""Of a caption at that size."""
+"""Characters of a caption line at that size."""
 
 
 def colour_of(method: str, methods: Sequence[str]) -> str:

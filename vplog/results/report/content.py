@@ -1,4 +1,4 @@
-"""What a report tells, gathered by the caller."""
+"""The values that a report is made of, gathered by the caller."""
 
 from __future__ import annotations
 
@@ -6,31 +6,28 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats, Keyframes, Trajectory
+    from vplog.data import Bools, Closures, Floats, Keyframes, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A run held against the truth."""
+    """A run compared with the truth."""
 
     name: str
-    """Of the truth, as it was given."""
+    """The truth as it was given."""
     scores: dict[str, Any]
-    """What `vplog evaluate --json` says."""
+    """The record of `vplog evaluate --json`."""
     words: list[str] = field(default_factory=list)
     """Sentences on the closures and their criteria."""
     path: Floats | None = None
     """(T, 3) m, the truth in the frame of the trajectory; None where the truth is the log's own GPS."""
-    true: NDArray[np.bool_] | None = None
-    """(C,) candidates whose pose is that of the truth, and those without a pose whose frames show one place."""
-    known: NDArray[np.bool_] | None = None
-    """(C,) candidates that the truth can tell of."""
+    true: Bools | None = None
+    """(C,) candidates that are true: by their pose, or by place where they have none."""
+    known: Bools | None = None
+    """(C,) candidates that the truth covers finely enough to judge."""
     curves: dict[str, Floats] = field(default_factory=dict)
     """By what candidates are ranked: (P, 3) recall, precision and the value there, by falling value."""
-    at_place: NDArray[np.bool_] | None = None
+    at_place: Bools | None = None
     """(C,) candidates whose two frames show one place."""
 
 

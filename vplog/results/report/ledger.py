@@ -1,14 +1,12 @@
-"""The ledger as a table that sorts by any column, its rows as data in the page."""
+"""The rows of the ledger as the page's script sorts and filters them."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
-from vplog.results.report.parts import KEPT
+from vplog.results.report import TAKEN
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -18,71 +16,56 @@ _MOST_ROWS = 20_000
 """Rows in the page: 1.5 MB. Accepted ones first, then by score; the table file has them all."""
 
 
-def ledger(content: Content, pictures: list[int]) -> str:
-    """The table, its filter by verdict, and the data; `pictures` are the rows that have one in the page."""
-    closures = content.closures
-    if not len(closures):
-        return "<p>Nothing was proposed.</p>"
+def ledger(content: Content, pictures: list[int]) -> dict[str, Any] | None:
+    """Columns and rows as JSON, None without candidates; `pictures` are the rows that have one in the page."""
+    if not len(content.closures):
+        return None
     rows = _chosen(content)
-    judged = content.judged
-    columns: list[tuple[str, list[Any]]] = [
-        ("row", rows),
-        ("verdict", [closures.verdict[row].value for row in rows]),
-        ("query", closures.query[rows].tolist()),
-        ("match", closures.match[rows].tolist()),
-        ("rank", closures.rank[rows].tolist()),
-        ("score", _rounded(closures.score[rows], 4)),
-        ("support", closures.support[rows].tolist()),
-        ("matches", closures.matches[rows].tolist()),
-        ("inliers", closures.inliers[rows].tolist()),
-        ("other way", [value if value >= 0 else None for value in closures.reverse_inliers[rows].tolist()]),
-        ("spread", _rounded(closures.spread[rows], 3)),
-        ("metres", _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)),
-        ("sigma before", _rounded(closures.residual_before[rows], 2)),
-        ("sigma after", _rounded(closures.residual_after[rows], 2)),
-        ("weight", _rounded(closures.weight[rows], 3)),
-    ]
-    if judged is not None and judged.true is not None and judged.known is not None:
-        told = np.where(judged.known, np.where(judged.true, "yes", "no"), "")
-        columns.append(("true", [one or None for one in told[rows].tolist()]))
-        if judged.at_place is not None:
-            columns.append(("same place", ["yes" if one else None for one in judged.at_place[rows].tolist()]))
-    heads = "".join(f'<th scope="col"><button type="button">{name}</button></th>' for name, _ in columns)
-    kinds = [verdict.value for verdict in Verdict if verdict in closures.verdict]
-    options = "".join(f'<option value="{kind}">{kind}</option>' for kind in kinds)
-    missing = f" Of {len(closures)} candidates, {len(rows)} are in this page." if len(rows) < len(closures) else ""
-    data = {
-        "columns": [name for name, _ in columns],
-        "rows": list(map(list, zip(*(values for _, values in columns), strict=True))),
+    columns = _columns(content, rows)
+    return {
+        "columns": list(columns),
+        "rows": list(map(list, zip(*columns.values(), strict=True))),
         "pictures": pictures,
-        "kept": [verdict.value for verdict in KEPT],
+        "kept": [verdict.value for verdict in TAKEN],
     }
-    return (
-        "<h3>The ledger</h3>\n"
-        f'<p class="quiet">Every candidate. A heading sorts; a number that is a link leads to its picture.{missing} '
-        f'<label>Verdict <select id="filter"><option value="">all</option>{options}</select></label> '
-        '<span id="count"></span></p>\n<noscript><p>The table needs JavaScript; closures.parquet has the same '
-        f'rows.</p></noscript>\n<div class="box tall"><table id="closures"><thead><tr>{heads}</tr></thead>'
-        '<tbody id="rows"></tbody></table></div>\n<p><button type="button" id="more" hidden>More</button></p>\n'
-        f'<script type="application/json" id="ledger">{_as_data(data)}</script>'
-    )
+
+
+def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
+    """Values of these rows by the name of their column; those of the truth beside the verdict, in view on a phone."""
+    closures, judged = content.closures, content.judged
+    columns: dict[str, list[Any]] = {"row": rows, "verdict": [closures.verdict[row].value for row in rows]}
+    if judged is not None and judged.true is not None and judged.known is not None:
+        true = np.where(judged.true, "yes", "no")[rows].tolist()
+        columns["true"] = [one if known else None for one, known in zip(true, judged.known[rows], strict=True)]
+        if judged.at_place is not None:
+            columns["same place"] = ["yes" if one else None for one in judged.at_place[rows].tolist()]
+    reverse = closures.reverse_inliers[rows].tolist()
+    return columns | {
+        "query": closures.query[rows].tolist(),
+        "match": closures.match[rows].tolist(),
+        "rank": closures.rank[rows].tolist(),
+        "score": _rounded(closures.score[rows], 4),
+        "support": closures.support[rows].tolist(),
+        "matches": closures.matches[rows].tolist(),
+        "inliers": closures.inliers[rows].tolist(),
+        "reverse inliers": [value if value >= 0 else None for value in reverse],
+        "spread": _rounded(closures.spread[rows], 3),
+        "metres": _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2),
+        "sigma before": _rounded(closures.residual_before[rows], 2),
+        "sigma after": _rounded(closures.residual_after[rows], 2),
+        "weight": _rounded(closures.weight[rows], 3),
+    }
 
 
 def _chosen(content: Content) -> list[int]:
     closures = content.closures
     if len(closures) <= _MOST_ROWS:
         return list(range(len(closures)))
-    accepted = np.array([verdict in KEPT for verdict in closures.verdict], bool)
-    order = np.lexsort((-closures.score.astype(np.float64), ~accepted))
+    taken = np.array([verdict in TAKEN for verdict in closures.verdict], bool)
+    order = np.lexsort((-closures.score.astype(np.float64), ~taken))
     return sorted(order[:_MOST_ROWS].tolist())
 
 
 def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
     """What JSON can hold: null where a value is not known."""
     return [round(value, digits) if np.isfinite(value) else None for value in values.astype(np.float64).tolist()]
-
-
-def _as_data(tree: Any) -> str:
-    """JSON that cannot end the script it stands in (html.spec.whatwg.org, 4.12.1.3)."""
-    dense = json.dumps(tree, separators=(",", ":"), allow_nan=False)
-    return dense.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

@@ -1,151 +1,202 @@
-"""The page: its sections in order, each a function of the content. Whatever comes from outside is escaped."""
+"""What each section of report.html shows, computed from a finished run."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.data import Verdict
-from vplog.results.report import charts
-from vplog.results.report.evidence import closures_section, distributions_section, references_section
-from vplog.results.report.parts import figure, key, part, table, text
-from vplog.results.report.style import SCRIPT, STYLE
+from vplog.results.html import figure, mapping, render
+from vplog.results.report import TAKEN, charts
+from vplog.results.report.ledger import ledger
 
 if TYPE_CHECKING:
-    from vplog.data import Closures
-    from vplog.results.report.content import Content
+    from vplog.data import Bools, Floats
+    from vplog.results.report.content import Content, Judged
 
 _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-"""The browser itself refuses whatever is not inside the page."""
+_MOST_PICTURE_BYTES = 6_000_000
+"""Bytes of all pictures together: the page then stays below 10 MB, base64 and table included."""
+_MOST_USED = 6
+"""References shown of the most used, and of the least used."""
+_FIGURES = (
+    ("ATE rmse m", "ate", "rmse_m", 3),
+    ("ATE max m", "ate", "max_m", 3),
+    ("RPE m a frame", "rpe", "translation_rmse_m", 4),
+    ("RPE degrees a frame", "rpe", "rotation_rmse_deg", 4),
+    ("drift m per 100 m", "drift", "translation_m", 2),
+    ("drift degrees per 100 m", "drift", "rotation_deg", 2),
+)
+"""Heading, error, figure and digits of the rows of the table of the truth."""
 
 
 def page(content: Content) -> str:
     """The whole report: the same text for the same run, but for its timings."""
-    drive = text(content.keyframes.drive)
-    sections = [
-        _head(content), _warnings(content), _trajectory(content), _truth(content), closures_section(content),
-        distributions_section(content), references_section(content), _costs(content), _settings(content),
-    ]  # fmt: skip
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>vplog: {drive}</title>\n'
-        f'<meta name="viewport" content="width=device-width,initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f'<link rel="icon" href="data:,">\n<style>\n{STYLE}\n</style></head>\n<body>\n'
-        + "\n".join(section for section in sections if section)
-        + f"\n<script>\n{SCRIPT}\n</script>\n</body></html>\n"
+    record, closures, judged = content.record, content.closures, content.judged
+    counts = [(verdict, closures.verdict.count(verdict)) for verdict in Verdict]
+    examples = _examples(content)
+    lines, trajectory_map = _map(content)
+    return render(
+        "report.html",
+        record=record,
+        drive=content.keyframes.drive,
+        tiles=_tiles(content),
+        warnings=_list(record.get("warnings")),
+        losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
+        map_lines=lines,
+        map=trajectory_map,
+        judged=judged,
+        truth=_truth(judged) if judged else [],
+        curves=_curves(judged) if judged else None,
+        verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
+        candidates=len(closures),
+        examples=examples,
+        ledger=ledger(content, [one["row"] for one in examples]),
+        distributions=_distributions(content),
+        references=_references(content),
+        stages=_stages(mapping(record.get("stages"))),
     )
 
 
-def _head(content: Content) -> str:
-    record, closures = content.record, content.closures
+def _tiles(content: Content) -> list[tuple[str, str]]:
+    """The drive in seven numbers, each with what it counts."""
     path_m = float(np.linalg.norm(np.diff(content.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
     stamps = content.after.stamp_ns
-    seconds = (int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0
-    totals = part(record, "totals")
-    tiles = [
+    totals = mapping(content.record.get("totals"))
+    return [
         (figure(len(content.keyframes.stamp_ns)), "keyframes"),
         (f"{figure(path_m)} m", "path"),
-        (f"{figure(seconds)} s", "of drive"),
-        (figure(len(closures)), "candidates"),
-        (figure(closures.verdict.count(Verdict.ACCEPTED)), "accepted closures"),
+        (f"{figure((int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0)} s", "of drive"),
+        (figure(len(content.closures)), "candidates"),
+        (figure(content.closures.verdict.count(Verdict.ACCEPTED)), "accepted closures"),
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
     ]
-    reason = part(record, "solution").get("reason", "")
-    return (
-        f"<h1>{text(content.keyframes.drive)}</h1>\n<p>{text(reason)}</p>\n"
-        f'<p class="quiet">{text(record.get("log", ""))}, vplog {text(record.get("vplog", ""))}</p>\n'
-        '<div class="tiles">'
-        + "".join(f'<div class="tile"><b>{value}</b><span>{name}</span></div>' for value, name in tiles)
-        + "</div>"
-    )
-
-
-def _warnings(content: Content) -> str:
-    found = content.record.get("warnings")
-    lines = [f'<p class="warn">{text(line)}</p>' for line in found] if isinstance(found, list) else []
-    told = content.record.get("losses")
-    rows = [_loss(one, content) for one in told if isinstance(one, dict)] if isinstance(told, list) else []
-    heads = ["topic", "messages lost", "of", "seconds into the drive", "why"]
-    lost = table(heads, rows[:_MOST_LOSSES], words=(4,)) if rows else ""
-    return f"<h2>Losses and warnings</h2>\n{''.join(lines) or '<p>No warnings.</p>'}{lost}"
 
 
 def _loss(loss: dict[str, Any], content: Content) -> list[str]:
     """A row of what could not be read: how much, when, and why."""
     start_ns = int(content.keyframes.stamp_ns[0]) if len(content.keyframes.stamp_ns) else 0
-    spans = loss.get("spans_ns")
-    ends = [end for span in spans for end in span] if isinstance(spans, list | tuple) else []
+    ends = [end for span in _list(loss.get("spans_ns")) for end in span]
     when = f"{(min(ends) - start_ns) / 1e9:.1f} to {(max(ends) - start_ns) / 1e9:.1f}" if ends else "-"
     why = f"{loss.get('reason', '')}: {loss['detail']}" if loss.get("detail") else loss.get("reason", "")
-    return [text(loss.get("topic") or "-"), figure(loss.get("messages")), figure(loss.get("of")), when, text(why)]
+    return [loss.get("topic") or "-", figure(loss.get("messages")), figure(loss.get("of")), when, why]
 
 
-def _trajectory(content: Content) -> str:
-    ends = content.world_from_body[:, :3, 3]
-    segments = [("yes", _between(ends, content.closures, Verdict.ACCEPTED))]
-    segments.append(("other", _between(ends, content.closures, Verdict.DIRECTION_ONLY)))
-    segments.append(("no", _between(ends, content.closures, Verdict.REJECTED_BY_SOLVER)))
-    paths = [("before", content.before.world_from_body[:, :3, 3]), ("after", content.after.world_from_body[:, :3, 3])]
-    dots = []
-    if content.judged is not None and content.judged.path is not None:
-        paths.insert(0, ("truth", content.judged.path))
-    if content.fixes_m is not None:
-        dots.append(("gps", content.fixes_m))
-    used = [kind for kind, points in (*dots, *paths, *segments) if len(points)]
-    return f"<h2>Trajectory</h2>\n{key(used)}{charts.trajectory_map(paths, dots, segments)}"
-
-
-def _between(ends: Any, closures: Closures, verdict: Verdict) -> Any:
-    """(S, 2, 3) the ends of closures with that verdict."""
-    rows = [row for row, one in enumerate(closures.verdict) if one == verdict]
-    return np.stack([ends[closures.match[rows]], ends[closures.query[rows]]], axis=1).reshape(-1, 2, 3)
-
-
-def _truth(content: Content) -> str:
-    judged = content.judged
-    if judged is None:
-        return ""
-    rows = []
-    for name, when in (("odometry", "before"), ("optimised", "after")):
-        ate, rpe, drift = (part(judged.scores, f"{name}_{when}") for name in ("ate", "rpe", "drift"))
-        values = [figure(ate.get("rmse_m"), 3), figure(ate.get("max_m"), 3)]
-        values += [figure(rpe.get("translation_rmse_m"), 4), figure(rpe.get("rotation_rmse_deg"), 4)]
-        values += [figure(drift.get("translation_m"), 2), figure(drift.get("rotation_deg"), 2)]
-        rows.append([name, *values])
-    aligned = text(part(judged.scores, "ate_after").get("alignment", ""))
-    heads = ["", f"ATE rmse m ({aligned})", "ATE max m", "RPE m a frame", "RPE degrees a frame"]
-    heads += ["drift m per 100 m", "drift degrees per 100 m"]
-    said = [f"<h2>Against the truth</h2>\n<p class='quiet'>{text(judged.name)}</p>{table(heads, rows)}"]
-    said += [f"<p>{text(line)}</p>" for line in judged.words]
-    if judged.curves:
-        names = {"after": "candidates by score", "other": "candidates by inliers"}
-        drawn = list(zip(names, judged.curves.values(), strict=False))
-        said.append(f'<h3>Precision and recall</h3>{key(names, names)}<div class="charts">{charts.curves(drawn)}</div>')
-    return "".join(said)
-
-
-def _costs(content: Content) -> str:
-    rows = []
-    for name, stage in part(content.record, "stages").items():
-        if isinstance(stage, dict):
-            values = [figure(stage.get("seconds"), 2), figure(stage.get("cpu_seconds"), 2)]
-            values += [figure(stage.get("items_per_second")), figure(stage.get("peak_memory_mb"), 0)]
-            rows.append([text(name), *values])
-    heads = ["stage", "seconds", "CPU seconds", "frames or candidates a second", "peak MB"]
-    return f"<h2>Time and memory</h2>\n{table(heads, rows)}" if rows else ""
-
-
-def _settings(content: Content) -> str:
-    shown = {name: content.record.get(name) for name in ("settings", "versions", "inputs", "counts", "noise", "gps")}
-    blocks = [
-        f"<details><summary>{name}</summary><pre>{text(json.dumps(value, indent=1, ensure_ascii=False))}</pre>"
-        "</details>"
-        for name, value in shown.items()
-        if value
+def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
+    """The legend and the map of the trajectory."""
+    verdicts, judged = content.closures.verdict, content.judged
+    accepted, rejected, without_metres = (
+        np.array([one == verdict for one in verdicts], bool)
+        for verdict in (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER, Verdict.DIRECTION_ONLY)
+    )
+    false = np.zeros(len(verdicts), bool)
+    if judged is not None and judged.true is not None and judged.known is not None:
+        false = accepted & judged.known & ~judged.true
+    segments = [
+        ("yes", "accepted closures", _ends(content, accepted & ~false)),
+        ("other", "closures taken without metres", _ends(content, without_metres)),
+        ("no", "closures the solver rejected", _ends(content, rejected)),
+        ("false", "accepted closures that are false", _ends(content, false)),
     ]
-    return f"<h2>How it was made</h2>\n{''.join(blocks)}"
+    paths = [
+        ("before", "odometry", content.before.world_from_body[:, :3, 3]),
+        ("after", "optimised", content.after.world_from_body[:, :3, 3]),
+    ]
+    if judged is not None and judged.path is not None:
+        paths.insert(0, ("truth", "truth", judged.path))
+    dots = [] if content.fixes_m is None else [("gps", "GPS fixes", content.fixes_m)]
+    legend = [(kind, name) for kind, name, points in (*dots, *paths, *segments) if len(points)]
+    drawn = ([(kind, points) for kind, _, points in group] for group in (paths, dots, segments))
+    return legend, charts.trajectory_map(*drawn)
+
+
+def _ends(content: Content, chosen: Bools) -> Floats:
+    """(S, 2, 3) positions of the match and the query of these closures (C,)."""
+    position, closures = content.world_from_body[:, :3, 3], content.closures
+    return np.stack([position[closures.match[chosen]], position[closures.query[chosen]]], axis=1)
+
+
+def _truth(judged: Judged) -> list[list[str]]:
+    """Errors of the odometry and of the result, one figure a row."""
+    scores = judged.scores
+    rows = [
+        [heading, *(figure(mapping(scores.get(f"{error}_{when}")).get(name), digits) for when in ("before", "after"))]
+        for heading, error, name, digits in _FIGURES
+    ]
+    alignment = mapping(scores.get("ate_after")).get("alignment", "")
+    return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
+
+
+def _curves(judged: Judged) -> charts.Chart | None:
+    """Precision over recall by score and by inliers, None where nothing was revisited."""
+    return charts.curves(list(zip(("after", "other"), judged.curves.values(), strict=False))) if judged.curves else None
+
+
+def _examples(content: Content) -> list[dict[str, Any]]:
+    """Closures with a picture, by row, until the page holds enough bytes of them."""
+    closures, left, examples = content.closures, _MOST_PICTURE_BYTES, []
+    for row, jpeg in sorted(content.pictures.items()):
+        if row >= len(closures) or len(jpeg) > left:
+            continue
+        left -= len(jpeg)
+        verdict = closures.verdict[row]
+        one = {"row": row, "jpeg": jpeg, "verdict": verdict.value}
+        one |= {"kind": "accepted" if verdict in TAKEN else "rejected"}
+        one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
+        examples.append(one)
+    return examples
+
+
+def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
+    """What accepted and rejected candidates differ in, with the thresholds of the settings."""
+    closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
+    metric = mapping(verify.get("metric"))
+    taken = np.array([verdict in TAKEN for verdict in closures.verdict], bool)
+    shown = []
+    for label, values, name, least in (
+        ("score", closures.score, "", None),
+        ("feature matches", closures.matches, "least matches", verify.get("min_matches")),
+        ("inliers", closures.inliers, "least inliers", metric.get("min_inliers")),
+        ("spread of the inliers", closures.spread, "least spread", metric.get("min_spread")),
+        ("residual after the solve, in sigma", closures.residual_after, "", None),
+    ):
+        wide = values.astype(np.float64)
+        threshold = [(f"{name} {least:g}", float(least))] if isinstance(least, int | float) else []
+        shown.append((label, charts.histogram(wide[taken], wide[~taken], label, threshold)))
+    return shown
+
+
+def _references(content: Content) -> dict[str, Any] | None:
+    """How often each reference explains a keyframe; None for a recogniser without boxes."""
+    library = mapping(content.record.get("library"))
+    used = _list(library.get("used"))
+    if not used or not all(isinstance(one, int) for one in used):
+        return None
+    order = sorted(range(len(used)), key=lambda number: (-used[number], number))
+    split = min(_MOST_USED, (len(order) + 1) // 2)
+    ends = (("Most used", order[:split]), ("Least used", order[max(split, len(order) - _MOST_USED) :]))
+    jpegs, coverage = content.references, mapping(library.get("coverage"))
+    return {
+        "count": len(used),
+        "explained": coverage.get("explained") if coverage.get("frames") else None,
+        "chart": charts.columns([used[number] for number in order], "references", "keyframes"),
+        "ends": [(title, [(n, jpegs[n], used[n]) for n in numbers if n in jpegs]) for title, numbers in ends],
+    }
+
+
+def _stages(stages: dict[str, Any]) -> list[list[str]]:
+    """Time and memory of each stage."""
+    names = (("seconds", 2), ("cpu_seconds", 2), ("items_per_second", 1), ("peak_memory_mb", 0))
+    return [
+        [name, *(figure(stage.get(field), digits) for field, digits in names)]
+        for name, stage in stages.items()
+        if isinstance(stage, dict)
+    ]
+
+
+def _list(value: Any) -> list[Any]:
+    """The value where it is an array of JSON, else an empty one."""
+    return value if isinstance(value, list) else []
