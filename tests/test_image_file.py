@@ -16,6 +16,8 @@ import pytest
 from PIL import Image
 
 from vplog.image_file import BadImageError, decode_image
+from vplog.logs.detect import open_log
+from vplog.logs.select import TopicChoice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -161,6 +163,14 @@ def test_tiff_is_read_and_a_cut_one_is_not(compression: str | None, pixels: np.n
     for stop in np.linspace(1, len(data) * 0.9, 20).astype(int):
         with pytest.raises(BadImageError):
             decode_image(data[:stop])
+
+
+def test_a_folder_of_tiff_is_a_log(tmp_path: Path) -> None:
+    for number in range(4):
+        (tmp_path / f"{number:03d}.tiff").write_bytes(FILES["tiff"])
+    log = open_log(tmp_path, TopicChoice())
+    frames = log.frames(log.stamps())
+    assert [frame.decode().image.shape for frame in frames] == [(120, 160)] * 4
 
 
 def test_tiff_of_floats_is_refused() -> None:
