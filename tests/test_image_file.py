@@ -16,6 +16,8 @@ import pytest
 from PIL import Image
 
 from vplog.image_file import BadImageError, decode_image
+from vplog.logs.detect import open_log
+from vplog.logs.select import TopicChoice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -119,6 +121,61 @@ def test_nothing_is_printed_of_damage(name: str, unchanged: bool, capfd: pytest.
         except BadImageError as error:
             assert str(error)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["jpeg", "exif", "inks"])
+def test_a_jpeg_that_lacks_its_end_marker_alone_is_whole(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    data = FILES[name].removesuffix(b"\xff\xd9")
+    assert np.array_equal(decode_image(data), decode_image(FILES[name]))
+    for cut in (1, 2, 3, 9, len(data) // 4, len(data) // 2):
+        with pytest.raises(BadImageError):
+            decode_image(data[:-cut])
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["progressive", "two scans"])
+def test_a_jpeg_of_several_scans_needs_its_end_marker(name: str) -> None:
+    data = (
+        FILES["progressive"]
+        if name == "progressive"
+        else FILES["jpeg"].replace(b"\xff\xda\0\x0c\3", b"\xff\xda\0\x0c\1")
+    )
+    with pytest.raises(BadImageError, match="not a whole JPEG"):
+        decode_image(data.removesuffix(b"\xff\xd9"))
+
+
+def test_a_jpeg_of_12_bits_is_refused_with_its_bits(capfd: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(FILES["jpeg"])
+    data[data.index(b"\xff\xc0") + 4] = 12
+    with pytest.raises(BadImageError, match="12 bits a sample"):
+        decode_image(bytes(data))
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate", "packbits"])
+@pytest.mark.parametrize("pixels", [COLOUR, COLOUR[..., 0], DEPTH], ids=["colour", "grey", "grey16"])
+def test_tiff_is_read_and_a_cut_one_is_not(compression: str | None, pixels: np.ndarray) -> None:
+    data = by_pillow("TIFF", pixels, compression=compression)
+    expected = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else pixels
+    found = decode_image(data)
+    assert found.dtype == expected.dtype
+    assert np.abs(found.astype(int) - expected).max() <= 1
+    for stop in np.linspace(1, len(data) * 0.9, 20).astype(int):
+        with pytest.raises(BadImageError):
+            decode_image(data[:stop])
+
+
+def test_a_folder_of_tiff_is_a_log(tmp_path: Path) -> None:
+    for number in range(4):
+        (tmp_path / f"{number:03d}.tiff").write_bytes(FILES["tiff"])
+    log = open_log(tmp_path, TopicChoice())
+    frames = log.frames(log.stamps())
+    assert [frame.decode().image.shape for frame in frames] == [(120, 160)] * 4
+
+
+def test_tiff_of_floats_is_refused() -> None:
+    with pytest.raises(BadImageError, match="float32"):
+        decode_image(by_pillow("TIFF", DEPTH.astype(np.float32)))
 
 
 @pytest.mark.parametrize("name", sorted(FILES.keys() - {"tiff", "inks"}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import shutil
 from functools import partial
 from http.server import ThreadingHTTPServer
@@ -182,6 +183,34 @@ def test_urls_are_cut_and_paths_are_not() -> None:
     assert SECRET not in f"{path} {path!r} {path.name} {path.relative_to(RemotePath('http://h'))}"
     assert SECRET in path.url
     assert SECRET not in reason(OSError(f"no answer from {path.url}"))
+
+
+_SIGNED = (
+    "X-Amz-Algorithm=AWS4-HMAC-SHA256{and_}X-Amz-Signature{is_}{secret}", "X-Goog-Signature{is_}{secret}{and_}x=1",
+    "sv{is_}2024{and_}se=2026-01-01T00%3A00Z{and_}sig{is_}{secret}", "SIG{is_}{secret}", "access_token{is_}{secret}",
+    "Policy=eyJ~-_{and_}Signature{is_}ab~{secret}__{and_}Key-Pair-Id=K2", "token{is_}{secret}=={and_}id=7",
+)  # fmt: skip
+_BEFORE = ("?", "#", "&", ";", "%3F", "%3f", "%23", "%26", "%3B", "%253F", "??", "?a&", "%3Fa=1&", ";a=1?", "&amp;")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_link_however_malformed_shows_its_secret(seed: int) -> None:
+    rng = random.Random(seed)
+    for _ in range(100):
+        scheme = rng.choice(["http", "https", "HTTPS", "s3", "gs", "ftp", "abfs"]) + rng.choice(["://", ":/", ":///"])
+        host = rng.choice(["host", "h.example.org:8080", "127.0.0.1:1", "[::1]:80", "bucket"])
+        path = rng.choice(["/a.mcap", "/a b.mcap", "/date=2024-01-02/a%20b.db3", "/"])
+        mark = rng.choice(["", "/", "?", "#", "@", ":", " ", "%40", "&", ";"])
+        user = rng.choice(["", f"u:{SECRET}@", f"u:p{mark}{SECRET}@", f"u:{SECRET}{mark}p@", f":{SECRET}@"])
+        and_, is_ = rng.choice(["&", ";", "%26", ","]), rng.choice(["=", "%3D", "%3d", "%253D"])
+        query = rng.choice(_BEFORE) + rng.choice(_SIGNED).format(and_=and_, is_=is_, secret=SECRET)
+        url = f"{scheme}{user}{host}{path}{rng.choice(['', query])}"
+        assert shown(url) == f"{scheme}{host}{path}", url
+        if " " not in path:
+            for sentence in ("Cannot read {}: 404.", 'No such file: "{}"', "({})", "{}"):
+                said = without_secrets(sentence.format(url))
+                assert SECRET not in said, url
+                assert f"{scheme}{host}{path}" in said, url
 
 
 def test_names_with_marks_are_found_again() -> None:

@@ -33,10 +33,15 @@ and progressive JPEG stay below 512 px. WebP has no such limit; MAX_PIXELS alone
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 """Markers that a JPEG begins and ends with: ITU T.81, table B.1. Some cameras write more behind its end."""
+_JPEG_SCAN, _JPEG_SEQUENTIAL = 0xDA, (0xC0, 0xC1)
+"""Marker that a scan starts with, and those of frames whose samples are coded once: ITU T.81, table B.1."""
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers that a frame starts with: ITU T.81, table B.1."""
 _JPEG_MARKER = struct.Struct(">BBHxHH")
 """A marker and the length behind it; where a frame starts its precision, height and width: ITU T.81, figure B.3."""
+_TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+_TIFF_SIDES, _TIFF_SHORT = (256, 257), 3
+"""Tags of width and height, and the type of 16 bits: TIFF 6.0, section 2 and 3."""
 _SIMPLEJPEG_ERRORS = (ValueError, KeyError)
 """What simplejpeg raises; a KeyError where the header names a sampling of colours that it does not know."""
 _PNM_HEAD = 4096
@@ -62,7 +67,7 @@ def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
         data = bytes(data)
     size = image_size(data)
     if size is None:
-        raise BadImageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP or PNM image")
+        raise BadImageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP, TIFF or PNM image")
     limit = MAX_PIXELS if data[:4] == b"RIFF" else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
     if not 0 < size[0] * size[1] <= limit:
         raise BadImageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
@@ -78,6 +83,8 @@ def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
         image = None
     if image is None:
         raise BadImageError(f"its {len(data)} bytes are not an image that OpenCV decodes")
+    if not unchanged and image.dtype not in (np.uint8, np.uint16):
+        raise BadImageError(f"its samples are {image.dtype}; write 8 or 16 bits without a sign")
     return image
 
 
@@ -92,20 +99,27 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
         size = _webp_size(data)
     elif data[:2] == b"BM" and len(data) >= 26:
         size = tuple(abs(side) for side in struct.unpack_from("<ii", data, 18))  # rows from the top count negative
+    elif data[:4] in _TIFF_ORDERS:
+        size = _tiff_size(data)
     elif match := re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD]):
         size = int(match[1]), int(match[2])
     return None if size is None else (size[0], size[1])
 
 
 def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
+    bits, has_end = _jpeg_bits_and_end(data)
+    if bits != 8:
+        raise BadImageError(f"its JPEG has {bits} bits a sample; write 8, or 16 as PNG")
+    data = data if has_end else bytes(data) + _JPEG_END
+    strict = not has_end  # a warning then means that samples are missing
     try:
-        if unchanged and simplejpeg.decode_jpeg_header(data, strict=False)[2] != "Gray":
-            return simplejpeg.decode_jpeg(data, colorspace="BGR", strict=False)
-        return simplejpeg.decode_jpeg(data, colorspace="GRAY", strict=False)[:, :, 0]
+        if unchanged and simplejpeg.decode_jpeg_header(data, strict=strict)[2] != "Gray":
+            return simplejpeg.decode_jpeg(data, colorspace="BGR", strict=strict)
+        return simplejpeg.decode_jpeg(data, colorspace="GRAY", strict=strict)[:, :, 0]
     except _SIMPLEJPEG_ERRORS as error:
         reason = error
     try:  # four inks, which programs for print write inverted: their product is the colour
-        inks = simplejpeg.decode_jpeg(data, colorspace="CMYK", strict=False)
+        inks = simplejpeg.decode_jpeg(data, colorspace="CMYK", strict=strict)
     except _SIMPLEJPEG_ERRORS:
         raise BadImageError(f"its JPEG is damaged ({str(reason).rstrip('.')})") from None
     colours = cv2.multiply(inks[:, :, :3], cv2.merge([inks[:, :, 3]] * 3), scale=1 / 255)
@@ -197,18 +211,51 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    """By the first directory."""
+    order, sides = _TIFF_ORDERS[data[:4]], {}
+    if len(data) < 8:
+        return None
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    count = int.from_bytes(data[start : start + 2], "little" if order == "<" else "big")
+    for at in range(start + 2, min(start + 2 + 12 * count, len(data) - 11), 12):
+        tag, kind = struct.unpack_from(order + "HH", data, at)
+        (side,) = struct.unpack_from(order + ("H" if kind == _TIFF_SHORT else "I"), data, at + 8)
+        sides[tag] = max(side, sides.get(tag, 0))
+    return (sides[_TIFF_SIDES[0]], sides[_TIFF_SIDES[1]]) if sides.keys() >= set(_TIFF_SIDES) else None
+
+
+def _jpeg_segments(data: bytes | memoryview) -> Iterator[tuple[int, int]]:
+    """Marker and offset of each segment up to the first scan; ends before one that is not whole."""
     position, last = 2, len(data) - _JPEG_MARKER.size
     while position <= last:
-        begin, marker, length, height, width = _JPEG_MARKER.unpack_from(data, position)
+        begin, marker, length, _, _ = _JPEG_MARKER.unpack_from(data, position)
         if begin != 0xFF:
-            return None
+            return
         if marker == 0xFF:  # fill byte: ITU T.81, B.1.1.2
             position += 1
-        elif marker in _JPEG_FRAMES:
-            # Without an end marker behind this (thumbnails lie before it) the file is cut; OpenCV would grey the rest.
-            ends = data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > position
-            return (width, height) if ends else None
-        else:
-            position += 2 + length
+            continue
+        yield marker, position
+        if marker == _JPEG_SCAN:
+            return
+        position += 2 + length
+
+
+def _jpeg_bits_and_end(data: bytes | memoryview) -> tuple[int, bool]:
+    """Bits of a sample, and whether an end marker lies behind the frame's header (thumbnails lie before it)."""
+    at = next((at for marker, at in _jpeg_segments(data) if marker in _JPEG_FRAMES), len(data) - 5)
+    return data[at + 4], data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > at
+
+
+def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
+    """None too where it is cut: without an end marker the samples can be whole only if one scan has them all."""
+    size, components, can_lack_end = None, 0, False
+    for marker, at in _jpeg_segments(data):
+        if marker in _JPEG_FRAMES and size is None:
+            *_, height, width = _JPEG_MARKER.unpack_from(data, at)
+            size, components, can_lack_end = (width, height), data[at + 9 : at + 10], marker in _JPEG_SEQUENTIAL
+            if _jpeg_bits_and_end(data)[1]:
+                return size
+        elif marker == _JPEG_SCAN:
+            return size if can_lack_end and data[at + 4 : at + 5] == components else None
     return None

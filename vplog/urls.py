@@ -1,29 +1,35 @@
-"""URLs as they are stored and shown: without what may be a secret.
+"""URLs as they are stored and shown: scheme, host and path, without what may be a secret.
 
-Links that are signed for a while (AWS Signature, Google's, Azure SAS) and tokens of any server are in the query, and
-which of its keys are harmless nobody knows for all servers. So user, password, query and fragment are cut: what is left
-tells which file it is, and who needs to open it again is given the URL again.
+Links that are signed for a while (AWS Signature, Google's, Azure SAS, CloudFront) and tokens of any server are in the
+query, and which of its keys are harmless nobody knows for all servers. So user, password and everything behind the path
+are cut: what is left names the file, and who needs to open it again gives the URL again.
 """
 
 from __future__ import annotations
 
 import re
 
-_USER = r"""\b([a-z][a-z0-9+.-]*:/{1,3})(?:[^\s/?#"<>]*@|[^\s/?#"<>@:[]+:(?!\d*[/?#])[^\s"<>]*@)?"""
-"""Scheme; user and password, which may have any character but blanks. A URL taken for a path has one slash."""
-_QUERY = r"[?#]|;[\w.-]+="
-"""Where a query, a fragment or the parameters of a path (`;jsessionid=`) begin."""
+_SCHEME = r"[a-z][a-z0-9+.-]*:/{1,3}"
+"""A URL taken for a path has one slash."""
+_PASSWORD = r"[^\s/?#\"<>@:[]+:(?!\d*(?:[/?#\s]|$))"  # noqa: S105 - a pattern
+"""A user and the colon before a password: not a host and its port."""
+_END = r"[?#]|(?:&amp;|[;&,!]|%(?:25)*(?:3f|23|26|3b))[^\s/=?#;&]*?(?:=|%(?:25)*3d)"
+"""Where the path ends: at a query or fragment, or at `key=` behind a separator, percent-encoded ones included."""
 _URL = re.compile(
-    rf"""{_USER}((?:(?!{_QUERY})[^\s"<>])*)(?:(?:{_QUERY})(?:[^\s"<>]|["<>](?=[^\s.,:;<>)\]}}]))*)?""", re.IGNORECASE
+    rf"""\b({_SCHEME})(?:[^\s/?#"<>]*@|{_PASSWORD}[^\s"<>]*@|{_PASSWORD}[^"<>]*?@|[^/?#"<>]*@)?"""
+    rf"""((?:(?!{_END})[^\s"<>])*)(?:(?:{_END})(?:[^\s"<>]|["<>](?=[^\s.,:;<>)\]}}]))*)?""",
+    re.IGNORECASE,
 )
 """In a sentence, where a quotation mark ends it but for one within the query."""
 
 
 def shown(url: str) -> str:
     """One URL, whatever characters it has, without its secrets; a path as it is."""
-    if not re.match(r"[a-z][a-z0-9+.-]+:/", url, re.IGNORECASE):
+    found = re.match(r"[a-z][a-z0-9+.-]+:/{1,3}", url, re.IGNORECASE)
+    if not found:
         return url
-    return re.split(_QUERY, re.sub(_USER, r"\1", url, count=1, flags=re.IGNORECASE), maxsplit=1)[0]
+    place = re.sub(rf"^(?:[^/?#]*@|{_PASSWORD}.*@)", "", url[found.end() :], flags=re.DOTALL)
+    return found[0] + re.split(_END, place, maxsplit=1, flags=re.IGNORECASE)[0]
 
 
 def without_secrets(text: str) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from vplog.cores import allowed
@@ -132,78 +133,67 @@ def _write_log(path: Path, settings: DemoSettings, scene: Scene, threads: int) -
 
 
 def _message(name: str, **fields: Any) -> Any:
-    return _TYPES.types[name](**fields)
+    """A message of a type with these fields, nested ones as dicts; the others are 0 or empty."""
+    return _TYPES.types[name](**{
+        field: _value(kind, about, fields.get(field)) for field, (kind, about) in _TYPES.fielddefs[name][1]
+    })  # fmt: skip
 
 
-def _header(stamp_ns: int, frame: str) -> Any:
-    stamp = _message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    return _message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+def _value(kind: Nodetype, about: Any, value: Any) -> Any:
+    if kind == Nodetype.NAME:
+        return _message(about, **(value or {}))
+    if value is not None:
+        return value
+    if kind == Nodetype.BASE:
+        return "" if about[0] == "string" else 0
+    return np.zeros(about[1])  # an array of numbers
 
 
-def _vector(name: str, values: Floats) -> Any:
-    return _message(f"geometry_msgs/msg/{name}", **dict(zip("xyzw", values.tolist(), strict=False)))
+def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
+
+
+def _pose(world_from_frame: Floats, translation: str, rotation: str) -> dict[str, Any]:
+    point, turn = world_from_frame[:3, 3], quaternion(world_from_frame[:3, :3])
+    return {name: dict(zip("xyzw", v.tolist(), strict=False)) for name, v in ((translation, point), (rotation, turn))}
 
 
 def _mounting(camera: Camera) -> Iterator[tuple[str, int, Any]]:
-    transform = _message(
-        "geometry_msgs/msg/Transform",
-        translation=_vector("Vector3", camera.body_from_camera[:3, 3]),
-        rotation=_vector("Quaternion", quaternion(camera.body_from_camera[:3, :3])),
-    )
     stamped = _message(
         "geometry_msgs/msg/TransformStamped",
         header=_header(route.START_NS, BODY_FRAME),
         child_frame_id=CAMERA_FRAME,
-        transform=transform,
+        transform=_pose(camera.body_from_camera, "translation", "rotation"),
     )
-    yield TF_STATIC, route.START_NS, _message("tf2_msgs/msg/TFMessage", transforms=[stamped])
+    yield TF_STATIC, route.START_NS, _message(TYPES[TF_STATIC], transforms=[stamped])
 
 
 def _odometry(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
     """Poses with a constant covariance: what one second of driving adds, biases included; translation first."""
     poses = route.odometry(settings, np.random.default_rng([settings.seed, 6]))
     rate = settings.odometry_rate_hz
-    turn2 = settings.odometry_turn_noise_rad**2 * rate
-    step2 = settings.odometry_step_noise_m**2 * rate
+    turn2, step2 = settings.odometry_turn_noise_rad**2 * rate, settings.odometry_step_noise_m**2 * rate
     along2 = (settings.odometry_scale_error * settings.speed_m_s) ** 2
-    covariance = np.diag([
-        step2 + along2, step2, step2, turn2, turn2, turn2 + settings.odometry_yaw_bias_rad_s**2,
-    ]).ravel()  # fmt: skip
-    zero = _vector("Vector3", np.zeros(3))
-    twist = _message(
-        "geometry_msgs/msg/TwistWithCovariance",
-        twist=_message("geometry_msgs/msg/Twist", linear=zero, angular=zero),
-        covariance=np.zeros(36),
-    )
-    turns = quaternion(poses[:, :3, :3])
-    for stamp, pose, turn in zip(route.odometry_stamps(settings).tolist(), poses, turns, strict=True):
-        at = _message(
-            "geometry_msgs/msg/Pose", position=_vector("Point", pose[:3, 3]), orientation=_vector("Quaternion", turn)
-        )
-        message = _message(
-            "nav_msgs/msg/Odometry",
-            header=_header(stamp, "odom"),
-            child_frame_id=BODY_FRAME,
-            pose=_message("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=covariance),
-            twist=twist,
-        )
-        yield ODOMETRY, stamp, message
+    variances = step2 + along2, step2, step2, turn2, turn2, turn2 + settings.odometry_yaw_bias_rad_s**2
+    for stamp, pose in zip(route.odometry_stamps(settings).tolist(), poses, strict=True):
+        at = {"pose": _pose(pose, "position", "orientation"), "covariance": np.diag(variances).ravel()}
+        fields = {"header": _header(stamp, "odom"), "child_frame_id": BODY_FRAME, "pose": at}
+        yield ODOMETRY, stamp, _message(TYPES[ODOMETRY], **fields)
 
 
 def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
     stamp_ns = route.stamps(settings, settings.gps_rate_hz)
     fixes = route.gps(settings, stamp_ns, np.random.default_rng([settings.seed, 7]))
     variance = np.diag(np.array([1.0, 1.0, 4.0]) * settings.gps_sigma_m**2).ravel()
-    for stamp, (latitude, longitude, altitude) in zip(stamp_ns.tolist(), fixes.tolist(), strict=True):
+    for stamp, fix in zip(stamp_ns.tolist(), fixes.tolist(), strict=True):
+        fields = dict(zip(("latitude", "longitude", "altitude"), fix, strict=True))
         message = _message(
-            "sensor_msgs/msg/NavSatFix",
+            TYPES[GPS],
             header=_header(stamp, BODY_FRAME),
-            status=_message("sensor_msgs/msg/NavSatStatus", status=0, service=1),  # a fix, by GPS
-            latitude=latitude,
-            longitude=longitude,
-            altitude=altitude,
+            status={"status": 0, "service": 1},  # a fix, by GPS
             position_covariance=variance,
             position_covariance_type=2,  # COVARIANCE_TYPE_DIAGONAL_KNOWN
+            **fields,
         )
         yield GPS, stamp, message
 
@@ -249,8 +239,8 @@ def _compressed_depth(depth: Float32s) -> Bytes:
     return np.concatenate([header, png.ravel()])
 
 
-def _calibration(header: object, camera: Camera, right_m: float = 0.0) -> Any:
-    """Of the camera, or of its twin so far to the right: the fourth column of P says how far (CameraInfo)."""
+def _calibration(header: dict[str, Any], camera: Camera, right_m: float = 0.0) -> Any:
+    """The CameraInfo of the camera, or of its twin so far to the right: the fourth column of P holds the baseline."""
     assert camera.matrix is not None  # noqa: S101 - the demo's camera is calibrated
     return _message(
         _CALIBRATION_TYPE,
@@ -262,7 +252,4 @@ def _calibration(header: object, camera: Camera, right_m: float = 0.0) -> Any:
         k=camera.matrix.ravel(),
         r=np.eye(3).ravel(),
         p=np.hstack([camera.matrix, [[-camera.matrix[0, 0] * right_m], [0.0], [0.0]]]).ravel(),
-        binning_x=0,
-        binning_y=0,
-        roi=_message("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
     )

@@ -1,4 +1,4 @@
-"""A small renderer: textured quads through a pinhole camera with exact occlusion, filtered textures and sun light.
+"""A renderer of textured parallelograms: pinhole camera, z-buffer, anisotropic texture filter, sun light.
 
 Every quad's image is a homography of its texture, so a pixel costs one 3x3 product; the nearest quad of every pixel
 is found first (z-buffer), then each pixel is shaded once.
@@ -6,8 +6,7 @@ is found first (z-buffer), then each pixel is shaded once.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,8 +23,7 @@ MAX_SAMPLES = 6
 """Texture samples along the longer axis of a pixel's footprint: sharp to 80 degrees of slant, blurred beyond."""
 
 
-@dataclass(frozen=True)
-class Light:
+class Light(NamedTuple):
     """The light of a moment, and how the camera answers to it."""
 
     sun: tuple[float, float, float]
@@ -41,15 +39,10 @@ class Light:
 
     def towards(self, other: Light, share: float) -> Light:
         """The light `share` (0..1) of the way to another."""
-
-        def mix(a: float, b: float) -> float:
-            return (1 - share) * a + share * b
-
-        x, y, z = map(mix, self.sun, other.sun)
+        x, y, z = (1 - share) * np.array(self.sun) + share * np.array(other.sun)
         norm = float(np.sqrt(x * x + y * y + z * z))
-        _, *mine = astuple(self)
-        _, *theirs = astuple(other)
-        return Light((x / norm, y / norm, z / norm), *map(mix, mine, theirs))
+        rest = ((1 - share) * a + share * b for a, b in zip(self[1:], other[1:], strict=True))
+        return Light((x / norm, y / norm, z / norm), *rest)
 
 
 def render(
@@ -60,7 +53,7 @@ def render(
     No noise; the camera has no distortion. Threads may render at the same time.
     """
     assert camera.matrix is not None  # noqa: S101 - the demo's camera is calibrated
-    quads = world.quads if occluders is None else world.quads + occluders
+    quads = world.quads if occluders is None else world.quads.with_others(occluders)
     camera_from_world = inverse(world_from_camera)
     corner = transform(camera_from_world, quads.corner)
     right, down = (v @ camera_from_world[:3, :3].T for v in (quads.right, quads.down))
@@ -69,23 +62,19 @@ def render(
     image_from_quad = camera.matrix @ np.stack([right, down, corner], axis=-1)
     boxes = _boxes(camera, np.stack([corner, corner + right, corner + right + down, corner + down], axis=1))
     # The determinant vanishes where the camera is in the plane of the quad: there is nothing to see of it.
-    seen = (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1]) & (np.abs(np.linalg.det(image_from_quad)) > 1e-6)
-    image_from_quad, boxes = image_from_quad[seen], boxes[seen]
-    texture, mask = quads.texture[seen], quads.mask[seen]
-
-    normal = np.cross(quads.down[seen], quads.right[seen])
+    visible = (boxes[:, :2] < boxes[:, 2:]).all(axis=1) & (np.abs(np.linalg.det(image_from_quad)) > 1e-6)
+    normal = np.cross(quads.down, quads.right)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     lit = light.ambient + (1 - light.ambient) * np.clip(normal @ np.array(light.sun), 0, None)
 
     # Near quads first, so that most pixels behind them fail the depth test at once.
-    order = np.argsort(image_from_quad[:, 2].sum(axis=-1), kind="stable")
-    quad_from_image = np.linalg.inv(image_from_quad)[order]
-    pixels, levels = world.textures.pixels, world.textures.levels
-    owner = np.full((camera.height, camera.width), -1, np.int32)
-    nearness = np.zeros((camera.height, camera.width))
-    _find_nearest(quad_from_image, boxes[order], mask[order], pixels, levels, owner, nearness)
+    order = np.flatnonzero(visible)
+    order = order[np.argsort(image_from_quad[order, 2].sum(axis=-1), kind="stable")]
+    quad_from_image = np.linalg.inv(image_from_quad[order])
+    owner, nearness = _find_nearest(quad_from_image, boxes[order], camera.height, camera.width)
     up = world_from_camera[2, :3] @ np.linalg.inv(camera.matrix)  # z of a pixel's ray in the world
-    shade = _shade(quad_from_image, texture[order], lit[order], pixels, levels, owner, nearness, up)
+    pixels, levels = world.textures
+    shade = _shade(quad_from_image, quads.texture[order], lit[order], pixels, levels, owner, nearness, up)
 
     across = light.gain / 255 * (1 + light.gradient * np.linspace(-0.5, 0.5, camera.width, dtype=np.float32))
     image = 255 * np.clip(across * shade, 0, 1) ** np.float32(light.gamma)
@@ -95,27 +84,23 @@ def render(
 
 
 def _boxes(camera: Camera, corners: Floats) -> Int32s:
-    """Pixels that quads with these corners (Q, 4, 3) in the camera can touch: x0, y0, x1, y1 (Q, 4), ends excluded."""
-    following = np.roll(corners, -1, axis=1)
-    # Where an edge passes the near plane, the crossing bounds the visible part.
-    rise = following[..., 2] - corners[..., 2]
-    share = (NEAR_M - corners[..., 2]) / np.where(rise == 0, 1, rise)
-    crossing = corners + share[..., None] * (following - corners)
-    points = np.concatenate([corners, crossing], axis=1)
-    visible = np.concatenate([corners[..., 2] >= NEAR_M, (rise != 0) & (share > 0) & (share < 1)], axis=1)
-    z = np.where(visible, np.maximum(points[..., 2], NEAR_M), 1.0)
-    pixel = (points @ camera.matrix.T)[..., :2] / z[..., None]  # type: ignore[union-attr]
-    low = np.where(visible[..., None], pixel, np.inf).min(axis=1)
-    high = np.where(visible[..., None], pixel, -np.inf).max(axis=1)
-    size = np.array([camera.width, camera.height])
-    return np.concatenate([np.clip(np.ceil(low), 0, size), np.clip(np.floor(high) + 1, 0, size)], axis=1).astype(
-        np.int32
-    )
+    """Pixels that quads with these corners (Q, 4, 3) in the camera can touch: x0, y0, x1, y1 (Q, 4), ends excluded.
+
+    The whole image where a quad passes the near plane.
+    """
+    size, z = np.array([camera.width, camera.height]), corners[..., 2]
+    pixel = (corners @ camera.matrix.T)[..., :2] / np.maximum(z, NEAR_M)[..., None]  # type: ignore[union-attr]
+    ahead, whole = z.max(axis=1, keepdims=True) > NEAR_M, z.min(axis=1, keepdims=True) > NEAR_M
+    low = np.where(whole, np.ceil(pixel.min(axis=1)), 0)
+    high = np.where(whole, np.floor(pixel.max(axis=1)) + 1, size) * ahead
+    return np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)], axis=1).astype(np.int32)
 
 
 @njit(nogil=True, error_model="numpy")
-def _find_nearest(quad_from_image, boxes, mask, pixels, levels, owner, nearness):
-    """The nearest quad of every pixel in `owner` (H, W), and 1 / its depth in `nearness` (H, W)."""
+def _find_nearest(quad_from_image, boxes, rows, columns):
+    """The nearest quad of every pixel (H, W), -1 where there is none, and 1 / its depth (H, W)."""
+    owner = np.full((rows, columns), -1, np.int32)
+    nearness = np.zeros((rows, columns))
     for q in range(len(boxes)):
         h = quad_from_image[q]
         for y in range(boxes[q, 1], boxes[q, 3]):
@@ -125,14 +110,10 @@ def _find_nearest(quad_from_image, boxes, mask, pixels, levels, owner, nearness)
                 if w <= nearness[y, x] or w > 1 / NEAR_M:
                     continue
                 u, v = h[0, 0] * x + u0, h[1, 0] * x + v0
-                if u < 0 or v < 0 or u >= w or v >= w:
-                    continue
-                if mask[q] >= 0:
-                    start, width, height = levels[mask[q], 1]  # half size: an outline needs no more
-                    if pixels[start + int(v / w * height) * width + int(u / w * width)] < 128:
-                        continue
-                nearness[y, x] = w
-                owner[y, x] = q
+                if u >= 0 and v >= 0 and u < w and v < w:
+                    nearness[y, x] = w
+                    owner[y, x] = q
+    return owner, nearness
 
 
 @njit(nogil=True, error_model="numpy")
@@ -143,48 +124,36 @@ def _shade(quad_from_image, texture, lit, pixels, levels, owner, nearness, up):
     for y in range(rows):
         for x in range(columns):
             q = owner[y, x]
-            if q < 0:  # sky: brighter towards the horizon, and nothing to hold on to
+            if q < 0:  # sky: brighter towards the horizon, and without texture
                 image[y, x] = 235 - 60 * min(1.0, max(0.0, up[0] * x + up[1] * y + up[2]))
                 continue
-            a, b, c = quad_from_image[q, 0, 0], quad_from_image[q, 0, 1], quad_from_image[q, 0, 2]
-            d, e, f = quad_from_image[q, 1, 0], quad_from_image[q, 1, 1], quad_from_image[q, 1, 2]
-            g, h = quad_from_image[q, 2, 0], quad_from_image[q, 2, 1]
-            z = 1 / nearness[y, x]
-            u, v = (a * x + b * y + c) * z, (d * x + e * y + f) * z
+            h, z, full = quad_from_image[q], 1 / nearness[y, x], levels[texture[q], 0]
+            u, v = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) * z, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) * z
             # How far u and v move per pixel in x and in y: the pixel's footprint in the texture, a parallelogram.
-            ux, uy, vx, vy = (a - u * g) * z, (b - u * h) * z, (d - v * g) * z, (e - v * h) * z
-            t = texture[q]
-            width2, height2 = float(levels[t, 0, 1]) ** 2, float(levels[t, 0, 2]) ** 2
-            along_x, along_y = ux * ux * width2 + vx * vx * height2, uy * uy * width2 + vy * vy * height2
+            ux, vx = (h[0, 0] - u * h[2, 0]) * z, (h[1, 0] - v * h[2, 0]) * z
+            uy, vy = (h[0, 1] - u * h[2, 1]) * z, (h[1, 1] - v * h[2, 1]) * z
+            along_x, along_y = (ux * full[1]) ** 2 + (vx * full[2]) ** 2, (uy * full[1]) ** 2 + (vy * full[2]) ** 2
             # Several samples along its longer side, from the pyramid level that blurs as much as the shorter side.
-            if along_x > along_y:
-                long2, short2, du, dv = along_x, along_y, ux, vx
-            else:
-                long2, short2, du, dv = along_y, along_x, uy, vy
-            samples = int(min(MAX_SAMPLES, np.ceil(np.sqrt(max(long2, 1.0) / max(short2, 1.0)))))
-            each = 1.0 / samples
-            level = min(0.5 * np.log2(max(long2 * each * each, 1.0)), levels.shape[1] - 1.001)
-            low = int(level)
-            share = level - low
+            long2, short2 = max(along_x, along_y, 1.0), max(min(along_x, along_y), 1.0)
+            du, dv = (ux, vx) if along_x > along_y else (uy, vy)
+            samples = int(min(MAX_SAMPLES, np.ceil(np.sqrt(long2 / short2))))
+            level = int(min(0.5 * np.log2(max(long2 / samples**2, 1.0)) + 0.5, levels.shape[1] - 1))
             total = 0.0
-            for k in range(2):
-                start, w, n = levels[t, low + k, 0], levels[t, low + k, 1], levels[t, low + k, 2]
-                step_x, step_y = du * w * each, dv * n * each
-                px, py = (u - 0.5 * du) * w - 0.5 - 0.5 * step_x, (v - 0.5 * dv) * n - 0.5 - 0.5 * step_y
-                part = 0.0
-                for _ in range(samples):
-                    px, py = px + step_x, py + step_y
-                    left, top = min(max(px, 0.0), w - 1.0), min(max(py, 0.0), n - 1.0)
-                    x0, y0 = int(left), int(top)
-                    right = 1 if x0 < w - 1 else 0
-                    above = start + y0 * w + x0
-                    below = above + w if y0 < n - 1 else above
-                    fx = left - x0
-                    upper = pixels[above] + fx * (float(pixels[above + right]) - pixels[above])
-                    lower = pixels[below] + fx * (float(pixels[below + right]) - pixels[below])
-                    part += upper + (top - y0) * (lower - upper)
-                total += part * (share if k == 1 else 1 - share)
-                if share == 0:
-                    break
-            image[y, x] = total * each * lit[q]
+            for i in range(samples):
+                at = (i + 0.5) / samples - 0.5
+                total += _bilinear(pixels, levels[texture[q], level], u + at * du, v + at * dv)
+            image[y, x] = total / samples * lit[q]
     return image
+
+
+@njit(nogil=True, error_model="numpy", inline="always")
+def _bilinear(pixels, level, u, v):
+    """The value of one level of a picture at u, v (0..1)."""
+    start, w, h = level
+    x, y = min(max(u * w - 0.5, 0.0), w - 1.0), min(max(v * h - 0.5, 0.0), h - 1.0)
+    x0, y0 = int(x), int(y)
+    right, below = 1 if x0 < w - 1 else 0, w if y0 < h - 1 else 0
+    at, fx = start + y0 * w + x0, x - x0
+    upper = pixels[at] + fx * (float(pixels[at + right]) - pixels[at])
+    lower = pixels[at + below] + fx * (float(pixels[at + below + right]) - pixels[at + below])
+    return upper + (y - y0) * (lower - upper)

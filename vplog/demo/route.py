@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.geodesy import geodetic
 from vplog.geometry import between, exp, log, pose, so3_exp
 
 if TYPE_CHECKING:
@@ -26,10 +27,6 @@ ORIGIN_ALTITUDE_M = 520.0
 SHIFT_LENGTH_M = 10.0
 """Distance before the end of the first lap over which the car moves to its new track and the light changes."""
 
-# WGS84: semi-major axis in m and squared eccentricity (NIMA TR8350.2, table 3.1 and 3.3).
-_SEMI_MAJOR_M = 6_378_137.0
-_ECCENTRICITY2 = 6.694_379_990_14e-3
-
 
 def lap_length(settings: DemoSettings) -> float:
     """Metres of one round along the axis: a rectangle with rounded corners."""
@@ -40,28 +37,23 @@ def lap_length(settings: DemoSettings) -> float:
 def axis_point(settings: DemoSettings, distance_m: Floats) -> tuple[Floats, Floats]:
     """Point (T, 2) and heading (T,) in rad of the axis of the street at these distances."""
     r = settings.corner_radius_m
-    half = np.array([settings.block_length_m, settings.block_width_m]) / 2
-    long, short = 2 * (half - r)
-    turn = np.pi / 2 * r
-    # start point, heading and length of the pieces: half a side, then a turn and a side in alternation
-    lengths = np.array([long / 2, turn, short, turn, long, turn, short, turn, long / 2])
-    starts = np.array([
-        [0, -half[1]], [half[0] - r, -half[1]], [half[0], r - half[1]], [half[0], half[1] - r], [half[0] - r, half[1]],
-        [r - half[0], half[1]], [-half[0], half[1] - r], [-half[0], r - half[1]], [r - half[0], -half[1]],
-    ])  # fmt: skip
+    long, short = settings.block_length_m - 2 * r, settings.block_width_m - 2 * r
+    # Half a side, then a turn and a side in alternation; the plane as complex numbers.
+    lengths = np.insert([long / 2, short, long, short, long / 2], [1, 2, 3, 4], np.pi / 2 * r)
     headings = np.array([0, 0, 1, 1, 2, 2, 3, 3, 4]) * np.pi / 2
+    is_turn = np.arange(len(lengths)) % 2 == 1
+    moves = np.where(is_turn, r * (1 + 1j), lengths) * np.exp(1j * headings)
+    starts = np.cumsum(moves) - moves - 0.5j * settings.block_width_m
     ends = np.cumsum(lengths)
 
     lap = np.floor(distance_m / ends[-1])
     rest = distance_m - lap * ends[-1]
     piece = np.minimum(np.searchsorted(ends, rest, side="right"), len(ends) - 1)
     rest = rest - (ends - lengths)[piece]
-    angle = np.where(piece % 2 == 1, rest / r, 0.0)
-    ahead = np.where(piece % 2 == 1, r * np.sin(angle), rest)
-    left = np.where(piece % 2 == 1, r * (1 - np.cos(angle)), 0.0)
-    c, s = np.cos(headings[piece]), np.sin(headings[piece])
-    point = starts[piece] + np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
-    return point, headings[piece] + angle + 2 * np.pi * lap
+    angle = np.where(is_turn[piece], rest / r, 0.0)
+    ahead = np.where(is_turn[piece], -1j * r * (np.exp(1j * angle) - 1), rest)
+    point = starts[piece] + np.exp(1j * headings[piece]) * ahead
+    return np.stack([point.real, point.imag], axis=-1), headings[piece] + angle + 2 * np.pi * lap
 
 
 def second_lap_share(settings: DemoSettings, distance_m: Floats) -> Floats:
@@ -134,21 +126,7 @@ def odometry(settings: DemoSettings, rng: np.random.Generator) -> Floats:
 
 
 def gps(settings: DemoSettings, stamp_ns: Ints, rng: np.random.Generator) -> Floats:
-    """(G, 3) latitude and longitude in degrees, altitude in m, of the noisy position at these stamps.
-
-    East and north become degrees by the radii of curvature at the origin, which is exact to a millimetre over a block.
-    """
+    """(G, 3) latitude and longitude in degrees, altitude in m, of the noisy position at these stamps."""
     sigma = np.array([1.0, 1.0, 2.0]) * settings.gps_sigma_m
-    east, north, up = (world_from_body(settings, stamp_ns)[:, :3, 3] + rng.normal(size=(len(stamp_ns), 3)) * sigma).T
-    latitude = np.radians(ORIGIN_DEG[0])
-    w2 = 1 - _ECCENTRICITY2 * np.sin(latitude) ** 2
-    meridian_m = _SEMI_MAJOR_M * (1 - _ECCENTRICITY2) / w2**1.5 + ORIGIN_ALTITUDE_M
-    parallel_m = (_SEMI_MAJOR_M / np.sqrt(w2) + ORIGIN_ALTITUDE_M) * np.cos(latitude)
-    return np.stack(
-        [
-            ORIGIN_DEG[0] + np.degrees(north / meridian_m),
-            ORIGIN_DEG[1] + np.degrees(east / parallel_m),
-            ORIGIN_ALTITUDE_M + up,
-        ],
-        axis=-1,
-    )
+    enu_m = world_from_body(settings, stamp_ns)[:, :3, 3] + rng.normal(size=(len(stamp_ns), 3)) * sigma
+    return geodetic(enu_m, (*ORIGIN_DEG, ORIGIN_ALTITUDE_M))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""
-_SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM", b"P5", b"P6", b"P2", b"P3")
+_SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM", b"II*\0", b"MM\0*", b"P5", b"P6", b"P2", b"P3")
 _SINCE_1970_S = (631_152_000, 4_102_444_800)
 """1990 to 2100: whole numbers of s, ms, us or ns in it have 9 to 19 digits, and never fit two of the units.
 In ns since a start they come up after a week."""
@@ -46,7 +46,7 @@ _TRIED = 10
 
 
 def is_image(path: Path) -> bool:
-    """By the file's first bytes: JPEG, PNG, WebP, BMP, PNM."""
+    """By the first bytes: JPEG, PNG, WebP, BMP, TIFF, PNM."""
     with path.open("rb") as file:
         head = file.read(12)
     return head.startswith(_SIGNATURES) or (head[:4] == b"RIFF" and head[8:] == b"WEBP")

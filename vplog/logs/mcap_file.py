@@ -268,9 +268,10 @@ class McapFile:
 
 def _total(counts: Iterable[dict[int, int]]) -> dict[int, int]:
     """The sums of counts, zeros left out."""
-    total: Counter[int] = Counter()
+    total: dict[int, int] = {}
     for each in counts:
-        total.update(each)
+        for channel_id, count in each.items():
+            total[channel_id] = total.get(channel_id, 0) + count
     return {channel_id: count for channel_id, count in total.items() if count}
 
 

@@ -44,23 +44,25 @@ _FARTHEST_NS = 10 * 365 * 86_400 * 10**9
 """ns between two messages of a log above which bytes that look like a message are none: ten years."""
 _PRIVATE = 0x80
 """Opcodes from here on are an application's own and stepped over, as the specification asks."""
-_SHAPES: dict[int, tuple[int | str, ...]] = {
-    Opcode.HEADER: ("I", "I"),
+_U32, _U64 = -4, -8
+"""Bytes behind a length of 4 or 8 bytes, in _SHAPES."""
+_SHAPES: dict[int, tuple[int, ...]] = {
+    Opcode.HEADER: (_U32, _U32),
     Opcode.FOOTER: (20,),
-    Opcode.SCHEMA: (2, "I", "I", "I"),
-    Opcode.CHANNEL: (4, "I", "I", "I"),
-    Opcode.CHUNK: (28, "I", "Q"),
-    Opcode.MESSAGE_INDEX: (2, "I"),
-    Opcode.CHUNK_INDEX: (32, "I", 8, "I", 16),
-    Opcode.ATTACHMENT: (16, "I", "I", "Q", 4),
-    Opcode.ATTACHMENT_INDEX: (40, "I", "I"),
-    Opcode.STATISTICS: (42, "I"),
-    Opcode.METADATA: ("I", "I"),
-    Opcode.METADATA_INDEX: (16, "I"),
+    Opcode.SCHEMA: (2, _U32, _U32, _U32),
+    Opcode.CHANNEL: (4, _U32, _U32, _U32),
+    Opcode.CHUNK: (28, _U32, _U64),
+    Opcode.MESSAGE_INDEX: (2, _U32),
+    Opcode.CHUNK_INDEX: (32, _U32, 8, _U32, 16),
+    Opcode.ATTACHMENT: (16, _U32, _U32, _U64, 4),
+    Opcode.ATTACHMENT_INDEX: (40, _U32, _U32),
+    Opcode.STATISTICS: (42, _U32),
+    Opcode.METADATA: (_U32, _U32),
+    Opcode.METADATA_INDEX: (16, _U32),
     Opcode.SUMMARY_OFFSET: (17,),
     Opcode.DATA_END: (4,),
 }
-"""Fields of each kind of record but messages: bytes of numbers; I, Q for bytes behind a length of 4 or 8 bytes."""
+"""Fields of each kind of record but messages: bytes of numbers, or _U32, _U64."""
 _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
@@ -122,7 +124,7 @@ def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None
 
 class _Walk:
     def __init__(self, file: BinaryIO, length: int, define: Callable[[int, bytes], None]) -> None:
-        self._file, self._length, self._define = file, length, define
+        self._length, self._define = length, define
         self.layout = Layout()
         self._indexed: dict[int, tuple[Chunk, dict[int, int]]] = {}
         """By offset: chunks as the summary's index lists them, and where the message index of each channel lies."""
@@ -130,6 +132,7 @@ class _Walk:
         self._indexing: Chunk | None = None
         """The chunk whose message indexes come by."""
         self._search = Search(file, length)
+        self.at = self._search.at
         self._summary_start: int | None = None
         self._summary_sound: bool | None = None
         """By its checksum; None where it has none."""
@@ -192,12 +195,6 @@ class _Walk:
             counts[channel_id] = (stop - position - RECORD.size - 6) // _ENTRY
         return counts
 
-    def at(self, position: int, length: int) -> bytes:
-        if not 0 <= position < self._length:  # offsets come from the file
-            return b""
-        self._file.seek(position)
-        return self._file.read(length)
-
     def _bounds(self, position: int) -> tuple[int, int]:
         """Opcode of the record at `position` and where it stops, either as what it must have been where one of them is
         damaged; opcode 0, which the specification has as invalid, where there is none. A chunk may go on behind the end
@@ -224,14 +221,15 @@ class _Walk:
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
         """Bytes of a record whose fields begin at `start`, as the lengths among them say."""
+        if opcode not in _SHAPES:
+            return None
         position = start
-        for field_ in _SHAPES.get(opcode, ()):
-            if isinstance(field_, int):
-                position += field_
-                continue
-            width = struct.calcsize(f"<{field_}")
-            position += width + int.from_bytes(self.at(position, width), "little")
-        return position - start if opcode in _SHAPES else None
+        for step in _SHAPES[opcode]:
+            if step > 0:
+                position += step
+            else:
+                position += int.from_bytes(self.at(position, -step), "little") - step
+        return position - start
 
     def _is_record(self, position: int, behind: int = 0, longer: bool = False) -> bool:
         """Whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of the

@@ -45,6 +45,10 @@ _NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn
 """Names in the header of a chunk, and those that no chunk has."""
 
 
+_Head = tuple[dict[bytes, bytes] | None, int, int]
+"""Header of a record, None where it is damaged, and where its data start and stop."""
+
+
 @dataclass(slots=True)
 class Chunk:
     start: int
@@ -91,7 +95,7 @@ def read_layout(file: BinaryIO, length: int, connect: Callable[[dict[bytes, byte
 
 class _Walk:
     def __init__(self, file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None]) -> None:
-        self._file, self._length, self._connect = file, length, connect
+        self._length, self._connect = length, connect
         self.layout = Layout()
         self._infos: dict[int, Chunk] = {}
         """By offset of their record: chunks as the bag's index lists them."""
@@ -99,6 +103,8 @@ class _Walk:
         """The chunk whose index records come by."""
         self._index_at = self._chunk_count = 0
         self._search = Search(file, length)
+        self.at = self._search.at
+        self._last: tuple[int, _Head] = -1, (None, 0, 0)
 
     def records(self, position: int) -> None:
         while position < self._length or position == len(MAGIC):
@@ -179,14 +185,14 @@ class _Walk:
         if layout.cut_at is not None and self._index_at and layout.cut_at >= self._index_at and not layout.missing:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at
 
-    def at(self, position: int, length: int) -> bytes:
-        if not 0 <= position < self._length:  # offsets come from the file
-            return b""
-        self._file.seek(position)
-        return self._file.read(length)
-
-    def _head(self, position: int) -> tuple[dict[bytes, bytes] | None, int, int]:
+    def _head(self, position: int) -> _Head:
         """Header of the record at `position`, and where its data start and stop."""
+        if position == self._last[0]:  # just looked at from the record before
+            return self._last[1]
+        self._last = position, self._parsed(position)
+        return self._last[1]
+
+    def _parsed(self, position: int) -> _Head:
         head = self.at(position, 4)
         size = int.from_bytes(head, "little")
         if len(head) < 4 or size > _MAX_HEADER:

@@ -1,4 +1,4 @@
-"""Records found again behind damage: a bounded search for the next place in a file that can be one."""
+"""Bytes of a file for a parser that jumps from record to record, and a bounded search behind damage for the next."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 _BLOCK = 2**20
 """Bytes that are searched at once."""
+_WINDOW = 4096
+"""Bytes that are read at once: the head of a record, and those of the small ones behind it."""
 MOST_GAPS = 1000
 """Damaged places in one file behind which reading goes on; a file with more is read up to there."""
 _MOST_TRIED = 500_000
@@ -18,10 +20,24 @@ _MOST_TRIED = 500_000
 
 
 class Search:
-    """Looks for a pattern in one file; what it costs is bounded over the life of the object."""
+    """One file: its bytes, and a search for patterns whose cost is bounded over the life of the object."""
 
     def __init__(self, file: BinaryIO, length: int) -> None:
         self._file, self._length, self._left = file, length, _MOST_TRIED
+        self._window, self._start = b"", 0
+
+    def at(self, position: int, length: int) -> bytes:
+        """Bytes from `position` on, fewer at the end of the file; offsets that it names itself may lie outside it."""
+        if not 0 <= position < self._length:
+            return b""
+        begin = position - self._start
+        if begin >= 0 and begin + length <= len(self._window):
+            return self._window[begin : begin + length]
+        self._file.seek(position)
+        if length > _WINDOW:
+            return self._file.read(length)
+        self._window, self._start = self._file.read(_WINDOW), position
+        return self._window[:length]
 
     def first(self, pattern: re.Pattern[bytes], start: int, accept: Callable[[int], bool]) -> int | None:
         """The first offset from `start` on where the pattern matches and `accept(offset)` holds, else None.
