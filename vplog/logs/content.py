@@ -84,7 +84,7 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
     for block in container.blocks(chosen.channels, stamped):
         read.take_block(block)
     read.finish_poses()
-    read.find_steps_back(notes)
+    read.mend_steps_back(notes)
     sources = weigh_sources(read, chosen)
     rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
