@@ -19,7 +19,7 @@ from vplog.logs.stamps import Stamps
 from vplog.logs.transforms import are_usable, clean
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
+    from vplog.data import Floats
     from vplog.logs.messages import FixMessage, PoseMessage
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
@@ -27,10 +27,6 @@ _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
-_LONGER = 0.02
-"""A path by header stamps that is longer by this share than by log times is out of order: sorted rightly it is
-shorter, but for noise, whose share is within _SIGMAS of the root of the steps' squares."""
-_SIGMAS = 3.0
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -97,7 +93,7 @@ class PoseTrack:
             notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
         if self._others:
             notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {self.child} left out.")
-        stamp_ns, rows = self.order(notes)
+        stamp_ns, rows = self.stamps.order(self.topic, notes)
         if not len(rows):
             return None
         poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
@@ -121,19 +117,6 @@ class PoseTrack:
     def give_places(self) -> None:
         """Give the stamps the position of each pose."""
         self.stamps.places = np.array(self._poses).reshape(-1, 7)[:, :3]
-
-    def order(self, notes: Notes) -> tuple[Ints, Ints]:
-        """Stamps and rows; by the log times where the motion is continuous by them and not by the header stamps."""
-        position = np.frombuffer(self._poses).reshape(-1, 7)[:, :3]
-        _, by_header = self.stamps.order(self.topic, Notes())
-        if (np.diff(by_header) < 0).any():
-            _, by_log = self.stamps.by_log_times(self.topic, Notes(), "")
-            steps, log_steps = (np.linalg.norm(np.diff(position[rows], axis=0), axis=1) for rows in (by_header, by_log))
-            noise_m = _SIGMAS * float(np.linalg.norm(log_steps))
-            if steps.sum() - log_steps.sum() > max(_LONGER * log_steps.sum(), noise_m):
-                why = "has header stamps by which it moves back and forth"
-                return self.stamps.by_log_times(self.topic, notes, why)
-        return self.stamps.order(self.topic, notes)
 
 
 def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
