@@ -88,10 +88,8 @@ def test_nothing_is_interleaved(still: bool) -> None:
         track.give_places()
         mend_steps_back([camera, track.stamps, imu], notes := Notes())
         share_clock([camera, track.stamps])
-        for name, (_, rows) in {
-            "camera": camera.order("/camera", notes),
-            "odom": track.stamps.order("/odom", notes),
-        }.items():
+        for name, stamps in {"camera": camera, "odom": track.stamps}.items():
+            _, rows = stamps.order(f"/{name}", notes)
             true_ns = topics[name].true_ns
             late_ns = np.maximum.accumulate(true_ns[rows]) - true_ns[rows]
             assert late_ns.max() <= 3 * np.median(np.diff(np.sort(true_ns))) + 1e8, (seed, name, notes.lines)

@@ -2,8 +2,7 @@
 
 A header stamp says when something was measured, and aligns topics; but clocks are set while a drive runs, simulations
 start again at zero, and single stamps are damaged. The log time is late by the transport but steady, so it is the
-check: between two messages of a topic both should advance alike. A clock that is set back shows by itself: it passes
-the same time twice, so that messages lie twice as close there, which those that only come out of order do not.
+check: between two messages of a topic both should advance alike, and their difference, the skew, stays at one level.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ LEAST_STEP_NS = 128_000_000
 GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also GAP_PERIODS of the topic's own."""
 GAP_PERIODS = 10
-NO_ROWS: Ints = np.zeros(0, np.int64)
 _SHORT = 10
 """Small steps are believed where less than a tenth of the messages are in runs too short to show a clock."""
 _NEAR = 4

@@ -108,14 +108,14 @@ class Stamps:
         if not len(header_ns):
             return NONE, NONE
         if 2 * len(rows) < len(header_ns):
-            return self.by_log_times(topic, notes, "has no header stamps")
+            return self._by_log_times(topic, notes, "has no header stamps")
         _lose("no_stamp", topic, header_ns == 0, log_ns, notes)
         if why := _no_clock(header_ns[rows], log_ns[rows]):
-            return self.by_log_times(topic, notes, why)
+            return self._by_log_times(topic, notes, why)
         common_ns = self.common.skew_ns if self.common else None
         found = on_one_clock(header_ns[rows], log_ns[rows], common_ns)
         if found is None:
-            return self.by_log_times(topic, notes, "has header stamps that follow no clock")
+            return self._by_log_times(topic, notes, "has header stamps that follow no clock")
         if found.jumps_ns:
             steps = ", ".join(f"{jump / 1e9:+.3f} s" for jump in found.jumps_ns[:_NAMED])
             steps += f" and {len(found.jumps_ns) - _NAMED} times more" if len(found.jumps_ns) > _NAMED else ""
@@ -133,7 +133,7 @@ class Stamps:
         stamp_ns = _on_common(stamp_ns, found.skew_ns, self.common, topic, notes)
         return _in_order(topic, notes, stamp_ns, rows, log_ns)
 
-    def by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
+    def _by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
         """The same by the log times alone, whatever the header stamps are."""
         log_ns = np.array(self.log_ns, np.int64)
         notes.add(f"{topic} {why}; its log times are used instead.")
