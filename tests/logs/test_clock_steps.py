@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -240,6 +240,7 @@ def test_a_clock_is_set_back_by_more_than_had_passed(seed: int, size_s: float) -
     assert not [line for line in said if "set" in line]
 
 
+@settings(max_examples=10)
 @given(seeds, st.floats(0.3, 0.6))
 def test_small_steps_of_the_headers_are_mended(seed: int, size_s: float) -> None:
     """A step of less than a second, and a large one behind it."""
