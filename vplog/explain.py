@@ -14,8 +14,8 @@ from vplog.extract import extract_frames
 from vplog.record import reopened
 from vplog.results import run_record, tables
 from vplog.retell import recorded_pipeline, recorded_places
-from vplog.stages import BoxState
 from vplog.shared_view import find_agreement, find_boxes
+from vplog.stages import BoxState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Closures, Keyframes
     from vplog.pipeline import Pipeline
-    from vplog.stages import BoxState
-from vplog.shared_view import SharedBoxes
+    from vplog.shared_view import SharedBoxes
 
     Choose = Callable[[Closures, Keyframes], int]
 

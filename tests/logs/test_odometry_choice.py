@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from vplog import logs
 from vplog.info import preflight
 from vplog.logs import TopicChoice
+from vplog.logs.tracks import PoseTrack
 
 from .drives import START_NS, Written, matrices, write_ros2
 from .test_motion import image, pose_message, tf
@@ -234,3 +235,14 @@ def test_what_was_lost_of_a_source_that_is_not_taken_is_no_loss(tmp_path: Path) 
     assert source(log) == "/odom"
     assert not [line for line in log.warnings if "/pose" in line]
     assert not [line for line in log.warnings if "Lost" in line]
+
+
+def test_each_source_is_converted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    converted, finish = [], PoseTrack.finish
+    monkeypatch.setattr(
+        PoseTrack, "finish", lambda track, notes: (converted.append(track.topic), finish(track, notes))[1]
+    )
+    log = logs.open(drive(tmp_path, poses("/a", POSE, WALK), poses("/b", ODOMETRY, OTHER)))
+    assert log.odometry() is not None
+    assert sorted(converted) == ["/a", "/b"]
+    assert "carries no covariance" not in " ".join(log.warnings), "what is said of a source that is not taken"

@@ -116,6 +116,11 @@ class Notes:
         if line not in self._said:
             self._said.append(line)
 
+    def extend(self, other: Notes) -> None:
+        self.account.extend(other.account)
+        for line in other._said:
+            self.add(line)
+
     @property
     def lines(self) -> list[str]:
         """The losses first."""

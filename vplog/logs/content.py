@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.containers import plural
+from vplog.logs.containers import Notes, plural
 from vplog.logs.continuity import without_jumps
 from vplog.logs.gather import Calibrations, Gathered, Images
 from vplog.logs.moving import MovingFrames
-from vplog.logs.odometry_sources import choose_odometry, read_odometry, weigh_sources
+from vplog.logs.odometry_sources import choose_odometry, read_sources, weigh_sources
 from vplog.logs.stamps import nearest, share_clock
 from vplog.logs.tracks import FixTrack, PoseTrack
 from vplog.logs.transforms import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry, OdometrySource
-    from vplog.logs.containers import Channel, Container, Notes, Place
+    from vplog.logs.containers import Channel, Container, Place
     from vplog.logs.message_records import CalibrationMessage
     from vplog.logs.select import Selection
 
@@ -84,15 +84,16 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
     for block in container.blocks(chosen.channels, stamped):
         read.take_block(block)
     read.finish_poses()
-    read.find_steps_back(notes)
-    sources = weigh_sources(read, chosen)
+    read.mend_steps_back(notes)
+    share_clock(read.stamps())
+    found = read_sources(read, chosen)
+    sources = weigh_sources(found, read.images.finish(Notes())[0])
     rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
         if topic in {channel.topic for channel in chosen.channels}:
             notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
-    share_clock(read.stamps())
     tree = FrameTree([*(read.moving.still() if chosen.tf else ()), *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
@@ -104,13 +105,16 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         paired.append([None if pair < 0 else other_places[pair] for pair in pairs])
         if images.channel and (alone := sum(pair < 0 for pair in pairs)):
             notes.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame's time.")
-        found = np.flatnonzero(np.array(pairs, np.int64) >= 0)
-        late_ns = np.abs(other_ns[np.array(pairs, np.int64)[found]] - stamp_ns[found])
-        if name == "right" and len(found) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
+        both = np.flatnonzero(np.array(pairs, np.int64) >= 0)
+        late_ns = np.abs(other_ns[np.array(pairs, np.int64)[both]] - stamp_ns[both])
+        if name == "right" and len(both) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
             notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; motion spoils depth.")
-    odometry, frames = read_odometry(read, chosen.odometry, tree, notes)
-    if odometry is not None and chosen.odometry is not None:
-        odometry = without_jumps(odometry, chosen.odometry.topic, notes)
+    odometry, frames = None, []
+    if chosen.odometry is not None:
+        odometry, frames = found[chosen.odometry].odometry, found[chosen.odometry].frames
+        notes.extend(found[chosen.odometry].notes)
+        if odometry is not None and next(one.jumps for one, source in sources if source == chosen.odometry):
+            odometry = without_jumps(odometry, chosen.odometry.topic, notes)
     body = frames[-1] if frames else ""
     gps = read.fixes.finish(notes) if read.fixes else None
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:

@@ -21,7 +21,8 @@ from vplog.logs.message_records import (
 from vplog.logs.messages import decode, stamp_of
 from vplog.logs.moving import MovingFrames
 from vplog.logs.odometry_message import read_poses
-from vplog.logs.stamps import NONE, Stamps, find_steps_back
+from vplog.logs.recorder_clock import mend_steps_back
+from vplog.logs.stamps import NONE, Stamps
 
 if TYPE_CHECKING:
     from vplog.data import Ints
@@ -58,16 +59,16 @@ class Images:
     rows: list[int] = field(default_factory=list)
     """Which of `stream` the places are."""
 
-    def add(self, message: Message) -> None:
+    def add(self, message: Message, position: int) -> None:
         """Raises BadMessageError."""
         self.stream.append(message.place)
         if len(message.data) < _SMALL and _is_empty(message):
             raise _EmptyImageError
-        self.stamps.add(stamp_of(message.channel, message.data), message.log_ns)
+        self.stamps.add(stamp_of(message.channel, message.data), message.log_ns, position)
         self.places.append(message.place)
         self.rows.append(len(self.stream) - 1)
 
-    def add_block(self, block: Block, rows: list[int]) -> bool:
+    def add_block(self, block: Block, rows: list[int], position: int) -> bool:
         """Add these messages of a block, where each is one with an image and a stamp; else none."""
         view, stamps = memoryview(block.data), []
         try:
@@ -78,7 +79,7 @@ class Images:
                 stamps.append(stamp_of(block.channels[row], view[start:stop]))
         except BadMessageError:
             return False
-        self.stamps.extend(stamps, [block.log_ns[row] for row in rows])
+        self.stamps.extend(stamps, [block.log_ns[row] for row in rows], [position + row for row in rows])
         places = [block.places[row] for row in rows]
         self.rows.extend(range(len(self.stream), len(self.stream) + len(rows)))
         self.places.extend(places)
@@ -142,8 +143,10 @@ class Gathered:
     transforms: list[TransformMessage] = field(default_factory=list)
     lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
     """By reason and topic."""
-    waiting: dict[Channel, tuple[list[bytes], list[int]]] = field(default_factory=dict)
-    """Messages of odometry that are still to be added, and their log times."""
+    waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = field(default_factory=dict)
+    """Messages of odometry that are still to be added, their log times and their positions."""
+    messages: int = 0
+    """Read so far: the position of the next one in the order of the file."""
     others: dict[Channel, Stamps] = field(default_factory=dict)
     """Log times of the topics that are not followed over time."""
     tf: tuple[Channel, ...] = ()
@@ -157,27 +160,31 @@ class Gathered:
     def take_block(self, block: Block) -> None:
         """Add the messages of a block; those that drives are full of, all of a topic at once."""
         rows: dict[Channel, list[int]] = {}
-        view = memoryview(block.data)
+        view, first = memoryview(block.data), self.messages
+        self.messages += len(block.channels)
         for row, channel in enumerate(block.channels):
             rows.setdefault(channel, []).append(row)
         others: list[int] = []
         for channel, mine in rows.items():
-            if (images := self.by_channel.get(channel)) and images.add_block(block, mine):
+            if (images := self.by_channel.get(channel)) and images.add_block(block, mine, first):
                 self._sound(channel.topic)
             elif channel in self.poses:
-                data, log_ns = self.waiting.setdefault(channel, ([], []))
+                data, log_ns, positions = self.waiting.setdefault(channel, ([], [], []))
                 data += [bytes(block.data[block.starts[row] : block.stops[row]]) for row in mine]
                 log_ns += [block.log_ns[row] for row in mine]
+                positions += [first + row for row in mine]
                 if len(data) >= _TOGETHER:
                     self._add_poses(channel)
             else:
-                self.others.setdefault(channel, Stamps()).extend([0] * len(mine), [block.log_ns[row] for row in mine])
+                self.others.setdefault(channel, Stamps()).extend(
+                    [0] * len(mine), [block.log_ns[row] for row in mine], [first + row for row in mine]
+                )
                 known = self.calibrations_of(channel)
                 others += [
                     row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
                 ]
         for row in sorted(others):
-            self.take(block.message(row))
+            self.take(block.message(row), first + row)
 
     def finish_poses(self) -> None:
         """Add the messages of odometry that wait."""
@@ -186,20 +193,20 @@ class Gathered:
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
-        data, log_ns = self.waiting.pop(channel)
+        data, log_ns, positions = self.waiting.pop(channel)
         found = read_poses(channel, data)
         if found is not None:
-            self.poses[channel].add_all(found, log_ns)
+            self.poses[channel].add_all(found, log_ns, positions)
             self._sound(channel.topic)
         else:
-            for one, time_ns in zip(data, log_ns, strict=True):
-                self.take(Message(channel, time_ns, one, ()))
+            for one, time_ns, position in zip(data, log_ns, positions, strict=True):
+                self.take(Message(channel, time_ns, one, ()), position)
 
-    def take(self, message: Message) -> None:
+    def take(self, message: Message, position: int) -> None:
         """Add a message, or count it among the lost ones."""
         topic = message.channel.topic
         try:
-            self.add(message)
+            self.add(message, position)
         except BadMessageError as error:
             reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
             self.lost.setdefault((reason, topic), Runs()).lost(message.log_ns)
@@ -220,11 +227,11 @@ class Gathered:
         images = [one.stamps for one in (self.images, self.depths, self.rights) if one.channel]
         return images + [one.stamps for one in (*self.poses.values(), self.fixes) if one]
 
-    def find_steps_back(self, notes: Notes) -> None:
-        """Undo steps back of the recorder's clock, which all topics share, and find those of the headers'."""
+    def mend_steps_back(self, notes: Notes) -> None:
+        """Undo steps back of the recorder's clock, which all topics share."""
         for track in self.poses.values():
-            track.tell_apart()
-        find_steps_back([*self.stamps(), *self.others.values(), *self.moving.stamps()], notes)
+            track.give_places()
+        mend_steps_back([*self.stamps(), *self.others.values(), *self.moving.stamps()], notes)
 
     def skew_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
@@ -237,20 +244,20 @@ class Gathered:
         found = {channel: one.stamps for channel, one in (*self.by_channel.items(), *self.poses.items())}
         return {channel: stamps.rate_hz() for channel, stamps in (*found.items(), *self.others.items())}
 
-    def add(self, message: Message) -> None:
+    def add(self, message: Message, position: int) -> None:
         """Raises BadMessageError."""
         channel = message.channel
         if images := self.by_channel.get(channel):
-            images.add(message)
+            images.add(message, position)
             return
         match decode(channel, message.data):
             case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
                 known.add(replace(calibration, stamp_ns=calibration.stamp_ns or message.log_ns), message.data)
             case PoseMessage() as pose if channel in self.poses:
-                self.poses[channel].add(pose, message.log_ns)
+                self.poses[channel].add(pose, message.log_ns, position)
             case FixMessage() as fix if self.fixes:
-                self.fixes.add(fix, message.log_ns)
+                self.fixes.add(fix, message.log_ns, position)
             case list() as transforms if channel in self.tf:
-                self.moving.add(transforms, message.log_ns)
+                self.moving.add(transforms, message.log_ns, position)
             case list() as transforms:
                 self.transforms.extend(transforms)

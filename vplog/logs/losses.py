@@ -101,6 +101,14 @@ class Account:
         for topic, count in ({"": None} if counts is None else counts).items():
             self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)
 
+    def extend(self, other: Account) -> None:
+        """Add what another found."""
+        for (reason, topic), places in other._found.items():
+            for key, lost in places.items():
+                self.add(
+                    reason, {topic: lost.messages} if lost.messages is not None else None, key, lost.spans, lost.detail
+                )
+
     def undecodable(self, stamp_ns: Collection[int]) -> list[tuple[str, int]]:
         """Topic and stamp of the images of frames with these stamps that were found not to decode."""
         wanted = set(stamp_ns)

@@ -35,8 +35,8 @@ class _Link:
     """One edge of the frame tree over time."""
 
     first: TransformMessage
-    times_ns: list[tuple[int, int]] = field(default_factory=list)
-    """Stamp and log time of the first and the last sample before it moved."""
+    times_ns: list[tuple[int, int, int]] = field(default_factory=list)
+    """Stamp, log time and position in the file of the first and the last sample before it moved."""
     moves: bool = False
     travels: bool = False
     """Its position changes, not its rotation alone."""
@@ -44,7 +44,7 @@ class _Link:
     values: array[float] = field(default_factory=lambda: array("d"))
     """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
 
-    def keep(self, transform: TransformMessage, time_ns: tuple[int, int]) -> None:
+    def keep(self, transform: TransformMessage, time_ns: tuple[int, int, int]) -> None:
         if not self.moves:
             self.times_ns[1:] = [time_ns]  # the first stays
             return
@@ -53,7 +53,7 @@ class _Link:
         self.times_ns.clear()
         self._append(transform, time_ns)
 
-    def _append(self, transform: TransformMessage, time_ns: tuple[int, int]) -> None:
+    def _append(self, transform: TransformMessage, time_ns: tuple[int, int, int]) -> None:
         self.stamps.add(*time_ns)
         self.values.extend((*transform.position, *transform.quaternion))
 
@@ -66,7 +66,7 @@ class MovingFrames:
         """Keep every sample, for odometry; else only what tells whether a frame moves."""
         self._links: dict[Edge, _Link] = {}
 
-    def add(self, transforms: list[TransformMessage], log_ns: int) -> None:
+    def add(self, transforms: list[TransformMessage], log_ns: int, position: int) -> None:
         for transform in transforms:
             edge = clean(transform.parent), clean(transform.child)
             link = self._links.get(edge)
@@ -75,7 +75,7 @@ class MovingFrames:
             link.travels = link.travels or not np.array_equal(link.first.position, transform.position)
             link.moves = link.travels or link.moves or not np.array_equal(link.first.quaternion, transform.quaternion)
             if self._keep:
-                link.keep(transform, (transform.stamp_ns, log_ns))
+                link.keep(transform, (transform.stamp_ns, log_ns, position))
 
     def still(self) -> list[TransformMessage]:
         """Transforms that were the same whenever they were sent."""

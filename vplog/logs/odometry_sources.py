@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,7 @@ from vplog.data import OdometrySource
 from vplog.logs.containers import Notes, plural
 from vplog.logs.continuity import find_jumps
 from vplog.logs.message_records import short_type
-from vplog.logs.stamps import NONE, share_clock
+from vplog.logs.stamps import NONE
 from vplog.logs.transforms import FrameTree
 
 if TYPE_CHECKING:
@@ -81,28 +82,37 @@ def weigh(source: Channel, frames: list[str], odometry: Odometry, camera_ns: Int
     )  # fmt: skip
 
 
-def read_odometry(
-    read: Gathered, source: Channel | None, tree: FrameTree, notes: Notes
-) -> tuple[Odometry | None, list[str]]:
-    """The odometry that was gathered from one source, and its frames from the one that stands still to the body."""
-    track = read.poses.get(source) if source is not None else None
-    if track is not None:
-        return track.finish(notes), [track.parent, track.child]
-    return (None, []) if source is None else read.moving.odometry(tree, source.topic, notes)
+@dataclass(frozen=True, eq=False)
+class SourceOdometry:
+    """What one source gives as odometry."""
+
+    odometry: Odometry | None
+    frames: list[str]
+    """From the one that stands still to the body."""
+    notes: Notes
+    """On what was repaired or left out of it."""
 
 
-def weigh_sources(read: Gathered, chosen: Selection) -> list[tuple[OdometrySource, Channel]]:
+def read_sources(read: Gathered, chosen: Selection) -> dict[Channel, SourceOdometry]:
+    """The odometry that was gathered from each source."""
+    tree, found = FrameTree([*read.moving.still(), *read.transforms]), {}
+    for source in chosen.sources:
+        notes, track = Notes(), read.poses.get(source)
+        if track is not None:
+            found[source] = SourceOdometry(track.finish(notes), [track.parent, track.child], notes)
+        else:
+            found[source] = SourceOdometry(*read.moving.odometry(tree, source.topic, notes), notes)
+    return found
+
+
+def weigh_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list[tuple[OdometrySource, Channel]]:
     """Every source with a usable pose, the best first; of equal ones that with most poses, then by name."""
-    share_clock(read.stamps())
-    camera_ns, _, _ = read.images.finish(Notes())
-    tree = FrameTree([*read.moving.still(), *read.transforms])
-    found = [(source, *read_odometry(read, source, tree, Notes())) for source in chosen.sources]
-    ends = [odometry.stamp_ns[[0, -1]] for _, odometry, _ in found if odometry is not None]
+    ends = [one.odometry.stamp_ns[[0, -1]] for one in found.values() if one.odometry is not None]
     span_ns = np.array([min(end[0] for end in ends), max(end[1] for end in ends)]) if ends else NONE
     weighed = [
-        (weigh(source, frames, odometry, camera_ns, span_ns), source)
-        for source, odometry, frames in found
-        if odometry is not None
+        (weigh(source, one.frames, one.odometry, camera_ns, span_ns), source)
+        for source, one in found.items()
+        if one.odometry is not None
     ]
     return sorted(weighed, key=lambda one: (-one[0].score, -one[0].count, one[1]))
 

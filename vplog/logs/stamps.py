@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import LATE_NS, LEAST_JUMP_NS, Clock, header_steps_back, on_one_clock, steps_back
+from vplog.logs.clocks import GAP_NS, GAP_PERIODS, LATE_NS, LEAST_JUMP_NS, Clock, on_one_clock
 from vplog.logs.containers import Notes, plural
 from vplog.logs.losses import runs_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from vplog.data import Ints
+    from vplog.data import Floats, Ints
     from vplog.logs.clocks import Repaired
 
 NONE: Ints = np.zeros(0, np.int64)
@@ -25,13 +25,8 @@ _LAST_NS = 2**63 - 1
 _SECOND_NS = 10**9
 _COARSE_NS = 3 * 10**8
 """ns by which the delay of stamps in whole seconds varies at least where they are not taken on the second."""
-_MOST_STEPS = 20
-"""Steps back of the recorder's clock that are undone; it is set a few times in a drive."""
 _STANDING = 10
 """A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
-_GAP_NS = 10**9
-"""ns without a message that count as a gap, where it is also _GAP_PERIODS of the topic's own."""
-_GAP_PERIODS = 10
 _FASTEST_HZ = 1e6
 """Hz; stamps that are less than a microsecond apart are counters, not times."""
 _NAMED = 4
@@ -49,20 +44,22 @@ class Stamps:
     header_ns: array[int] = field(default_factory=_numbers)
     log_ns: array[int] = field(default_factory=_numbers)
 
-    content: array[float] = field(default_factory=lambda: array("d"))
-    """A number of each message's content, where that is known: it tells a message from one that was written twice."""
+    places: Floats | None = None
+    """(M, 3) positions that the messages say, where they do: they tell a message from one that was written twice."""
     common: Clock | None = None
     """The clock that all topics of the log are to be on, where that is known."""
-    step_ns: int | None = None
-    """The least step that a clock of the log was set back by; None where none was."""
+    _positions: array[int] = field(default_factory=_numbers)
     _found: tuple[int, Repaired | None] | None = None
     """The one clock of so many messages."""
 
-    def add(self, header_ns: int, log_ns: int) -> None:
+    def add(self, header_ns: int, log_ns: int, position: int | None = None) -> None:
+        self._positions.append(len(self.log_ns) if position is None else position)
         self.header_ns.append(header_ns)
         self.log_ns.append(min(log_ns, _LAST_NS))
 
-    def extend(self, header_ns: list[int], log_ns: list[int]) -> None:
+    def extend(self, header_ns: list[int], log_ns: list[int], positions: list[int] | None = None) -> None:
+        """Add messages by their stamps, log times and positions in the file; None is one behind the other."""
+        self._positions.extend(positions or range(len(self.log_ns), len(self.log_ns) + len(log_ns)))
         self.header_ns.extend(header_ns)
         self.log_ns.extend([min(time_ns, _LAST_NS) for time_ns in log_ns])
 
@@ -76,22 +73,14 @@ class Stamps:
         ordered_ns, _ = self.order("", Notes())
         return rate_hz(ordered_ns)
 
-    def header_steps(self) -> Ints:
-        """Sizes in ns of the steps back of the header's clock."""
-        header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
-        set_ = header_ns != 0
-        return header_steps_back(header_ns[set_], log_ns[set_])
+    def positions(self) -> Ints:
+        """(M,) where the messages lie among all of the file, in its order."""
+        return np.array(self._positions, np.int64)
 
-    def shift(self, last_ns: int, period_ns: int, size_ns: int) -> None:
-        """Shift the log times from where the recorder's clock was set back, behind `last_ns`, on by `size_ns`."""
+    def shift_log_times(self, by_ns: Ints) -> None:
+        """Add (M,) ns to the log times."""
         log_ns = np.array(self.log_ns, np.int64)
-        step = np.diff(log_ns)
-        near = 3 * max(period_ns, int(np.median(np.abs(step))) if len(step) else 0)
-        back = np.flatnonzero((step < 0) & (np.abs(log_ns[:-1] - last_ns) <= near))
-        row = int(back[np.argmin(step[back])]) + 1 if len(back) else int(np.argmax(log_ns > last_ns))
-        if len(back) or log_ns[row] > last_ns:
-            log_ns[row:] = np.minimum(log_ns[row:], _LAST_NS - size_ns) + size_ns
-            self.log_ns, self._found = array("q", log_ns.tolist()), None
+        self.log_ns, self._found = array("q", (np.minimum(log_ns, _LAST_NS - by_ns) + by_ns).tolist()), None
 
     def clocks(self) -> dict[int, int]:
         """Messages by the skew of the clock that they came on; several where it was set."""
@@ -103,7 +92,7 @@ class Stamps:
         if self._found is None or self._found[0] != len(self.log_ns):
             header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
             log_ns, header_ns = log_ns[header_ns != 0], header_ns[header_ns != 0]
-            found = on_one_clock(header_ns, log_ns, None, self.step_ns) if len(header_ns) else None
+            found = on_one_clock(header_ns, log_ns) if len(header_ns) else None
             self._found = len(self.log_ns), found
         return self._found[1]
 
@@ -119,14 +108,14 @@ class Stamps:
         if not len(header_ns):
             return NONE, NONE
         if 2 * len(rows) < len(header_ns):
-            return self.by_log_times(topic, notes, "has no header stamps")
+            return self._by_log_times(topic, notes, "has no header stamps")
         _lose("no_stamp", topic, header_ns == 0, log_ns, notes)
         if why := _no_clock(header_ns[rows], log_ns[rows]):
-            return self.by_log_times(topic, notes, why)
+            return self._by_log_times(topic, notes, why)
         common_ns = self.common.skew_ns if self.common else None
-        found = on_one_clock(header_ns[rows], log_ns[rows], common_ns, self.step_ns)
+        found = on_one_clock(header_ns[rows], log_ns[rows], common_ns)
         if found is None:
-            return self.by_log_times(topic, notes, "has header stamps that follow no clock")
+            return self._by_log_times(topic, notes, "has header stamps that follow no clock")
         if found.jumps_ns:
             steps = ", ".join(f"{jump / 1e9:+.3f} s" for jump in found.jumps_ns[:_NAMED])
             steps += f" and {len(found.jumps_ns) - _NAMED} times more" if len(found.jumps_ns) > _NAMED else ""
@@ -134,12 +123,17 @@ class Stamps:
         if found.log_jumps:
             times = plural(found.log_jumps, "place")
             notes.add(f"{topic}: the log times jump in {times}; the header stamps do not, and are used.")
+        for change in found.unclear_ns:
+            notes.add(
+                f"{topic}: behind a gap the log times are {change / 1e9:+.3f} s further from the header stamps. Was a "
+                "clock set, or does it take longer since? The stamps are left as they are."
+            )
         _lose("stray_stamp", topic, ~found.kept, log_ns[rows], notes)
         rows, stamp_ns = rows[found.kept], found.stamp_ns[found.kept]
         stamp_ns = _on_common(stamp_ns, found.skew_ns, self.common, topic, notes)
         return _in_order(topic, notes, stamp_ns, rows, log_ns)
 
-    def by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
+    def _by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
         """The same by the log times alone, whatever the header stamps are."""
         log_ns = np.array(self.log_ns, np.int64)
         notes.add(f"{topic} {why}; its log times are used instead.")
@@ -167,49 +161,12 @@ def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
     return ""
 
 
-def find_steps_back(topics: Iterable[Stamps], notes: Notes) -> None:
-    """Undo each step back of the recorder's clock in all topics: what was received behind it is shifted on. Tell all
-    topics the least step back of a clock of the headers, which `order` undoes."""
-    topics = [one for one in topics if len(one.log_ns)]
-    _mend_log_times(topics, notes)
-    steps = [int(size) for one in topics for size in one.header_steps()]
-    for one in topics:
-        one.step_ns, one._found = min(steps, default=None), None
-
-
-def _mend_log_times(topics: list[Stamps], notes: Notes) -> None:
-    for _ in range(_MOST_STEPS):
-        found = [step for one in topics if (step := _first_step(one)) is not None]
-        if not found:
-            return
-        earliest = min(found)
-        last_ns = max(before for before, _, behind, _ in found if behind <= earliest[0])
-        period_ns, size_ns = min((period, size) for _, period, behind, size in found if behind <= earliest[0])
-        for one in topics:
-            one.shift(last_ns, period_ns, size_ns)
-        notes.add(
-            f"The recorder's clock was set back by {size_ns / 1e9:.3f} s; the log times from there on are shifted by "
-            "as much."
-        )
-
-
-def _first_step(one: Stamps) -> tuple[int, int, int, int] | None:
-    """Log time before the first step back, the period, log time behind the step, and its size; None where is none."""
-    log_ns, header_ns = np.array(one.log_ns, np.int64), np.array(one.header_ns, np.int64)
-    content = np.array(one.content) if len(one.content) == len(log_ns) else None
-    rows, sizes = steps_back(log_ns, header_ns, content)
-    if not len(rows):
-        return None
-    row, size = int(rows[0]), int(sizes[0])
-    before, behind = int(log_ns[row - 1]), int(log_ns[row])
-    return before, size - (before - behind), behind, size
-
-
 def share_clock(topics: Iterable[Stamps]) -> None:
     """Tell all topics of a log the clock that most of their messages are on, by how far log times are from stamps."""
     topics = [one for one in topics if len(one.header_ns)]
     pooled: dict[int, int] = {}
-    for one in topics:
+    steady = [one for one in topics if len(one.clocks()) == 1]
+    for one in steady or topics:  # a clock that was set is moved to one that was not
         for skew, count in sorted(one.clocks().items()):
             known = next((other for other in pooled if abs(other - skew) <= LEAST_JUMP_NS), skew)
             pooled[known] = pooled.get(known, 0) + count
@@ -266,7 +223,7 @@ def _note_gaps(topic: str, stamp_ns: Ints, notes: Notes) -> None:
     steps = np.diff(stamp_ns)
     if not len(steps):
         return
-    gaps = np.flatnonzero(steps > max(_GAP_NS, _GAP_PERIODS * float(np.median(steps))))
+    gaps = np.flatnonzero(steps > max(GAP_NS, GAP_PERIODS * float(np.median(steps))))
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
         at_s = (stamp_ns[longest] - stamp_ns[0]) / 1e9

@@ -19,7 +19,7 @@ from vplog.logs.stamps import Stamps
 from vplog.logs.transforms import are_usable, clean
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
+    from vplog.data import Floats
     from vplog.logs.message_records import FixMessage, PoseMessage
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
@@ -27,10 +27,6 @@ _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
-_LONGER = 0.02
-"""A path by header stamps that is longer by this share than by log times is out of order: sorted rightly it is
-shorter, but for noise, whose share is within _SIGMAS of the root of the steps' squares."""
-_SIGMAS = 3.0
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
 
@@ -66,12 +62,13 @@ class PoseTrack:
         self.parent = ""
         """The frame that it moves in."""
 
-    def add(self, message: PoseMessage, log_ns: int) -> None:
-        stamp_ns, frame, child, position, quaternion, covariance = message
+    def add(self, message: PoseMessage, log_ns: int, position: int | None = None) -> None:
+        stamp_ns, frame, child, place, quaternion, covariance = message
         known = None if covariance is None else np.array(covariance, np.float64)[None]
-        self.add_all(Poses(np.array([stamp_ns]), frame, child, np.array([[*position, *quaternion]]), known), [log_ns])
+        poses = Poses(np.array([stamp_ns]), frame, child, np.array([[*place, *quaternion]]), known)
+        self.add_all(poses, [log_ns], None if position is None else [position])
 
-    def add_all(self, poses: Poses, log_ns: list[int]) -> None:
+    def add_all(self, poses: Poses, log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add several messages that name the same frames."""
         self.child = self.child or clean(poses.child)
         self.parent = self.parent or clean(poses.frame)
@@ -80,7 +77,9 @@ class PoseTrack:
             return
         usable = are_usable(poses.poses)
         self._dropped += int((~usable).sum())
-        self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable.tolist())))
+        every = usable.tolist()
+        at = None if positions is None else list(compress(positions, every))
+        self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, every)), at)
         self._poses.frombytes(poses.poses[usable].tobytes())
         if poses.covariances is None:
             self._covariances.frombytes(np.full((int(usable.sum()), 36), np.nan).tobytes())
@@ -94,7 +93,7 @@ class PoseTrack:
             notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
         if self._others:
             notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {self.child} left out.")
-        stamp_ns, rows = self._order(notes)
+        stamp_ns, rows = self.stamps.order(self.topic, notes)
         if not len(rows):
             return None
         poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
@@ -115,22 +114,9 @@ class PoseTrack:
         notes.add(f"{self.topic} {why}; the noise of its motion is a guess.")
         return Odometry(stamp_ns, poses, None)
 
-    def tell_apart(self) -> None:
-        """Give the stamps a number of each pose, by which a pose that was written twice shows."""
-        self.stamps.content = array("d", np.frombuffer(self._poses).reshape(-1, 7)[:, :3].sum(1).tolist())
-
-    def _order(self, notes: Notes) -> tuple[Ints, Ints]:
-        """Stamps and rows; by the log times where the motion is continuous by them and not by the header stamps."""
-        position = np.frombuffer(self._poses).reshape(-1, 7)[:, :3]
-        _, by_header = self.stamps.order(self.topic, Notes())
-        if (np.diff(by_header) < 0).any():
-            _, by_log = self.stamps.by_log_times(self.topic, Notes(), "")
-            steps, log_steps = (np.linalg.norm(np.diff(position[rows], axis=0), axis=1) for rows in (by_header, by_log))
-            noise_m = _SIGMAS * float(np.linalg.norm(log_steps))
-            if steps.sum() - log_steps.sum() > max(_LONGER * log_steps.sum(), noise_m):
-                why = "has header stamps by which it moves back and forth"
-                return self.stamps.by_log_times(self.topic, notes, why)
-        return self.stamps.order(self.topic, notes)
+    def give_places(self) -> None:
+        """Give the stamps the position of each pose."""
+        self.stamps.places = np.array(self._poses).reshape(-1, 7)[:, :3]
 
 
 def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
@@ -163,12 +149,12 @@ class FixTrack:
         self._dropped: Counter[str] = Counter()
         """Messages by why they are no fix."""
 
-    def add(self, message: FixMessage, log_ns: int) -> None:
+    def add(self, message: FixMessage, log_ns: int, position: int | None = None) -> None:
         if why := _no_position(message):
             self._dropped[why] += 1
             return
         self.frame = self.frame or message.frame
-        self.stamps.add(message.stamp_ns, log_ns)
+        self.stamps.add(message.stamp_ns, log_ns, position)
         self._fixes.append(message)
 
     def finish(self, notes: Notes) -> Gps | None:

@@ -1,0 +1,135 @@
+"""The recorder's clock set back on the way: found by the order of the file and undone in all topics.
+
+A recorder writes messages as it receives them, so its log times go back in the file only where its clock was set, or
+where parts of a recording were joined in another order or twice. A clock that was set back passes a time twice: the
+messages behind it fall between those before it. Parts in another order do not overlap, and a part that was written
+twice holds the same messages. Where a clock was set back into a gap nothing overlaps; there the motion decides, which
+leads on from one message to the next where they were received one behind the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.logs.clocks import GAP_NS, GAP_PERIODS, STEP_PERIODS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from vplog.data import Floats, Ints
+    from vplog.logs.containers import Notes
+    from vplog.logs.stamps import Stamps
+
+_TURNS = 3
+"""Turns from one side of a step to the other in the order of time that mere neighbours make: A B A B."""
+_OVERLAP = 2
+"""Turns beyond these, of all topics together, by which a time was passed twice; one message more makes two."""
+_MOST_STEPS = 20
+"""A clock is set a few times in a drive; times that go back more often are in no order."""
+_ONWARD = 3
+"""Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
+
+
+@dataclass(frozen=True)
+class _Drop:
+    """A place where the log times of one topic go back."""
+
+    before: int
+    """Position in the file of the topic's last message before it."""
+    behind: int
+    period_ns: int
+    back_ns: int
+    """By how much the log times go back: less than the clock was set back by, as time passed."""
+    elapsed_ns: int
+    """How much, by the header stamps or the period."""
+    overlap: int
+    """Turns from one side to the other beyond those of neighbours."""
+    onward: bool
+    """The motion leads on over it in the order of the file and not in that of time."""
+
+
+def mend_steps_back(topics: Iterable[Stamps], notes: Notes) -> None:
+    """Shift all log times behind each step back of the recorder's clock on by its size."""
+    topics = [one for one in topics if len(one.log_ns)]
+    drops = sorted((drop for one in topics for drop in _drops(one)), key=lambda drop: (drop.behind, drop.before))
+    steps: list[tuple[int, int]] = []
+    while drops:  # all topics go back at the same place: each group has its first message behind
+        position = drops[0].behind
+        group = [drop for drop in drops if drop.before < position]
+        drops = [drop for drop in drops if drop.before >= position]
+        if sum(drop.overlap for drop in group) >= _OVERLAP or any(drop.onward for drop in group):
+            fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns))
+            steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *(drop.back_ns for drop in group))))
+    if not 0 < len(steps) <= _MOST_STEPS:
+        return
+    positions, sizes = np.transpose(np.array(steps, np.int64))
+    total_ns = np.append(0, np.cumsum(sizes))
+    for one in topics:
+        one.shift_log_times(total_ns[np.searchsorted(positions, one.positions(), "right")])
+    for size_ns in sizes.tolist():
+        notes.add(
+            f"The recorder's clock was set back by {size_ns / 1e9:.3f} s; the log times from there on are shifted by "
+            "as much."
+        )
+
+
+def _drops(one: Stamps) -> list[_Drop]:
+    """Where the log times of a topic go back by more than messages come out of order by."""
+    log_ns, header_ns, positions = np.array(one.log_ns, np.int64), np.array(one.header_ns, np.int64), one.positions()
+    step = np.diff(log_ns)
+    back = step < 0
+    if not back.any() or not (step > 0).any():  # nearly always
+        return []
+    period = int(np.median(step[step > 0]))
+    rows = np.flatnonzero(-step > (STEP_PERIODS - 1) * period) + 1
+    if len(rows) > _MOST_STEPS:
+        return []
+    gaps = np.flatnonzero(step > max(GAP_NS, GAP_PERIODS * period)) + 1
+    bounds = np.unique([0, *rows.tolist(), *gaps.tolist(), len(log_ns)])
+    found = []
+    for row in rows.tolist():
+        at = int(np.searchsorted(bounds, row))
+        behind = np.arange(row, bounds[at + 1])
+        first_ns, last_ns = log_ns[behind].min(), log_ns[behind].max()
+        before = np.flatnonzero((log_ns[:row] >= first_ns) & (log_ns[:row] <= last_ns))
+        behind = behind[~_again(one, log_ns, header_ns, before, behind)]
+        elapsed = int(header_ns[row] - header_ns[row - 1])  # by a header's clock that went on
+        found.append(
+            _Drop(
+                int(positions[row - 1]), int(positions[row]), period,
+                -int(step[row - 1]), elapsed if elapsed > 0 else period,
+                max(_turns(log_ns[before], log_ns[behind]) - _TURNS, 0), _leads_on(log_ns, one.places, row),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _again(one: Stamps, log_ns: Ints, header_ns: Ints, before: Ints, behind: Ints) -> np.ndarray:
+    """Which messages behind a step are the same as one before it, by times and position: written twice."""
+    numbers = [log_ns, header_ns] if one.places is None else [log_ns, header_ns, *one.places.T.copy().view(np.int64)]
+    rows = np.concatenate([before, behind])
+    _, first, inverse = np.unique(
+        np.stack([each[rows] for each in numbers]), axis=1, return_index=True, return_inverse=True
+    )
+    return first[inverse.ravel()[len(before) :]] < len(before)
+
+
+def _turns(before_ns: Ints, behind_ns: Ints) -> int:
+    """How often the messages in order of time change from one side of a step to the other."""
+    side = np.repeat([False, True], [len(before_ns), len(behind_ns)])
+    return int((np.diff(side[np.argsort(np.concatenate([before_ns, behind_ns]), kind="stable")]) != 0).sum())
+
+
+def _leads_on(log_ns: Ints, places: Floats | None, row: int) -> bool:
+    """Whether the motion goes on from the row before, and would jump at this row in the order of time."""
+    if places is None:
+        return False
+    step_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    limit = _ONWARD * float(np.quantile(step_m, 0.9))
+    earlier = np.flatnonzero(log_ns < log_ns[row])
+    last = earlier[np.argmax(log_ns[earlier])] if len(earlier) else None
+    apart = last is None or float(np.linalg.norm(places[row] - places[last])) > limit
+    return bool(step_m[row - 1] <= limit) and apart
