@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from vplog import batch_inputs
 from vplog.batch_inputs import known_hashes
 from vplog.logs import TopicChoice
 from vplog.logs.mcap_file import MAGIC
+from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -112,15 +113,25 @@ def test_a_damaged_record_is_made_anew(logs: dict[str, Path], tmp_path: Path, re
     assert record.read_text() == whole
 
 
+def test_no_flipped_bit_of_the_record_gives_another_hash(
+    logs: dict[str, Path], tmp_path: Path, read: list[str]
+) -> None:
+    record, rng = tmp_path / ".inputs.json", np.random.default_rng(0)
+    first, whole = asked(logs, record), record.read_bytes()
+    for bit in rng.integers(8 * len(whole), size=100):
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << bit % 8
+        record.write_bytes(data)
+        assert asked(logs, record) == first
+
+
 def test_the_record_forgets_logs_that_are_gone(logs: dict[str, Path], tmp_path: Path, read: list[str]) -> None:
     record = tmp_path / ".inputs.json"
     asked(logs, record)
     logs.pop("one.mcap").unlink()
     (tmp_path / "three.mcap").write_bytes(log("three"))
     asked({"three": tmp_path / "three.mcap"}, record)
-    assert set(json.loads(record.read_text())) == {
-        str(tmp_path / name) for name in ("two.mcap", "folder", "three.mcap")
-    }
+    assert set(read_run_json(record)) == {str(tmp_path / name) for name in ("two.mcap", "folder", "three.mcap")}
     assert read[3:] == ["three.mcap"]
 
 
@@ -139,7 +150,7 @@ def test_a_log_of_the_record_that_cannot_be_asked_for_stops_nothing(
 
     monkeypatch.setattr(Path, "stat", refused)
     assert asked(logs, record)[1] == {}
-    assert len(json.loads(record.read_text())) == 3
+    assert len(read_run_json(record)) == 3
     assert (read[0], sorted(read[1:])) == ("one.mcap", ["folder", "two.mcap"])
 
 

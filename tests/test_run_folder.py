@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
     from vplog.demo.record import Drive
 
+    Verb = Callable[..., Said]
+
 
 def tree(out: Path) -> dict[str, bytes]:
     """All in a folder but what is kept for resuming."""
@@ -306,6 +308,25 @@ def test_an_interrupted_library_leaves_the_one_before(
         monkeypatch.undo()
     build_library([drive.log], out, load_pipeline("default", [*QUICK, "library.size=3"]))
     assert tree(out) != before
+
+
+def test_a_library_of_another_log_is_not_replaced_without_force(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+    """One of the same log is, with other settings too; a damaged one is of an unknown log."""
+    out, other = tmp_path / "library", tmp_path / f"other{drive.log.suffix}"
+    shutil.copyfile(drive.log, other)
+    arguments = ("library", "-o", out, *(part for one in QUICK for part in ("--set", one)))
+    assert verb(*arguments, drive.log).code == 0
+    assert verb(*arguments, drive.log, "--set", "library.size=3").code == 0
+    before = tree(out)
+    said = verb(*arguments, other)
+    assert "is another log or has changed. Choose another folder with -o" in said.error
+    assert tree(out) == before
+    assert verb(*arguments, other, "--force").code == 0
+    (out / "references.parquet").write_bytes(b"PAR1")
+    before = tree(out)
+    assert "its logs are not known" in verb(*arguments, other).error
+    assert tree(out) == before
+    assert verb(*arguments, other, "--force").code == 0
 
 
 def test_a_drive_may_be_called_library() -> None:

@@ -21,7 +21,7 @@ from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.inputs import bytes_of
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.maps.damage import damaged_files, left_out
+from vplog.maps.damage import left_out
 from vplog.maps.imports import ALONE
 from vplog.maps.join import join as join_drives
 from vplog.maps.join import load_places
@@ -214,9 +214,8 @@ def _failed(store: Store) -> dict[str, dict[str, Any]]:
 
 
 def _is_damaged(store: Store, drive: str) -> bool:
-    """Whether a file of a drive of a map in a folder is not as it was written; then it is left out until it is."""
-    wrong = damaged_files(store.run(drive)) if store.mirror is None else []
-    if wrong:
+    """Whether a file of a drive is not as it was written; then the drive is left out until it is computed."""
+    if wrong := store.damaged_files(drive):
         store.damaged[drive] = wrong[0]
     return bool(wrong)
 

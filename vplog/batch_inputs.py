@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
@@ -14,7 +13,7 @@ from vplog import logs as all_logs
 from vplog.errors import LogError, ResultError
 from vplog.inputs import bytes_of, changed_s, hash_inputs, look_of
 from vplog.remote import RemotePath
-from vplog.results.atomic import replacing
+from vplog.results.run_record import read_run_json, write_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -104,21 +103,19 @@ def known_hashes(
 def _read(record: Path) -> dict[str, dict[str, Any]]:
     """By log, its `look` and its `hashes`; nothing where there is no such file, or another thing."""
     try:
-        if record.stat().st_size > _MOST_BYTES:
-            return {}
-        known = json.loads(record.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        known = read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {}
+    except (OSError, ResultError):
         return {}
 
     def sound(about: Any) -> bool:
         parts = [about.get("look"), about.get("hashes")] if isinstance(about, dict) else [None]
         return all(isinstance(part, dict) and all(isinstance(text, str) for text in part.values()) for part in parts)
 
-    return {name: about for name, about in known.items() if sound(about)} if isinstance(known, dict) else {}
+    return {name: about for name, about in known.items() if sound(about)}
 
 
 def _write(record: Path, known: dict[str, dict[str, Any]]) -> None:
     """Of all logs that are still there."""
     there = {name: about for name, about in sorted(known.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
-    with suppress(ResultError), replacing(record) as stream:
-        stream.write(json.dumps(there, separators=(",", ":")).encode())
+    with suppress(ResultError):
+        write_run_json(record, there, checksum=True)

@@ -189,7 +189,7 @@ def library(arguments: argparse.Namespace) -> None:
     with Progress(arguments) as progress:
         state = build_library(
             arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress,
-            warnings.append,
+            warnings.append, force=arguments.force,
         )  # fmt: skip
     record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
     if arguments.json:
@@ -350,6 +350,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("library", library, topics, threads, settings)
     sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
     output(sub, "folder of the library")
+    _add_force(sub, "library")
     sub = add("run", run, topics, threads, settings)
     _add_run(sub)
     output(sub, "run folder")
@@ -378,8 +379,8 @@ def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 
 
-def _add_force(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--force", action="store_true", help="replace the run of another log in OUT")
+def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:
+    sub.add_argument("--force", action="store_true", help=f"replace the {what} of another log in OUT")
 
 
 def _add_run(sub: argparse.ArgumentParser) -> None:

@@ -23,7 +23,7 @@ from vplog.places.coverage import (
 )
 from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
-from vplog.places.stored import load_references, read_library_record
+from vplog.places.stored import load_references, read_library_record, read_sources
 from vplog.references import PAPER_SIZE, choose, evenly
 from vplog.results.staging import recover, staged
 from vplog.stage_codecs import images_codec, json_codec
@@ -150,16 +150,19 @@ def build_library(
     threads: int = 1,
     progress: Progress = lambda *_: None,
     warn: Callable[[str], object] = lambda _: None,
+    *,
+    force: bool = True,
 ) -> PlaceState:
     """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
 
-    `warn` gets what the logs warn of, once they are read. A library that `out` holds stays until the new one is whole.
+    `warn` gets what the logs warn of, once they are read. A library that `out` holds stays until the new one is whole;
+    without `force` one with references of other logs is not replaced.
     Raises VplogError where that cannot be.
     """
     references: list[Reference] = []
     opened = [logs.open(path, topics) for path in paths]
     by_coverage = pipeline.library.choose == "coverage"
-    with staged(out, lambda: _library_in(out)) as made:
+    with staged(out, lambda: _library_in(out, None if force else opened)) as made:
         wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
         for log, stamps in zip(opened, wanted, strict=True):
             for done, (stamp_ns, frame, features, _) in enumerate(
@@ -175,14 +178,30 @@ def build_library(
     return state
 
 
-def _library_in(out: Path) -> list[str]:
-    """The files of a library in a folder that a new one may replace. Raises SettingsError where it may not."""
+def _library_in(out: Path, opened: Sequence[Log] | None) -> list[str]:
+    """The files of a library in a folder that a new one may replace: one of these logs, or any. Raises SettingsError
+    where it may not."""
     if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "library.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a library. Choose another with -o.")
     check_regular(out, "library.json")
     if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
         raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")
+    if opened is not None and (out / "library.json").is_file():
+        _check_same_logs(out, opened)
     return ["library.json", "features.parquet", "references.parquet"]
+
+
+def _check_same_logs(out: Path, opened: Sequence[Log]) -> None:
+    """Raises SettingsError where a library has a reference that is a frame of none of these logs, by name and stamp."""
+    remedy = "Choose another folder with -o, or replace that library with --force."
+    try:
+        sources = read_sources(out)
+    except LibraryError as error:
+        raise SettingsError(f"{error} So its logs are not known. {remedy}") from None
+    others = sources - {(log.name, stamp) for log in opened for stamp in log.stamps().tolist()}
+    if others:
+        names, given = (", ".join(sorted(one)) for one in ({name for name, _ in others}, {log.name for log in opened}))
+        raise SettingsError(f"{out} is a library of {names}, and {given} is another log or has changed. {remedy}")
 
 
 def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:

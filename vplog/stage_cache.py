@@ -28,7 +28,7 @@ from vplog.cache_file import (
 from vplog.errors import ResultError
 from vplog.inputs import hash_inputs, look_of
 from vplog.results.atomic import replacing
-from vplog.results.run_record import canonical_json, write_run_json
+from vplog.results.run_record import canonical_json, read_run_json, write_run_json
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -107,16 +107,14 @@ def _known_inputs(cache: Path) -> dict[str, Any]:
     """inputs.json of a cache; empty where there is none, or another thing."""
     path = cache / INPUTS
     try:
-        if path.stat().st_size > _INPUTS_BYTES:
-            return {}
-        known = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        known = read_run_json(path) if path.stat().st_size <= _INPUTS_BYTES else {}
+    except (OSError, ResultError):
         return {}
 
     def texts(value: Any) -> bool:
         return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
 
-    sound = isinstance(known, dict) and texts(known.get("look")) and isinstance(known.get("token"), str)
+    sound = texts(known.get("look")) and isinstance(known.get("token"), str)
     return known if sound and (known.get("hashes") is None or texts(known["hashes"])) else {}
 
 
@@ -232,7 +230,7 @@ class StageCache:
 
     def _write_inputs(self, known: dict[str, Any]) -> None:
         try:
-            write_run_json(self.folder / INPUTS, known)
+            write_run_json(self.folder / INPUTS, known, checksum=True)
         except ResultError:  # it only spares work; the result's own files say that the disk is full
             self._full = True
 

@@ -17,6 +17,7 @@ import pytest
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import bucket_lock, objects, sending
 from vplog.maps import store as map_store
+from vplog.maps.damage import UnreachableError, without_damaged
 from vplog.maps.info import describe_map
 from vplog.remote import located
 
@@ -361,11 +362,60 @@ def test_what_is_no_map_is_one_line(root: Any, verb: Callable[..., Said]) -> Non
         {"files": {"run.json": {"bytes": "many", "sha256": ""}}}, {"replaces": "../runs"}, {"files": []},
     ):  # fmt: skip
         sending.put_json(manifest, {**sound, **change})
-        assert "not a manifest" in verb("map", "info", place).error
-    for about, why in (({"bytes": 3}, "longer than"), ({"sha256": "0" * 64}, "damaged")):
+        assert "not a manifest" in verb("map", "info", place, "--json").json["damaged"]["one"]
+    for about in ({"bytes": 3}, {"sha256": "0" * 64}):
         changed = {**files, "run.json": {**files["run.json"], **about}}
         sending.put_json(manifest, {**sound, "files": changed})
-        assert why in verb("map", "info", place).error
+        assert "does not have the length and sha256" in verb("map", "info", place, "--json").json["damaged"]["one"]
     sending.put_json(manifest, sound)
     objects.remove(place / "runs" / "drive=one" / sound["generation"])
-    assert "has lost files" in verb("map", "info", place).error
+    assert "has lost files" in verb("map", "info", place, "--json").json["damaged"]["one"]
+
+
+def _put_back(place: Any, data: bytes | None) -> None:
+    if data is None:
+        objects.remove(place)
+    else:
+        objects.put(place, data)
+
+
+@pytest.mark.parametrize("how", ["flip", "gone", "longer", "manifest", "no manifest"])
+def test_a_damaged_drive_is_left_out_and_published_again(
+    root: Any, verb: Callable[..., Said], tmp_path: Path, how: str
+) -> None:
+    """It is named, the others are answered with, and its objects stay until it is there again."""
+    root = root / how.replace(" ", "-")
+    make_map(root, {"one": 1, "two": 2})
+    run = root / "runs/drive=one"
+    file = run / json.loads(objects.get(run / "drive.json") or b"")["generation"] / "descriptors.parquet"
+    place = run / "drive.json" if "manifest" in how else file
+    data = objects.get(place) or b""
+    _put_back(place, {
+        "flip": data[:40] + bytes([data[40] ^ 4]) + data[41:], "gone": None, "longer": data + b"x",
+        "manifest": data[:-9], "no manifest": None,
+    }[how])  # fmt: skip
+    said = verb("map", "export", root, "-o", tmp_path / "places.parquet", "--json")
+    assert (said.code, said.json["drives"]) == (0, ["two"]), said.err
+    assert "one is damaged and left out" in said.json["warnings"][0]
+    assert json.loads(verb("map", "info", root, "--check", "--json").out)["damaged_files"]
+    said = verb("map", "merge", root, "-o", tmp_path / "merged", "--json")
+    assert [one["drive"] for one in said.json["drives"]] == ["two"], said.err
+    assert "one is damaged and left out" in said.json["warnings"][0]
+    with map_store.writing(root) as store:
+        assert "manifest" in how or store.damaged_files("one")
+        assert store.damaged_files("two") == []
+        put(store, "one", 3)
+    assert same_state(root) == {"one": {3}, "two": {2}}
+
+
+def test_a_store_that_cannot_be_reached_damages_no_drive(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_map(root, {"one": 1})
+
+    def refused(*_: Any) -> str:
+        raise OSError("connection reset")
+
+    monkeypatch.setattr(objects, "fetch", refused)
+    with map_store.reading(root) as store:
+        with pytest.raises(UnreachableError, match="connection reset"):
+            without_damaged(store, lambda: (store.rows("keyframes", "one") and store.earth("one")) or store.run("one"))
+        assert store.damaged == {}

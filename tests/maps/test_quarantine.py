@@ -108,6 +108,10 @@ def test_a_damaged_record_leaves_its_drive_out(root: Path, verb: Verb, tmp_path:
         said = verb("map", "info", here, "--json")
         assert [one["drive"] for one in said.json["drives"]] == ["ride", "sail"]
         assert list(said.json["damaged"]) == ["walk"]
+    path.unlink()
+    said = verb("map", "export", here, "-o", tmp_path / "places.parquet", "--json")
+    assert said.json["drives"] == ["ride", "sail"]
+    assert "walk is damaged and left out" in said.json["warnings"][0]
 
 
 def test_a_map_can_be_written_to_with_a_damaged_drive_in_it(root: Path, tmp_path: Path) -> None:

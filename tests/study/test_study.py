@@ -15,6 +15,7 @@ from vplog.evaluate.place_truth import TruthChoice
 from vplog.methods import read_method
 from vplog.pipeline import Pipeline
 from vplog.places.bobb import BobbSettings
+from vplog.study import study
 from vplog.study.ablations import DEPARTURES, Departure
 from vplog.study.study import EXPERIMENTS, short_names, truth_of_pair
 
@@ -168,6 +169,36 @@ def test_bytes_do_not_depend_on_threads_and_the_interrupted_goes_on(
     other = verb(*arguments, "-o", outs[1], "--only", "bits", "--library-size", 5).json
     assert list(other["experiments"]) == ["bits"]
     assert not (outs[1] / "pairs.png").exists()
+
+
+def test_an_interrupted_study_leaves_the_one_before_and_goes_on(
+    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it had finished is not done again, and nothing of it is in OUT before all is."""
+    out = tmp_path / "study"
+    arguments = ("study", *walks, "--truth", "index", "-o", out, *QUICK, "--methods", "thumbnail,gist")
+    assert verb(*arguments, "--only", "pairs", "--library-size", 4).code == 0
+
+    def state() -> dict[str, bytes]:
+        return {file.name: file.read_bytes() for file in out.iterdir() if file.is_file() and file.stem != "trials"}
+
+    before, done, do = state(), list[str](), study._do
+
+    def failing(name: str, *more: Any) -> dict[str, Any]:
+        if name == "conditions" and not done.count("failed"):
+            done.append("failed")
+            raise KeyboardInterrupt
+        done.append(name)
+        return do(name, *more)
+
+    monkeypatch.setattr(study, "_do", failing)
+    assert verb(*arguments, "--only", "pairs,conditions", "--library-size", 5).code == 130
+    assert state() == before
+    found = verb(*arguments, "--only", "pairs,conditions", "--library-size", 5, "--json").json
+    assert done == ["pairs", "failed", "conditions"]
+    assert list(found["experiments"]) == ["pairs", "conditions"]
+    figures = {file for one in found["experiments"].values() for file in one["figures"]}
+    assert {file.name for file in out.iterdir()} == figures | {"study.json", "trials.json"}
 
 
 def test_a_drive_and_its_own_past(verb: Verb, drive: Drive, tmp_path: Path) -> None:

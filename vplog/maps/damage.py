@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from vplog.errors import LibraryError, NewerError, ResultError
 from vplog.folders import is_below
-from vplog.maps.layout import AT_HAND, drive_record, sha256_of
+from vplog.maps.earth import earth_of_made
+from vplog.maps.layout import AT_HAND, FORMAT, drive_record, sha256_of
+from vplog.results import run_record
+from vplog.scratch import files_in
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from vplog.maps.store import Store
-
     T = TypeVar("T")
+
+
+class Quarantining(Protocol):
+    """A map; as text what its user calls it."""
+
+    @property
+    def damaged(self) -> dict[str, str]:
+        """Drives that are left out of answers, and why."""
+        ...
+
+
+class UnreachableError(ResultError):
+    """An object store refuses a request or cannot be reached: no drive is damaged."""
 
 
 class DamagedDriveError(ResultError):
@@ -31,13 +45,13 @@ def reading_drive(drive: str) -> Iterator[None]:
     """Raises DamagedDriveError where a file of the drive cannot be read."""
     try:
         yield
-    except (DamagedDriveError, NewerError):
+    except (DamagedDriveError, NewerError, UnreachableError):
         raise
     except (ResultError, LibraryError) as error:
         raise DamagedDriveError(str(error), drive) from None
 
 
-def without_damaged(store: Store, work: Callable[[], T]) -> T:
+def without_damaged(store: Quarantining, work: Callable[[], T]) -> T:
     """What `work` makes of a map; a drive that it finds damaged is left out, and it is done again without."""
     while True:
         try:
@@ -48,7 +62,7 @@ def without_damaged(store: Store, work: Callable[[], T]) -> T:
             store.damaged[error.drive] = str(error)
 
 
-def left_out(store: Store) -> list[str]:
+def left_out(store: Quarantining) -> list[str]:
     """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
     return [
         f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
@@ -76,12 +90,23 @@ def damaged_files(folder: Path) -> list[str]:
     return [line for line in lines if line]
 
 
-def hashes_of(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Length and sha256 of files of a folder, by name, as drive.json has them. Raises ResultError."""
+def complete_record(made: Path, hashed: bool) -> None:
+    """Note in drive.json of a finished run folder where the drive is on earth and, if `hashed`, length and sha256 of
+    each file. Raises ResultError."""
+    about = {**drive_record(made), "format": FORMAT}
+    about.pop("files", None)  # of the map that it comes from
+    if "earth" not in about:
+        about["earth"] = earth_of_made(made)
     try:
-        return {name: {"bytes": (folder / name).stat().st_size, "sha256": sha256_of(folder / name)} for name in names}
+        if hashed:
+            about["files"] = {
+                name: {"bytes": (made / name).stat().st_size, "sha256": sha256_of(made / name)}
+                for name in files_in(made)
+                if name != "drive.json"
+            }
     except OSError as error:
-        raise ResultError(f"Cannot read {error.filename or folder}: {error.strerror or error}.") from None
+        raise ResultError(f"Cannot read {error.filename or made}: {error.strerror or error}.") from None
+    run_record.write_run_json(made / "drive.json", about, checksum=True)
 
 
 def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:

@@ -48,8 +48,8 @@ def _damaged_files(store: Store) -> list[str]:
         lines = [line for folder in folders for line in damaged_files(folder)]
         names = (name for name in regular_files(store.root) if name.endswith(".parquet") and name[:5] != "runs/")
         return [*lines, *(line for name in names for line in _damaged_table(store.root / name))]
-    wrong = []
-    for drive in store.mirror.manifests:
+    wrong = list(store.mirror.damaged.values())
+    for drive in list(store.mirror.manifests):
         try:
             store.whole(drive)
         except ResultError as error:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
 from vplog.folders import check_regular, regular_files
+from vplog.maps.damage import complete_record
 from vplog.maps.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
 from vplog.results.atomic import replacing
 from vplog.scratch import made_folder, sync, sync_all
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from vplog.maps.store import Store
+    from vplog.maps.contents import Store
 
 _HERE, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
@@ -96,6 +97,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
     A reader finds the old folder or the new one: they change places in one step where the system can (Linux, on all
     its usual file systems), else there is neither for a moment.
     """
+    complete_record(made, hashed=True)
     run, replaced = store.run(drive), store.staging / f"replaced-{os.getpid()}"
     try:
         run.parent.mkdir(exist_ok=True)

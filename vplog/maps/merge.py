@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.maps import keys
 from vplog.maps import store as map_store
-from vplog.maps.damage import damaged_files, left_out
+from vplog.maps.damage import DamagedDriveError, damaged_files, left_out
 from vplog.maps.imports import ALONE, drives_of_file, library_of_file, take_places
 from vplog.maps.layout import folder_name
 from vplog.maps.pairs import KEPT
@@ -61,18 +61,11 @@ def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Se
                 _, drives = map_store.one_library(other)
                 _take_library(store, other, library)
                 for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
-                    if wrong := _damage(other, drive):
-                        other.damaged[drive] = wrong
-                        continue
-                    fate.append(_take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}"))
+                    taken = _take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}")
+                    fate += [] if taken is None else [taken]
                     progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
                 warnings += left_out(other)
         return {"map": str(store), "library": library, "drives": fate, "warnings": warnings}
-
-
-def _damage(store: Store, drive: str) -> str:
-    """What is wrong with the files of a drive; empty where nothing is. A store has the sha256 of what it gives out."""
-    return "" if store.mirror is not None else " ".join(damaged_files(store.run(drive))[:1])
 
 
 def _check_libraries(sources: Sequence[Path], target: Path) -> str:
@@ -158,13 +151,21 @@ class _There:
         return keys.free_name(drive, log, self._names)
 
 
-def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any]:
-    """One drive; what became of it. A whole one comes in place of its places alone."""
+def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any] | None:
+    """One drive; what became of it, None where it is damaged. A whole one comes in place of its places alone."""
     drive = record["drive"]
     told = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
     same, alone = there.same(record)
     if same is not None and (not alone or ALONE in record):
         return {**told, "as": same, "state": "there already"}
+    try:
+        whole = other.whole(drive)  # of a store, files that have their sha256
+        wrong = damaged_files(whole) if other.mirror is None else []
+    except DamagedDriveError as error:
+        wrong = [str(error)]
+    if wrong:
+        other.damaged[drive] = wrong[0]
+        return None
     taken, made = same or there.free_name(drive, record["log"]), store.staging / staged
 
     def copied(_: Path) -> None:

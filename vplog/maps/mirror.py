@@ -25,11 +25,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import unquote
 
-from vplog.errors import ResultError
+from vplog.errors import NewerError, ResultError
 from vplog.folders import is_below
 from vplog.maps import objects
-from vplog.maps.layout import ADD_AGAIN, HASH, folder_name, sound_record
+from vplog.maps.damage import DamagedDriveError, UnreachableError
+from vplog.maps.layout import ADD_AGAIN, HASH, TABLES, folder_name, sound_record
 from vplog.remote import reason
 
 if TYPE_CHECKING:
@@ -59,6 +61,8 @@ class Mirror:
         store cannot be read."""
         self.remote, self.local, self.lock, self.cache = remote, local, lock, cache
         self.manifests: dict[str, dict[str, Any]] = {}
+        self.damaged: dict[str, str] = {}
+        """Drives whose manifest is damaged or missing, and why."""
         self.rest_manifest: dict[str, Any] = {}
         self._fetched: set[str] = set()
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
@@ -68,12 +72,26 @@ class Mirror:
                     (local / name).write_bytes(data)
             folders = [name for name in objects.folders_in(remote / "runs") if name.startswith("drive=")]
             with ThreadPoolExecutor(_REQUESTS) as pool:
-                for found in pool.map(self.read_manifest, folders):
-                    if found is not None:
-                        self.lay(found)
+                list(pool.map(self._open, folders))
+
+    def _open(self, drive_folder: str) -> None:
+        """Read the manifest of a drive. One that is missing was there where a table has a copy: that comes after it."""
+        drive, place = unquote(drive_folder.removeprefix("drive=")), self.remote / "runs" / drive_folder
+        try:
+            found = self.read_manifest(drive_folder)
+        except NewerError:
+            raise
+        except ResultError as error:
+            self.damaged[drive] = str(error)
+        else:
+            if found is not None:
+                self.lay(found)
+            elif any(objects.files_below(self.remote / name / drive_folder) for name in TABLES):
+                self.damaged[drive] = f"{place}/drive.json is not there."
 
     def fetch(self, drive: str, names: Iterable[str]) -> None:
-        """Have these files of a drive in the local folder, all of one generation. Raises ResultError."""
+        """Have these files of a drive in the local folder, all of one generation. Raises DamagedDriveError where one is
+        gone or damaged, and ResultError."""
         with self._locks[drive]:
             for _ in range(3):
                 if drive not in self.manifests:
@@ -88,8 +106,23 @@ class Mirror:
     def _fetch(self, drive: str, names: Iterable[str]) -> None:
         manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
         for name in names:
-            self._bring(place / manifest["generation"] / name, self.run(drive) / name, manifest["files"].get(name))
+            path = place / manifest["generation"] / name
+            if why := self._bring(path, self.run(drive) / name, manifest["files"].get(name)):
+                raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
         self._fetched.add(drive)
+
+    def damaged_files(self, drive: str, names: Iterable[str]) -> list[str]:
+        """A line for each file of a drive that is gone, and for the first of `names` that is damaged: these are
+        fetched. Raises UnreachableError."""
+        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
+        with told(self.remote):
+            there = objects.files_below(place / manifest["generation"])
+        gone = [f"{place / manifest['generation'] / name} is not there." for name in manifest["files"].keys() - there]
+        try:
+            self.fetch(drive, names)
+        except DamagedDriveError as error:
+            return sorted({*gone, str(error)})
+        return sorted(gone)
 
     def forget(self, drive: str) -> None:
         """Free the disk of a drive's files; they are fetched anew where they are asked for again."""
@@ -104,12 +137,15 @@ class Mirror:
         place = self.remote / "runs" / folder_name(drive)
         with told(self.remote):
             found = self.read_manifest(place.name)
-        old = self.manifests.pop(drive)
+        old = self.manifests[drive]
+        if found is not None and found["generation"] == old["generation"]:
+            raise DamagedDriveError(
+                f"{place} has lost files that its drive.json names. Copy them back, or {ADD_AGAIN}", drive
+            )
+        del self.manifests[drive]
         shutil.rmtree(self.run(drive), ignore_errors=True)
         if found is None:
             raise ResultError(f"{drive} was removed from {self.remote} while it was read. Run again.")
-        if found["generation"] == old["generation"]:
-            raise ResultError(f"{place} has lost files that its drive.json names. Copy them back, or {ADD_AGAIN}")
         if drive in self._fetched:
             raise ResultError(f"{drive} was replaced in {self.remote} while it was read. Run again.")
         self.lay(found)
@@ -151,7 +187,11 @@ class Mirror:
             wanted = {name: about for name, about in files.items() if name in names or not names}
             try:
                 for name, about in wanted.items():
-                    self._bring(place / name, self.local / name, about)
+                    if why := self._bring(place / name, self.local / name, about):
+                        raise ResultError(
+                            f"{why}. Move {self.remote}/rest.json away, and join the drives again: vplog map join "
+                            f"{self.remote}"
+                        )
                 self.rest_manifest = manifest
                 return
             except FileNotFoundError:
@@ -164,25 +204,28 @@ class Mirror:
         known = {folder_name(drive) for drive in self.manifests}
         return all(part in known for part in PurePosixPath(name).parts if part.startswith("drive="))
 
-    def _bring(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> None:
-        """An object, if the manifest names it and it is not here yet. Raises FileNotFoundError where it is gone."""
+    def _bring(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
+        """Fetch an object, if the manifest names it and it is not here yet; what is wrong with it, if anything. Raises
+        FileNotFoundError where it is gone, and UnreachableError."""
         if about is None or target.exists():
-            return
+            return ""
         target.parent.mkdir(parents=True, exist_ok=True)
         if self.cache is not None and self.cache.take(about["sha256"], target):
-            return
+            return ""
         part = target.with_name(f".{target.name}.part")
         try:
             digest = objects.fetch(place, part, about["bytes"])
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise ResultError(f"Cannot read {place}: {reason(error)}.") from None
-        if digest != about["sha256"]:
-            raise ResultError(f"{place} is damaged: it does not have the sha256 that its manifest names. Run again.")
+            raise UnreachableError(f"Cannot read {place}: {reason(error)}. Try again later.") from None
+        if (digest, part.stat().st_size) != (about["sha256"], about["bytes"]):
+            part.unlink()
+            return f"{place} does not have the length and sha256 that its manifest names"
         part.replace(target)
         if self.cache is not None:
             self.cache.keep(digest, target)
+        return ""
 
     def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
         """As it is now; None where there is none. Raises OSError, and ResultError where it is damaged."""
@@ -208,6 +251,7 @@ class Mirror:
         folder.parent.mkdir(parents=True, exist_ok=True)
         made.rename(folder)
         self.manifests[manifest["drive"]] = manifest
+        self.damaged.pop(manifest["drive"], None)
         self._fetched.add(manifest["drive"])
 
     def digest(self, drive: str, name: str) -> str | None:
@@ -232,7 +276,7 @@ def told(remote: RemotePath) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ResultError(f"Cannot read or write {remote}: {reason(error)}.") from None
+        raise UnreachableError(f"Cannot read or write {remote}: {reason(error)}.") from None
 
 
 def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:

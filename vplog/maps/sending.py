@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vplog.errors import ResultError, SettingsError
+from vplog.errors import NewerError, ResultError, SettingsError
 from vplog.maps import objects
 from vplog.maps.layout import AT_HAND, TABLES, folder_name, sha256_of
 from vplog.maps.mirror import read_rest, told
@@ -50,12 +50,14 @@ def begin(mirror: Mirror) -> None:
             copied = all(f"{named}/{name}.parquet" in there[name] for name in TABLES)
             if not copied or any(name.startswith(f"{named}/{manifest['replaces']}/") for name in runs):
                 _after_manifest(mirror, drive, manifest)
+        damaged = {folder_name(drive) for drive in mirror.damaged}  # what their manifests name is not known
         for name in TABLES:
-            for left in _left_over(there[name], 1, {folder_name(drive) for drive in mirror.manifests}):
+            for left in _left_over(there[name], 1, damaged | {folder_name(drive) for drive in mirror.manifests}):
                 objects.remove(remote / name / left)
         named_runs = {f"{folder_name(drive)}/{one['generation']}" for drive, one in mirror.manifests.items()}
         for left in _left_over(runs, 2, named_runs):
-            objects.remove(remote / "runs" / left)
+            if left.split("/")[0] not in damaged:
+                objects.remove(remote / "runs" / left)
         manifest = read_rest(remote) or {}
         before = f"{manifest.get('replaces')}/"
         if known := [name.removeprefix(before) for name in rest if name.startswith(before)]:
@@ -86,7 +88,12 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
     rows = {f"{name}.parquet": {"rows": _rows(made / f"{name}.parquet")} for name in TABLES}
     with told(mirror.remote):
         sent = _send_all(files_in(made), made, place / generation)
-        old = mirror.read_manifest(place.name)
+        try:
+            old = mirror.read_manifest(place.name)
+        except NewerError:
+            raise
+        except ResultError:  # damaged
+            old = None
         manifest = {
             **run_record.read_run_json(made / "drive.json"),
             "generation": generation,

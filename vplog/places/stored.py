@@ -155,6 +155,15 @@ def read_library_record(folder: Path) -> dict[str, Any]:
     return record
 
 
+def read_sources(folder: Path) -> set[tuple[str, int]]:
+    """Log and stamp in ns of every reference of a saved library. Raises LibraryError."""
+    try:
+        table = _table(folder / "references.parquet", _REFERENCES)
+        return set(zip(table["drive"].to_pylist(), table["stamp_ns"].to_pylist(), strict=True))
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}.") from None
+
+
 def load_references(folder: Path, threads: int = 1) -> list[Reference]:
     """The references of a saved library, in their order. Raises LibraryError where the files do not fit together,
     ResultError where something in the folder is not its own file."""

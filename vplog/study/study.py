@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import itertools
 import re
+import shutil
 import tempfile
 import time
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from pathlib import Path
+from glob import escape
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,11 +22,12 @@ from vplog.compare import check_truth, same_drive
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import TruthChoice, open_truth
 from vplog.execution_value import logged_warnings
+from vplog.folders import check_regular
 from vplog.inputs import hash_inputs
 from vplog.methods import read_methods
 from vplog.references import PAPER_SIZE
 from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
-from vplog.scratch import made_folder
+from vplog.results.staging import staged
 from vplog.study.bench import Bench, all_pairs
 from vplog.study.charts import CHARTS
 from vplog.study.experiments import NUMBERS, Plan
@@ -32,7 +35,7 @@ from vplog.study.pictures import PICTURES
 from vplog.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from vplog.pipeline import Pipeline
     from vplog.walks import Progress
@@ -45,6 +48,8 @@ SEEDS = 3
 """Libraries drawn for each figure: enough to see where one draw was lucky."""
 EXPERIMENTS = (*NUMBERS, *PICTURES)
 """All of them, in the order they are done."""
+_WORK = ".study"
+"""Folder in OUT of the experiments that an interrupted study finished: the next one with the same inputs takes them."""
 _TWO_DRIVES = {
     "library": "which drive the library comes from",
     "conditions": "a change of condition between drives",
@@ -79,11 +84,10 @@ def study(
     recognisers = read_methods(methods, pipeline)
     _check_drives(drives, min_gap)
     warnings: list[str] = []
-    with ExitStack() as stack:
-        _begin(out, stack)
+    with staged(out, lambda: _figures_in(out)) as made, ExitStack() as stack:
         stack.enter_context(logged_warnings(warnings))
         opened = [logs.open(path, topics) for path in drives]
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=out)))
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=made)))
         names = short_names([log.name for log in opened])
         known = {}
         for query, other in all_pairs(len(drives)):
@@ -116,13 +120,24 @@ def study(
             "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
         }
         inputs = _hash({**account, "pipeline": pipeline.model_dump(mode="json"), "code": _code_hash(set())})
-        done = _kept(out, inputs)
+        work = out / _WORK
+        done, files = {}, dict[str, Path]()
+        for folder in (out, work):
+            for name, one in _finished(folder, inputs).items():
+                done[name] = one
+                files |= {file: folder / file for file in one["figures"]}
+        work.mkdir(exist_ok=True)
         for name in chosen:
             if name not in done:
-                done[name] = _do(name, bench, plan, out)
-                _write(out, account, inputs, done, [])
-        warned = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
-        return _write(out, account, inputs, done, list(dict.fromkeys(warned)))
+                done[name] = _do(name, bench, plan, work)
+                files |= {file: work / file for file in done[name]["figures"]}
+                _write(work, account, inputs, done, [])
+        for file, path in files.items():
+            shutil.copy2(path, made / file)
+        said = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
+        result = _write(made, account, inputs, done, list(dict.fromkeys(said)))
+    shutil.rmtree(out / _WORK, ignore_errors=True)
+    return result
 
 
 def _do(name: str, bench: Bench, plan: Plan, out: Path) -> dict[str, Any]:
@@ -146,26 +161,45 @@ def _write(
     return result
 
 
-def _kept(out: Path, inputs: str) -> dict[str, Any]:
-    """Experiments that study.json holds of the same inputs, with all their figures. Figures of others are removed."""
+def _finished(folder: Path, inputs: str) -> dict[str, Any]:
+    """Experiments that study.json of a folder holds of the same inputs, with all their figures there."""
+    found = _read(folder)
+    return {
+        name: one
+        for name, one in _experiments(found)
+        if found.get("inputs") == inputs and all((folder / file).is_file() for file in one["figures"])
+    }
+
+
+def _figures_in(out: Path) -> list[str]:
+    """Results of an earlier study in `out`, which a new one replaces. Raises SettingsError where it holds other
+    things."""
+    there = {file.name for file in out.iterdir() if not file.name.startswith(".")}
+    if there and not there & {"study.json", "trials.json"}:
+        raise SettingsError(f"{out} is a folder with other things in it, not a study. Choose another with -o.")
+    check_regular(out)
+    return [escape(file) for _, one in _experiments(_read(out)) for file in one["figures"]]
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """study.json of a folder; empty where it has none that is sound."""
     try:
-        found = read_run_json(out / "study.json")
+        return read_run_json(folder / "study.json")
     except ResultError:
         return {}
+
+
+def _experiments(found: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Those of a study.json whose figures are named as files of a study, by name."""
     earlier = found.get("experiments")
-    kept = {}
     for name, one in earlier.items() if isinstance(earlier, dict) else ():
-        files = one.get("figures") if isinstance(one, dict) else None
-        if name not in EXPERIMENTS or not isinstance(files, list):
-            continue
-        paths = [out / Path(str(file)).name for file in files]
-        if found.get("inputs") == inputs and all(path.is_file() for path in paths):
-            kept[name] = one
-            continue
-        for path in paths:
-            if path.suffix in (".png", ".svg"):
-                path.unlink(missing_ok=True)
-    return kept
+        figures = one.get("figures") if isinstance(one, dict) else None
+        if name in EXPERIMENTS and isinstance(figures, list) and all(map(_is_figure, figures)):
+            yield name, one
+
+
+def _is_figure(file: Any) -> bool:
+    return isinstance(file, str) and PurePath(file).name == file and file.endswith((".png", ".svg"))
 
 
 def _choose(only: Sequence[str] | None, drives: int) -> list[str]:
@@ -192,18 +226,11 @@ def _check_drives(drives: Sequence[Path], min_gap: int | None) -> None:
         raise SettingsError("--min-gap is for one drive, matched with its own past; leave it out, or give one drive.")
 
 
-def _begin(out: Path, stack: ExitStack) -> None:
-    if out.is_dir() and any(out.iterdir()) and not any((out / f"{n}.json").is_file() for n in ("study", "trials")):
-        raise SettingsError(f"{out} is a folder with other things in it, not a study. Choose another with -o.")
-    try:
-        stack.enter_context(made_folder(out))
-    except OSError as error:
-        raise SettingsError(f"Cannot make the folder {out}: {error.strerror}. Choose another with -o.") from None
-
-
 def _check_same_drives(out: Path, hashes: Sequence[str]) -> None:
     """Raises SettingsError where `out` holds the study of a drive that is not among these, by content."""
-    earlier = read_run_json(out / "study.json").get("drives") if (out / "study.json").is_file() else None
+    earlier = _read(out).get("drives")
+    if earlier is None and (out / "study.json").is_file():
+        raise SettingsError(f"{out}/study.json is damaged, so its drives are not known. Choose another folder with -o.")
     for drive in earlier if isinstance(earlier, list) else ():
         if isinstance(drive, dict) and drive.get("hash") not in hashes:
             raise SettingsError(f"{out} holds a study of {drive.get('log')}. Choose another folder with -o.")
