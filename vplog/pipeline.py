@@ -45,7 +45,7 @@ from vplog.run_folder import begun
 from vplog.settings import Settings, load_yaml, override
 from vplog.show import Seen, earth_of, finished_picture, reference_use
 from vplog.stage_cache import StageCache, inputs_of
-from vplog.stage_codecs import arrays_codec, descriptors_codec, images_codec
+from vplog.stage_codecs import columns_codec, descriptors_codec, images_codec
 from vplog.timing import Watch
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def run(
         )  # fmt: skip
         proposals = stages.stage(
             "propose", ["keyframes", "extract", "state", "describe"], [pipeline.propose, pipeline.sequence],
-            ["vplog.recognise", places], arrays_codec(Proposals),
+            ["vplog.recognise", places], columns_codec(Proposals),
             lambda: find_candidates(state, descriptors, keyframes, pipeline.propose, pipeline.sequence, threads),
             len(seen),
         )  # fmt: skip
