@@ -31,19 +31,19 @@ _NUMBERS = "iuf"
 
 @dataclass(frozen=True)
 class Codec(Generic[T]):
-    """Both ways."""
+    """How a value becomes bytes, and back."""
 
     to_bytes: Callable[[T], bytes]
     from_bytes: Callable[[bytes], T]
 
 
 def json_codec(make: Callable[[Any], T], plain: Callable[[T], Any]) -> Codec[T]:
-    """Of what `plain` makes a tree of plain values, and `make` makes of that again."""
+    """JSON of the plain values that `plain` gives, from which `make` builds the value again."""
     return Codec(lambda value: json.dumps(plain(value)).encode(), lambda data: make(json.loads(data)))
 
 
 def columns_codec(kind: type[T]) -> Codec[T]:
-    """Of a dataclass of columns of numbers."""
+    """An Arrow table of a dataclass of columns of numbers."""
 
     def from_bytes(data: bytes) -> T:
         table = _read(data)
@@ -59,7 +59,7 @@ def columns_codec(kind: type[T]) -> Codec[T]:
 
 
 def closures_codec() -> Codec[Closures]:
-    """Of a ledger."""
+    """An Arrow table of a ledger."""
     return Codec(
         lambda closures: _written(tables.exact_ledger(closures)),
         lambda data: tables.ledger_of(_read(data, tables.EXACT_LEDGER)),
@@ -67,7 +67,7 @@ def closures_codec() -> Codec[Closures]:
 
 
 def descriptors_codec(state: PlaceState, count: int) -> Codec[Sequence[Any]]:
-    """Of `count` place descriptors, as the recogniser stores them in a table."""
+    """An Arrow table of `count` place descriptors in the recogniser's type."""
 
     def from_bytes(data: bytes) -> Sequence[Any]:
         table = _read(data, pa.schema({"place": state.arrow_type}))
@@ -79,7 +79,7 @@ def descriptors_codec(state: PlaceState, count: int) -> Codec[Sequence[Any]]:
 
 
 def images_codec() -> Codec[list[tuple[int, Bytes]]]:
-    """Of grey images with a number each, as PNG: half the bytes, and they come back as they were."""
+    """An Arrow table of grey images with a number each, as PNG: lossless at half the bytes."""
     schema = pa.schema({"number": pa.int64(), "png": pa.binary()})
 
     def to_bytes(images: list[tuple[int, Bytes]]) -> bytes:
