@@ -28,7 +28,7 @@ from vplog.places.stored import load_references, save_references
 from vplog.results import geo, kept_features, placed, places_map, tables
 from vplog.results.shown import Earth
 from vplog.stage_cache import digest_of
-from vplog.stage_codecs import _pack, _unpack
+from vplog.stage_codecs import closures_codec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -197,13 +197,12 @@ def test_no_flip_in_a_part_of_an_index_is_silent(tmp_path: Path) -> None:
 
 def test_no_flip_in_the_stage_cache_is_silent(tmp_path: Path) -> None:
     """Of what a stage came to, and of its key, which is in the file."""
-    columns = {"a": np.arange(50.0), "b": np.arange(7)}
-    path, key = tmp_path / "stage", "ab" * 32
-    path.write_bytes(sealed(key, _pack(columns)))
+    path, key, codec = tmp_path / "stage", "ab" * 32, closures_codec()
+    path.write_bytes(sealed(key, codec.to_bytes(RUN.closures)))
 
     def read(path: Path) -> Any:
         try:
-            return _unpack(content_of(path.read_bytes(), key).tobytes())
+            return codec.from_bytes(content_of(path.read_bytes(), key).tobytes())
         except DamagedError as error:
             raise ResultError(f"{path}: {error}") from None
 

@@ -7,7 +7,6 @@ import json
 import os
 import random
 import shutil
-import struct
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -33,7 +32,7 @@ from vplog.pipeline import CacheOptions, Pipeline, load_pipeline, run
 from vplog.record import head
 from vplog.run_folder import begun
 from vplog.stage_cache import StageCache, digest_of, inputs_of
-from vplog.stage_codecs import arrays_codec, closures_codec, images_codec
+from vplog.stage_codecs import closures_codec, columns_codec, images_codec
 from vplog.steps import Steps
 
 from .logs import drives
@@ -375,7 +374,7 @@ def test_no_bytes_harm_the_reader_of_a_stage(
     whole: Path, log: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     """Of any stage, resealed after a change: a value or an error that the cache makes good, at the cost of its size."""
-    readers = {"verify": closures_codec(), "propose": arrays_codec(Proposals), "choose": images_codec()}
+    readers = {"verify": closures_codec(), "propose": columns_codec(Proposals), "choose": images_codec()}
     name = data.draw(st.sampled_from(sorted(readers)))
     [file] = (whole / ".cache").glob(f"{name}-*")
     content = bytearray(file.read_bytes()[CONTENT_AT:].partition(b"\n")[2])
@@ -383,7 +382,7 @@ def test_no_bytes_harm_the_reader_of_a_stage(
         content[data.draw(st.integers(0, min(len(content) - 1, 600)))] = data.draw(st.integers(0, 255))
     try:
         readers[name].from_bytes(bytes(content))
-    except (ValueError, TypeError, KeyError, struct.error, cv2.error, RecursionError, IndexError):
+    except (ValueError, TypeError, KeyError, cv2.error, ResultError):
         return
 
 

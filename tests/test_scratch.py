@@ -127,3 +127,13 @@ def test_content_is_on_the_disk_before_its_name_is(
     assert (tmp_path / "result").exists()
     assert events[-2:] == ["rename", "folder"]
     assert "file" in events[:-2]
+
+
+def test_what_a_process_leaves_that_is_killed_meanwhile_goes_with_the_block(tmp_path: Path) -> None:
+    with scratch("run", tmp_path) as own:
+        left = tmp_path / "run-1-left"
+        left.mkdir()
+        (left / ".lock").touch()
+        (left / "run.json").touch()
+    assert not own.exists()
+    assert not left.exists()

@@ -161,10 +161,10 @@ def run_batch(
                 _relocate(store, drive, known[drive]["log"], log)
             else:
                 wanted.append(about)
-        each = _threads_each(workers, jobs, len(wanted))
+        each, at_once = _shares(workers, jobs, len(wanted))
         progress("drives", len(done), len(paths))
         like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, join or keep_cache)
-        tasks = _tasks(store, wanted, like, urls, longest_first=(jobs or workers.at_once(each)) > 1)
+        tasks = _tasks(store, wanted, like, urls, longest_first=at_once > 1)
         places = None
         if join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
             places = aside.submit(load_places, like.library, pipeline, threads)
@@ -188,7 +188,7 @@ def run_batch(
         "map": str(root),
         "library": digest,
         "engine": engine,
-        "jobs": jobs or workers.at_once(each),
+        "jobs": at_once,
         "threads_per_job": each,
         "seconds": round(time.perf_counter() - began, 3),
         "failed": sum(one.state == "failed" for one in fate),
@@ -328,13 +328,17 @@ def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:
         return None, str(error)
 
 
-def _threads_each(workers: Engine, jobs: int | None, drives: int) -> int:
-    """Of each drive. On this machine all, which the system shares out: drives are not equally long, and the last has
-    the cores for itself. Else its share of the cores, as far as one machine has them; without `jobs` none waits."""
+def _shares(workers: Engine, jobs: int | None, drives: int) -> tuple[int, int]:
+    """Threads of each drive, and drives at once.
+
+    On this machine each has all threads, which the system shares out: drives are not equally long, and the last has the
+    cores for itself. Else its share of the cores, as far as one machine has them; without `jobs` none waits.
+    """
     if isinstance(workers, LocalEngine):
-        return workers.cores
-    at_once = min(jobs or max(workers.at_once(1), 1), max(drives, 1))
-    return min(max(workers.cores // at_once, 1), workers.widest)
+        return workers.cores, jobs or 1
+    wanted = min(jobs or max(workers.at_once(1), 1), max(drives, 1))
+    each = min(max(workers.cores // wanted, 1), workers.widest)
+    return each, jobs or workers.at_once(each)
 
 
 def _place(path: Path) -> str:

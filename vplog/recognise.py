@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.extract import map_in_order, one_thread_each
 from vplog.loops.propose import Proposals, candidate_stops, propose
 from vplog.places.sequence import rank_places
-from vplog.stage_codecs import arrays_codec, descriptors_codec
+from vplog.stage_codecs import columns_codec, descriptors_codec
 from vplog.stages import BoxState
 from vplog.steps import step
 
@@ -40,7 +40,7 @@ def describe(state: PlaceState, features: Extracted, *, execution: Execution) ->
     return result
 
 
-@step("propose", lambda *_: arrays_codec(Proposals), items=lambda state, descriptors, *_: len(descriptors))
+@step("propose", lambda *_: columns_codec(Proposals), items=lambda state, descriptors, *_: len(descriptors))
 def find_candidates(
     state: PlaceState,
     descriptors: Sequence[Any],

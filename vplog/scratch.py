@@ -43,7 +43,7 @@ def own_folder() -> Path:
 @contextmanager
 def scratch(name: str, among: Path | None = None) -> Iterator[Path]:
     """A new folder for the time of the block, among others in the one given, which is there, or in `own_folder`. Those
-    of processes that were killed are removed on the way. Raises ResultError."""
+    of processes that were killed are removed before and after. Raises ResultError."""
     among = among or own_folder()
     _sweep(among)
     try:
@@ -58,6 +58,7 @@ def scratch(name: str, among: Path | None = None) -> Iterator[Path]:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+            _sweep(among)  # a killed process may not have ended when the block began
 
 
 def _sweep(among: Path) -> None:

@@ -1,4 +1,4 @@
-"""How the results of stages become bytes for the stage cache, and back: arrays, descriptors, images, plain values.
+"""How the results of stages become bytes for the stage cache, and back: Arrow tables, and JSON for plain values.
 
 Reading checks what it reads, as of any file: what does not fit raises ValueError, and nothing larger than the bytes
 given is made.
@@ -6,148 +6,110 @@ given is made.
 
 from __future__ import annotations
 
-import io
 import json
-import math
-import struct
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import cv2
 import numpy as np
+import pyarrow as pa
 
-from vplog.data import Closures, Verdict
 from vplog.image_file import decode_image
+from vplog.results import tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vplog.data import Bytes
+    from vplog.data import Bytes, Closures
     from vplog.stages import PlaceState
 
 T = TypeVar("T")
 
-_LENGTH = struct.Struct("<I")
-_NUMBERS = "biuf"
-"""Kinds of numpy types that are read: truth values, whole and floating numbers."""
+_NUMBERS = "iuf"
+"""Kinds of numpy types that are read: whole and floating numbers."""
 
 
 @dataclass(frozen=True)
 class Codec(Generic[T]):
-    """Both ways."""
+    """How a value becomes bytes, and back."""
 
     to_bytes: Callable[[T], bytes]
     from_bytes: Callable[[bytes], T]
 
 
 def json_codec(make: Callable[[Any], T], plain: Callable[[T], Any]) -> Codec[T]:
-    """Of what `plain` makes a tree of plain values, and `make` makes of that again."""
+    """JSON of the plain values that `plain` gives, from which `make` builds the value again."""
     return Codec(lambda value: json.dumps(plain(value)).encode(), lambda data: make(json.loads(data)))
 
 
-def arrays_codec(kind: type[T]) -> Codec[T]:
-    """Of a dataclass of arrays."""
+def columns_codec(kind: type[T]) -> Codec[T]:
+    """An Arrow table of a dataclass of columns of numbers."""
+
+    def from_bytes(data: bytes) -> T:
+        table = _read(data)
+        columns = {name: np.array(table[name].to_numpy()) for name in table.column_names}
+        if any(table[name].null_count or columns[name].dtype.kind not in _NUMBERS for name in columns):
+            raise ValueError("a column does not hold numbers")
+        return kind(**columns)
+
     return Codec(
-        lambda value: _pack({field.name: getattr(value, field.name) for field in fields(kind)}),  # type: ignore[arg-type]
-        lambda data: kind(**_unpack(data)),
+        lambda value: _written(pa.table({field.name: getattr(value, field.name) for field in fields(kind)})),  # type: ignore[arg-type]
+        from_bytes,
     )
 
 
 def closures_codec() -> Codec[Closures]:
-    """Of a ledger: its lists are arrays of their values, one after the other, and of how many each row has."""
-    ragged = {"shared_references": np.uint16, "shared_overlap": np.float32}
-
-    def to_bytes(closures: Closures) -> bytes:
-        columns: dict[str, Any] = {field.name: getattr(closures, field.name) for field in fields(Closures)}
-        for name, kind in ragged.items():
-            rows = columns[name]
-            columns[f"{name} count"] = np.array([len(row) for row in rows], np.int32)
-            columns[name] = np.concatenate([*rows, np.empty(0, kind)]).astype(kind)
-        order = [verdict.value for verdict in Verdict]
-        columns["verdict"] = np.array([order.index(verdict) for verdict in closures.verdict], np.int32)
-        columns["scale"] = np.frombuffer("\n".join(closures.scale).encode(), np.uint8)
-        return _pack(columns)
-
-    def from_bytes(data: bytes) -> Closures:
-        columns: dict[str, Any] = _unpack(data)
-        for name in ragged:
-            ends = np.cumsum(columns.pop(f"{name} count"), dtype=np.int64)
-            columns[name] = np.split(columns[name], ends[:-1]) if len(ends) else []
-        verdicts = list(Verdict)
-        columns["verdict"] = [verdicts[number] for number in columns["verdict"].tolist()]
-        scale = columns["scale"].tobytes().decode()
-        columns["scale"] = scale.split("\n") if len(columns["query"]) else []
-        closures = Closures(**columns)
-        if any(len(getattr(closures, field.name)) != len(closures) for field in fields(Closures)):
-            raise ValueError("the columns of a ledger are not of one length")
-        return closures
-
-    return Codec(to_bytes, from_bytes)
+    """An Arrow table of a ledger."""
+    return Codec(
+        lambda closures: _written(tables.exact_ledger(closures)),
+        lambda data: tables.ledger_of(_read(data, tables.EXACT_LEDGER)),
+    )
 
 
 def descriptors_codec(state: PlaceState, count: int) -> Codec[Sequence[Any]]:
-    """Of `count` place descriptors, as the recogniser stores them in a table."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    def to_bytes(descriptors: Sequence[Any]) -> bytes:
-        sink = io.BytesIO()
-        pq.write_table(pa.table({"place": state.to_arrow(descriptors)}), sink, compression="none")
-        return sink.getvalue()
+    """An Arrow table of `count` place descriptors in the recogniser's type."""
 
     def from_bytes(data: bytes) -> Sequence[Any]:
-        file = pq.ParquetFile(io.BytesIO(data))
-        if file.metadata.num_rows != count or file.schema_arrow.field("place").type != state.arrow_type:
-            raise ValueError(f"it holds something else than {count} places of {state.arrow_type}")
-        return state.from_arrow(file.read()["place"].combine_chunks())
+        table = _read(data, pa.schema({"place": state.arrow_type}))
+        if len(table) != count:
+            raise ValueError(f"it holds {len(table)} places instead of {count}")
+        return state.from_arrow(table["place"].combine_chunks())
 
-    return Codec(to_bytes, from_bytes)
+    return Codec(lambda descriptors: _written(pa.table({"place": state.to_arrow(descriptors)})), from_bytes)
 
 
 def images_codec() -> Codec[list[tuple[int, Bytes]]]:
-    """Of grey images with a number each, as PNG: half the bytes, and they come back as they were."""
+    """An Arrow table of grey images with a number each, as PNG: lossless at half the bytes."""
+    schema = pa.schema({"number": pa.int64(), "png": pa.binary()})
 
     def to_bytes(images: list[tuple[int, Bytes]]) -> bytes:
-        pictures = [cv2.imencode(".png", image)[1].ravel() for _, image in images]
-        return _pack({
-            "number": np.array([number for number, _ in images], np.int64),
-            "bytes": np.array([len(picture) for picture in pictures], np.int64),
-            "png": np.concatenate([*pictures, np.empty(0, np.uint8)]).astype(np.uint8),
-        })  # fmt: skip
+        encoded = [cv2.imencode(".png", image)[1].tobytes() for _, image in images]
+        return _written(pa.table([[number for number, _ in images], encoded], schema=schema))
 
     def from_bytes(data: bytes) -> list[tuple[int, Bytes]]:
-        columns = _unpack(data)
-        ends = np.cumsum(columns["bytes"])
-        pictures = np.split(columns["png"], ends[:-1]) if len(ends) else []
-        images = [decode_image(picture.tobytes()) for picture in pictures]
+        numbers, encoded = (column.to_pylist() for column in _read(data, schema))
         return [
-            (number, np.asarray(image, np.uint8))
-            for number, image in zip(columns["number"].tolist(), images, strict=True)
+            (int(number), np.asarray(decode_image(png), np.uint8)) for number, png in zip(numbers, encoded, strict=True)
         ]
 
     return Codec(to_bytes, from_bytes)
 
 
-def _pack(columns: dict[str, Any]) -> bytes:
-    """Arrays one after the other, behind their names, types and shapes."""
-    arrays = {name: np.ascontiguousarray(array) for name, array in columns.items()}
-    head = json.dumps([[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]).encode()
-    return b"".join([_LENGTH.pack(len(head)), head, *(array.tobytes() for array in arrays.values())])
+def _written(table: pa.Table) -> bytes:
+    """A table as an Arrow IPC stream, which is read where it lies."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return sink.getvalue().to_pybytes()
 
 
-def _unpack(data: bytes) -> dict[str, np.ndarray]:
-    [length] = _LENGTH.unpack(data[: _LENGTH.size])
-    at = _LENGTH.size + length
-    arrays = {}
-    for name, kind, shape in json.loads(data[_LENGTH.size : at]):
-        dtype = np.dtype(str(kind))
-        if dtype.kind not in _NUMBERS or any(type(size) is not int or size < 0 for size in shape):
-            raise ValueError(f"column {name} is none of numbers")
-        count = math.prod(shape)
-        if count * dtype.itemsize > len(data) - at:
-            raise ValueError(f"column {name} is longer than the file")
-        arrays[str(name)] = np.frombuffer(data, dtype, count, at).reshape(shape).copy()
-        at += count * dtype.itemsize
-    if at != len(data):
-        raise ValueError("there is more than the columns named")
-    return arrays
+def _read(data: bytes, schema: pa.Schema | None = None) -> pa.Table:
+    """The table, checked, with the columns of the schema where one is given."""
+    try:
+        table = pa.ipc.open_stream(data).read_all()
+        table.validate(full=True)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(str(error)) from None
+    if schema is not None and not table.schema.equals(schema):
+        raise ValueError(f"it holds columns {table.schema.names} instead of {schema.names}, or other types")
+    return table

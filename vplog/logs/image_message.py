@@ -54,7 +54,7 @@ def locate_image(channel: Channel, data: Octets) -> Located | None:
 
 
 def stamp_of_image(channel: Channel, data: Octets) -> int | None:
-    """Its stamp in ns alone, or None as above. Raises BadMessageError likewise."""
+    """The stamp in ns of an image message, or None as above. Raises BadMessageError likewise."""
     read_head = _head_reader(channel)
     try:
         found = None if read_head is None else read_head(data)

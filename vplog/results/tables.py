@@ -73,6 +73,7 @@ def _pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Fie
 
 
 _MATRIX = pa.list_(pa.field("element", pa.float64(), nullable=False), 36)
+_POSE = pa.list_(pa.field("element", pa.float64(), nullable=False), 16)
 _NUMBERS = pa.list_(pa.field("element", pa.uint16(), nullable=False))
 _SHARES = pa.list_(pa.field("element", pa.float32(), nullable=False))
 _OPEN_SHARE = 1e-12
@@ -243,9 +244,33 @@ _SCALES = ("odometry", "depth", "stereo", "none")
 """Where the metres of a closure may come from."""
 
 
+EXACT_LEDGER = pa.schema(
+    [
+        *(CLOSURES.field(name) for name in (*_PLAIN_LEDGER, "shared_references", "shared_overlap", "scale")),
+        *(CLOSURES.field(name) for name in ("information", "verdict")),
+        _column("match_from_query", _POSE, "", "4x4, row by row; NaN where no pose was found."),
+    ]
+)
+"""Columns of a ledger as it is computed: closures.parquet rounds poses to quaternions."""
+
+
+def exact_ledger(closures: Closures) -> pa.Table:
+    """The ledger bit for bit."""
+    columns = {name: getattr(closures, name) for name in EXACT_LEDGER.names}
+    columns["verdict"] = [verdict.value for verdict in closures.verdict]
+    return pa.Table.from_arrays(_arrays(EXACT_LEDGER, columns), schema=EXACT_LEDGER)
+
+
+def ledger_of(table: pa.Table) -> Closures:
+    """The ledger of a table with the columns of EXACT_LEDGER. Raises ResultError, ValueError."""
+    poses = table["match_from_query"].combine_chunks().flatten().to_numpy().reshape(-1, 4, 4)
+    return _ledger_from(table, "A ledger", poses.copy())
+
+
 def read_closures(path: Path) -> Closures:
     """The ledger."""
-    return _ledger_from(_read(path, "closures", CLOSURES), path)
+    table = _read(path, "closures", CLOSURES)
+    return _ledger_from(table, path, _poses(table, ""))
 
 
 def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
@@ -255,10 +280,11 @@ def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
     rows: dict[tuple[str, str], list[int]] = {}
     for row, pair in enumerate(drives):
         rows.setdefault(pair, []).append(row)
-    return {pair: _ledger_from(table.take(pa.array(own)), path) for pair, own in rows.items()}
+    found = {pair: table.take(pa.array(own)) for pair, own in rows.items()}
+    return {pair: _ledger_from(own, path, _poses(own, "")) for pair, own in found.items()}
 
 
-def _ledger_from(table: pa.Table, path: Path) -> Closures:
+def _ledger_from(table: pa.Table, path: Path | str, match_from_query: Floats) -> Closures:
     try:
         verdict = [Verdict(text) for text in table["verdict"].to_pylist()]
     except ValueError as error:
@@ -273,7 +299,7 @@ def _ledger_from(table: pa.Table, path: Path) -> Closures:
         shared_references=references,
         shared_overlap=overlap,
         scale=scale,
-        match_from_query=_poses(table, ""),
+        match_from_query=match_from_query,
         information=_matrices(table, "information"),
         verdict=verdict,
         **{name: _values(table, name) for name in _PLAIN_LEDGER},
@@ -446,11 +472,11 @@ def _array(values: Any, column: pa.Field) -> pa.Array:
         offsets = np.cumsum([0, *map(len, values)], dtype=np.int32)
         flat = pa.array(np.concatenate([*values, np.empty(0)]), column.type.value_type)
         return pa.ListArray.from_arrays(offsets, flat, type=column.type)
-    if column.type != _MATRIX:
+    if column.type not in (_MATRIX, _POSE):
         return pa.array(values, column.type, mask=np.isnan(values) if column.nullable else None)
-    rows = np.ascontiguousarray(values, np.float64).reshape(-1, _MATRIX.list_size)
+    rows = np.ascontiguousarray(values, np.float64).reshape(-1, column.type.list_size)
     unknown = pa.array(np.isnan(rows).all(1)) if column.nullable else None
-    return pa.FixedSizeListArray.from_arrays(pa.array(rows.reshape(-1)), type=_MATRIX, mask=unknown)
+    return pa.FixedSizeListArray.from_arrays(pa.array(rows.reshape(-1)), type=column.type, mask=unknown)
 
 
 def _with_metadata(schema: pa.Schema, name: str, metadata: TableMetadata) -> pa.Schema:
