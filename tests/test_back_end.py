@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vplog.stages import Log
 
 NO_LOG = cast("Log", None)
-"""Only GPS and directions would ask it."""
+"""Only GPS would ask it."""
 
 
 def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:

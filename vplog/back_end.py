@@ -11,7 +11,6 @@ from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
 from vplog.graph.consistency import is_loop
 from vplog.graph.cross_check import cross_checked
-from vplog.graph.directions import Directions, with_directions
 from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
@@ -80,16 +79,6 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
         if kept := int((again.weight[is_loop(other)] > 0.5).sum()):
             graph, solution, source = other, again, "model"
             doubts = [*doubts, _CONTRADICTED.format(count=len(rows), kept=kept)]
-    if len(lines := without_metres(closures)):
-        directions = Directions(
-            closures.match[lines].astype(np.int64),
-            closures.query[lines].astype(np.int64),
-            closures.match_from_query[lines],
-            closures.information[lines],
-            log.camera().body_from_camera,
-        )
-        graph, solution = with_directions(graph, solution, directions, settings.solve)
-        rows = np.concatenate([rows, lines])
     fixes = fixes_on(log.gps(), odometry, keyframes, settings.gps) if settings.gps.use else None
     if fixes is not None:
         solution = keep_odometry_if_further(graph, solution, fixes)
@@ -107,12 +96,6 @@ def back_end(log: Log, odometry: Odometry, keyframes: Keyframes, closures: Closu
 def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
     """The robust solution, or the odometry where that cannot be believed."""
     return cross_checked(graph, gated(graph, settings.solve), settings.cross_check)
-
-
-def without_metres(closures: Closures) -> Ints:
-    """Ledger rows of which turn and direction are known, but no metres."""
-    known = np.isfinite(closures.information).all((1, 2))
-    return np.flatnonzero(known & np.array([verdict is not Verdict.ACCEPTED for verdict in closures.verdict], bool))
 
 
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
@@ -150,6 +133,4 @@ def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) ->
     for row in rows.tolist():
         if weight[row] < 0.5 and verdict[row] is Verdict.ACCEPTED:
             verdict[row] = Verdict.REJECTED_BY_SOLVER
-        elif weight[row] >= 0.5 and verdict[row] is not Verdict.ACCEPTED:
-            verdict[row] = Verdict.DIRECTION_ONLY
     return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)

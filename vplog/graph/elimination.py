@@ -71,7 +71,7 @@ class Elimination:
     @cached_property
     def subtrees(self) -> Subtrees:
         """What of it can be worked on side by side."""
-        return Subtrees.of(self)
+        return Subtrees.of(self.form)
 
 
 def _dissected(n: int, a: Ints, b: Ints) -> Ints:

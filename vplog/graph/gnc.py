@@ -27,7 +27,7 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
-from vplog.graph.descent import descend, is_large
+from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_kept
@@ -108,9 +108,7 @@ class GncSettings(Settings):
         part = chain.part
         one, two = part[graph.a[loops]], part[graph.b[loops]]
         across = one != two
-        consistency = PcmSettings(pair_probability=self.inlier_probability)
-        if is_large(chain.poses):
-            consistency = consistency.model_copy(update={"clique_steps": _BRANCHES})
+        consistency = PcmSettings(pair_probability=self.inlier_probability, clique_steps=_BRANCHES)
         good = ~across
         # closures between other pieces say nothing about each other, so each two pieces are judged by themselves
         pairs = np.minimum(one, two) * (int(part.max()) + 1) + np.maximum(one, two)
@@ -128,10 +126,7 @@ class GncSettings(Settings):
         judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
         if len(judged) == 0:
             return weight, poses, 0
-        first, steps, growth = self.max_iterations, self.steps, self.growth
-        if is_large(poses):
-            first, steps, growth = min(first, _FIRST_STEPS), 1, growth**_AT_ONCE
-        poses = descend(factors, weight, poses, first, 1e-3).world_from_body
+        poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         stage = 0
@@ -139,7 +134,7 @@ class GncSettings(Settings):
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
-            poses = descend(factors, weight, poses, steps, self.stage_tolerance).world_from_body
+            poses = descend(factors, weight, poses, self.steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
-            mu *= growth
+            mu *= self.growth
         return np.where(weight > 0.5, 1.0, 0.0), poses, stage

@@ -16,14 +16,13 @@ import numpy as np
 from vplog import geometry
 from vplog.graph.build import AXES, informed
 from vplog.graph.consistency import OdometryChain
+from vplog.graph.descent import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
 
 if TYPE_CHECKING:
-    import gtsam
-
     from vplog.data import Floats, Int32s, Ints, PoseGraph
-    from vplog.graph.cholesky import Cholesky
     from vplog.graph.factors import Factors
+    from vplog.graph.linear import BayesTree, Supernodes
 
 _ALONE = 1e-9
 """Least share of a closure's say that the rest has, so that no quotient is infinite."""
@@ -54,7 +53,7 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     graph = factors.graph
     axes = AXES[graph.dimension]
     error, turned = _errors(graph, poses, loops)
-    covariance = turned @ edge_covariances(factors, weight, poses, loops) @ np.swapaxes(turned, 1, 2)
+    covariance = turned @ edge_covariances(Objective(factors, weight), poses, loops) @ np.swapaxes(turned, 1, 2)
     information = informed(graph)[loops] * weight[loops, None, None]
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     # leverage: the share of the closure's own say in where its ends are, 1 where nothing else tells
@@ -70,10 +69,8 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     )
 
 
-def cost_together(
-    factors: Factors, weight: Floats, poses: Floats, tree: gtsam.GaussianBayesTree | Cholesky, loops: Ints
-) -> float:
-    """By how much chi-square falls without all of a few closures, to first order; `tree` as of marginals.factorised."""
+def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Supernodes | BayesTree, loops: Ints) -> float:
+    """By how much chi-square falls without all of a few closures, to first order; `tree` of Objective.information()."""
     size = len(AXES[factors.graph.dimension])
     error, turned = _errors(factors.graph, poses, loops)
     information = informed(factors.graph)[loops] * weight[loops, None, None]
@@ -94,7 +91,7 @@ def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tu
     barely = np.array(weight)
     barely[loops] = 1e-9
     error, turned = _errors(graph, poses, loops)
-    covariance = turned @ edge_covariances(factors, barely, poses, loops) @ np.swapaxes(turned, 1, 2)
+    covariance = turned @ edge_covariances(Objective(factors, barely), poses, loops) @ np.swapaxes(turned, 1, 2)
     covariance = covariance + np.linalg.inv(informed(graph)[loops])
     error = error[:, axes]
     squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)

@@ -10,14 +10,14 @@ from pydantic import Field
 from vplog.data import Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.descent import LARGE_POSES, descend, is_large
+from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
-    from vplog.graph.factors import Fit
+    from vplog.graph.descent import Fit
 
 
 class LmSettings(Settings):
@@ -43,8 +43,7 @@ def solve_kept(
 ) -> Solution:
     """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
     fit = descend(factors, weight, start, max_iterations, tolerance)
-    by = f" by sparse elimination, as for all of {LARGE_POSES} poses or more," if is_large(start) else ""
-    return as_solution(factors.graph, weight, fit, f"{found}Least squares{by}")
+    return as_solution(factors.graph, weight, fit, f"{found}Least squares")
 
 
 def as_solution(graph: PoseGraph, weight: Floats, fit: Fit, found: str) -> Solution:

@@ -15,14 +15,12 @@ from pydantic import Field
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, redundancy, residual_sigma
-from vplog.graph.descent import descend
-from vplog.graph.factors import Factors, least_squares
+from vplog.graph.descent import Objective, minimised
+from vplog.graph.factors import Factors
 from vplog.graph.satellites import Fixes, believe, chi2_of_fixes, with_fixes, world_from_enu
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from vplog.data import Bools, Floats, PoseGraph, Solution
     from vplog.graph.satellites import GpsSettings
 
@@ -94,12 +92,11 @@ def refine(
     noise, scale, present, before = 1.0, 1.0, graph, (1.0, 1.0)
     for _ in range(settings.max_rounds):
         present = rescaled(graph, of_odometry, ~loops, noise, scale)
-        factors = Factors.of(present)
-        weighted = None if fixes is None else with_fixes(factors, weight, poses, fixes, believed)
-        poses = _settled(factors, weight, weighted, poses, 1e-6)
+        objective = _objective(present, weight, poses, fixes, believed)
+        poses = minimised(objective, poses, _STEPS, 1e-6).world_from_body
         before = noise, scale
         if settings.noise:
-            noise *= _misjudged(factors, weight, weighted, poses, ~loops, settings.least_redundancy)
+            noise *= _misjudged(objective, poses, ~loops, settings.least_redundancy)
             noise = float(np.clip(noise, 1.0 / settings.most_change, settings.most_change))
         if settings.scale:
             scale += _scale_step(graph, weight, of_odometry, ~loops, noise, scale, poses, fixes, believed, settings)
@@ -122,26 +119,23 @@ def rescaled(graph: PoseGraph, of_odometry: Bools, odometry: Bools, noise: float
     return replace(graph, a_from_b=a_from_b, information=information)
 
 
-def _settled(factors: Factors, weight: Floats, weighted: Any, start: Floats, tolerance: float) -> Floats:
-    """The best poses (N, 4, 4) from `start` for the weighted edges, or for the graph `weighted` where that is given."""
-    if weighted is None:
-        return descend(factors, weight, start, _STEPS, tolerance).world_from_body
-    return least_squares(factors, weighted, start, _STEPS, tolerance).world_from_body
+def _objective(graph: PoseGraph, weight: Floats, poses: Floats, fixes: Fixes | None, inlier: Floats) -> Objective:
+    """The weighted edges (E,) of the graph, and the fixes (F,) in the world of the poses where there are any."""
+    factors = Factors.of(graph)
+    return Objective(factors, weight) if fixes is None else with_fixes(factors, weight, poses, fixes, inlier)
 
 
-def _misjudged(
-    factors: Factors, weight: Floats, weighted: Any, poses: Floats, odometry: Bools, least_redundancy: float
-) -> float:
+def _misjudged(objective: Objective, poses: Floats, odometry: Bools, least_redundancy: float) -> float:
     """By what factor the odometry's covariance is too small: its chi-square over its share of the redundancy.
 
     Variance components: Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1979.
     """
-    graph, edges = factors.graph, np.flatnonzero(odometry)
+    graph, edges = objective.factors.graph, np.flatnonzero(odometry)
     try:
-        checks = redundancy(factors, weight, poses, edges, weighted)
+        checks = redundancy(objective, poses, edges)
     except GraphError:
         # noise so large that rounding decides: all that the constraints could check, so that the next round has less
-        checks = float(degrees_of_freedom(graph) * min(np.count_nonzero(weight[~odometry]), len(edges)))
+        checks = float(degrees_of_freedom(graph) * min(np.count_nonzero(objective.weight[~odometry]), len(edges)))
     if checks < least_redundancy:
         return 1.0
     chi2 = float((residual_sigma(graph, poses)[edges] ** 2).sum())
@@ -166,9 +160,8 @@ def _scale_step(
     """
 
     def slope(at: float, start: Floats) -> float:
-        factors = Factors.of(rescaled(graph, of_odometry, odometry, noise, at))
-        weighted = None if fixes is None else with_fixes(factors, weight, start, fixes, believed)
-        best = _settled(factors, weight, weighted, start, 1e-8)
+        present = rescaled(graph, of_odometry, odometry, noise, at)
+        best = minimised(_objective(present, weight, start, fixes, believed), start, _STEPS, 1e-8).world_from_body
         errors = [
             float((weight * residual_sigma(rescaled(graph, of_odometry, odometry, noise, at + side), best) ** 2).sum())
             for side in (-_STEP, _STEP)

@@ -10,9 +10,8 @@ import numpy as np
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, residual_sigma
-from vplog.graph.descent import descend
+from vplog.graph.descent import Objective, descend
 from vplog.graph.leave_out import cost_together, distance, group_costs, groups, tension
-from vplog.graph.marginals import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -107,11 +106,11 @@ class Scrutiny:
         suspects = [members for members in suspects[:_MOST_SUSPECTS] if members.tobytes() not in cleared]
         if not suspects:
             return None
-        tree = factorised(factors, state.weight, state.poses)
+        information = Objective(factors, state.weight).information(state.poses)
         for members in suspects:
             cost = state.chi2  # of many, solving without them takes less than foretelling what that gives
             if len(members) <= _MOST_FORETOLD:
-                cost = min(cost_together(factors, state.weight, state.poses, tree, members), cost)
+                cost = min(cost_together(factors, state.weight, state.poses, information, members), cost)
             if cost > self.limit_of_group(state, np.array([cost]), len(members))[0]:
                 smaller = self.settle(_with(state.weight, members, 0.0), state.poses)
                 cost = state.chi2 - smaller.chi2

@@ -147,7 +147,6 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
     count, camera = len(rows), later.camera
     pose, information = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
     body_from_camera = geometry.adjoint(camera.body_from_camera)
-    camera_from_body = geometry.adjoint(geometry.inverse(camera.body_from_camera))
     twists = [body_twists(drive.keyframes) for drive in (earlier, later)]
     stamp_sigma_s = later.settings.calibration.stamp_sigma_s
     for at, row in enumerate(rows):
@@ -159,9 +158,6 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
             total = body_from_camera @ (covariance + motion_covariance(found, share)) @ body_from_camera.T
             speeds = twists[0][proposals.match[at]], twists[1][proposals.query[at]]
             known = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
-            information[at] = (known + known.T) / 2.0
-        elif row.pose.information is not None:  # turn and direction alone
-            known = camera_from_body.T @ row.pose.information @ camera_from_body
             information[at] = (known + known.T) / 2.0
     return Closures(
         query=proposals.query.astype(np.int32),
