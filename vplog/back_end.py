@@ -112,7 +112,7 @@ def about_gps(fixes: Fixes | None, refined: Refined) -> dict[str, Any] | None:
     latitude, longitude, altitude = fixes.origin
     return {
         "fixes": len(fixes),
-        "kept": int(refined.believed.sum()),
+        "kept": int(refined.inlier.sum()),
         "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude},
         "world_from_enu": refined.world_from_enu.tolist(),
     }

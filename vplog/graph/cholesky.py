@@ -20,6 +20,8 @@ from vplog.graph.triangles import add_rows, back_run, forward_run
 from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from vplog.data import Floats, Ints
     from vplog.graph.elimination import Elimination
     from vplog.graph.fronts import Blocks
@@ -42,7 +44,7 @@ class Cholesky:
     """For each supernode (k, k + m): k its columns, m the rows below them, all in scalars."""
 
     @classmethod
-    def of(cls, shape: Elimination, matrix: Blocks) -> Cholesky:
+    def of(cls, shape: Elimination, matrix: Blocks) -> Self:
         """Raises GraphError where the matrix is not positive definite, to working precision."""
         size = matrix.diagonal.shape[1]
         wide, below = np.diff(shape.first) * size, np.diff(shape.start) * size

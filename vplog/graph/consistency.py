@@ -172,8 +172,8 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     of it from so many on.
     """
     odometry = ~is_loop(graph)
-    kept = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
-    closures = int((kept[~odometry] > 0).sum())
+    accepted = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
+    closures = int((accepted[~odometry] > 0).sum())
     if closures == 0:
         if odometry.all():
             return solution
@@ -184,7 +184,10 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
         return solution
     try:
         checks = max(
-            round(redundancy(Objective(Factors.of(graph), kept), solution.world_from_body, np.flatnonzero(odometry))), 1
+            round(
+                redundancy(Objective(Factors.of(graph), accepted), solution.world_from_body, np.flatnonzero(odometry))
+            ),
+            1,
         )
     except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
         checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))

@@ -1,11 +1,11 @@
-"""Graduated non-convexity: closures that do not fit the rest lose their say, odometry is always believed.
+"""Graduated non-convexity: closures that do not fit the rest lose their weight, odometry keeps its own.
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020. Three things are
-added to it, since it starts from a solve that believes every closure, which false ones can bend beyond return, and ends
+added to it, since it starts from a solve with every closure, which false ones can bend beyond return, and ends
 where no closure has a large residual, which a false one has not either where little else holds the graph:
 
 1. The start is what agrees with the odometry, by the mixture of agreement.py.
-2. Noise is often said far too large, and then says nothing about false closures. So its scale is taken from the solved
+2. Noise is often claimed far too large, and then tells no false closure. So its scale is taken from the solved
    graph as well.
 3. In the end each closure, and each group of neighbouring ones, is held against what the rest predicts (scrutiny.py).
 """
@@ -30,7 +30,7 @@ from vplog.graph.consistency import (
 from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
-from vplog.graph.lm import solve_kept
+from vplog.graph.lm import solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.scrutiny import Scrutiny
@@ -40,15 +40,9 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 
-_AT_ONCE = 3
-"""Stages that a large graph takes as one, of one least squares step. Drives of 12 000 poses keep the same closures as
-stage by stage, of 100 000 poses all but one of 5948, with half of the factorisations."""
-_FIRST_STEPS = 5
-"""Least squares steps of a large graph before its stages at most. 100 000 poses take 3; where false closures are left
-that bend a million, 20 and more do not settle them, and the stages need no settled start."""
 _BRANCHES = 200
-"""Of the search for the largest set of each two pieces of a large graph: a greedy one and some more. Where some hundred
-closures join two drives, one in a hundred pairs of which disagrees by chance, an exact search does not end."""
+"""Of the search for the largest set of closures between two pieces of odometry: a greedy one and some more. Where
+some hundred closures join two drives, one in a hundred pairs of which disagrees by chance, an exact one does not end."""
 
 
 class GncSettings(Settings):
@@ -83,7 +77,7 @@ class GncSettings(Settings):
         weight = np.ones(len(graph.a))
         if len(loops) == 0:
             start = initial_poses(factors, weight)
-            return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, "")
+            return solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
         chain = OdometryChain.of(graph)
         agreed = agreement(graph, loops, chain)
         gated = far_from_odometry(graph, self.gate_probability, chain)[loops]
@@ -95,13 +89,13 @@ class GncSettings(Settings):
             factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
         )
         state = scrutiny(weight, poses)
-        kept = int(state.weight[loops].sum())
+        accepted = int(state.weight[loops].sum())
         taken = "1 stage" if stages == 1 else f"{stages} stages"
         found = (
-            f"{kept} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. {apart} "
-            f"did not agree with it at first; {taken} and a look at what each costs the others decided. "
+            f"{accepted} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. "
+            f"{apart} disagreed with it at first; {taken} and leave-one-out tests decided. "
         )
-        return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
+        return solve_weighted(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
     def _join(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest set that agrees."""
@@ -116,8 +110,8 @@ class GncSettings(Settings):
         first = np.flatnonzero(np.diff(pairs[by_pair], prepend=-1))
         with Workers() as workers:
             tasks = [(graph, loops[rows], chain) for rows in np.split(by_pair, first)[1:]]
-            for kept, _ in workers.each(consistency.consistent, tasks):
-                good[np.searchsorted(loops, kept)] = True
+            for accepted, _ in workers.each(consistency.consistent, tasks):
+                good[np.searchsorted(loops, accepted)] = True
         return good
 
     def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats, int]:
@@ -130,7 +124,7 @@ class GncSettings(Settings):
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         stage = 0
-        for stage in range(1, self.max_stages + 1):  # noqa: B007 (told in the reason)
+        for stage in range(1, self.max_stages + 1):  # noqa: B007 (used in the reason)
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break

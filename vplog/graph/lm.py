@@ -35,10 +35,10 @@ class LmSettings(Settings):
         graph, _ = checked(graph)
         factors = Factors.of(graph)
         weight = np.ones(len(graph.a))
-        return solve_kept(factors, weight, initial_poses(factors, weight), self.max_iterations, self.tolerance, "")
+        return solve_weighted(factors, weight, initial_poses(factors, weight), self.max_iterations, self.tolerance, "")
 
 
-def solve_kept(
+def solve_weighted(
     factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float, found: str
 ) -> Solution:
     """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""

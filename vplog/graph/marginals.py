@@ -37,7 +37,7 @@ def joint_covariance(factors: Factors, information: Supernodes | BayesTree, pose
     axes = AXES[graph.dimension]
     size = len(axes)
     ends = np.stack([graph.a[edges], graph.b[edges]], axis=1)
-    nodes = np.unique(ends)
+    nodes = np.unique(ends).astype(np.int64)
     covariance = information.joint_inverse(nodes)
     Ad = geometry.adjoint(geometry.between(poses[ends[:, 1]], poses[ends[:, 0]]))[:, axes][:, :, axes]
     jacobian = np.zeros((len(edges) * size, len(covariance)))

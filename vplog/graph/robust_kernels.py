@@ -53,8 +53,8 @@ def solve_robustly(graph: PoseGraph, settings: KernelSettings, kernel: Callable[
     fit = minimised(objective, start, settings.max_iterations, settings.tolerance)
     weight = np.ones(len(graph.a))
     weight[loops] = [estimator.weight(sigma) for sigma in residual_sigma(graph, fit.world_from_body, loops).tolist()]
-    kept = int((weight[loops] > 0.5).sum())
-    found = f"{kept} of {len(loops)} closures have more than half their weight. Robust least squares"
+    accepted = int((weight[loops] > 0.5).sum())
+    found = f"{accepted} of {len(loops)} closures have more than half their weight. Robust least squares"
     return as_solution(graph, weight, fit, found)
 
 
@@ -96,7 +96,9 @@ class GemanMcClureSettings(KernelSettings):
 
     def __call__(self, graph: PoseGraph) -> Solution:
         return solve_robustly(
-            graph, self, lambda half: mEstimator.GemanMcClure.Create(math.sqrt(half / (math.sqrt(2.0) - 1.0)))
+            graph,
+            self,
+            lambda half: mEstimator.GemanMcClure.Create(math.sqrt(half / (math.sqrt(2.0) - 1.0))),
         )
 
 

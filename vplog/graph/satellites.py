@@ -151,7 +151,7 @@ def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, in
     )
 
 
-def believe(
+def inlier_fixes(
     factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings
 ) -> tuple[Floats, Floats]:
     """Poses (N, 4, 4), pose 0 as given, and which fixes (F,) are believed, 0 or 1: jumps are not.
@@ -159,22 +159,22 @@ def believe(
     Graduated non-convexity with the truncated least squares loss (Yang et al., RA-L 2020) over the fixes, the edges
     keeping their weights. The first solve believes all of them, so their frame is found whatever the odometry drifted.
     """
-    bound, believed, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
+    bound, inlier, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
     mu = 0.0
     for _ in range(settings.max_stages):
-        poses = minimised(with_fixes(factors, weight, poses, fixes, believed), poses, 20, 1e-4).world_from_body
-        chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(believed, 1e-9)))
+        poses = minimised(with_fixes(factors, weight, poses, fixes, inlier), poses, 20, 1e-4).world_from_body
+        chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)))
         mu = bound / max(2.0 * chi2.max() - bound, bound) if mu == 0.0 else mu * settings.growth  # remark 5
-        believed = truncated_weights(chi2, bound, mu)
-        if ((believed == 0) | (believed == 1)).all():
+        inlier = truncated_weights(chi2, bound, mu)
+        if ((inlier == 0) | (inlier == 1)).all():
             break
-    believed = np.where(believed > 0.5, 1.0, 0.0)
-    if believed.sum() < _LEAST:
+    inlier = np.where(inlier > 0.5, 1.0, 0.0)
+    if inlier.sum() < _LEAST:
         raise GraphError(
-            f"Only {int(believed.sum())} of {len(fixes)} GPS fixes agree with the odometry and each other. "
+            f"Only {int(inlier.sum())} of {len(fixes)} GPS fixes agree with the odometry and each other. "
             "Run without --gps, or set gps.unknown_sigma_m to what the receiver does."
         )
-    return poses, believed
+    return poses, inlier
 
 
 def only(fixes: Fixes, rows: Bools) -> Fixes:

@@ -79,9 +79,9 @@ def verify_between(
         cv2.setNumThreads(1)  # one candidate, one thread; the pool is the only parallelism
         return check_queries(later, earlier, match, queries)
 
-    def back(query: int, matches: list[int], believed: list[Row]) -> list[Row]:
+    def back(query: int, matches: list[int], accepted: list[Row]) -> list[Row]:
         cv2.setNumThreads(1)
-        return check_back(later, earlier, query, matches, believed, bent)
+        return check_back(later, earlier, query, matches, accepted, bent)
 
     rows: dict[int, Row] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
@@ -93,8 +93,8 @@ def verify_between(
             if progress is not None:
                 progress(len(rows), total)
         if later.settings.both_ways:
-            believed = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
-            groups = _by(proposals.query, proposals.match, believed)
+            accepted = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
+            groups = _by(proposals.query, proposals.match, accepted)
             queries = [int(proposals.query[group[0]]) for group in groups]
             matches = [proposals.match[group].tolist() for group in groups]
             one_way = [[rows[at] for at in group.tolist()] for group in groups]
@@ -124,10 +124,10 @@ def calibration_share(drive: Drive, threads: int = 1) -> float:
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
     driven = geometry.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
-    seen = np.array(
+    observed = np.array(
         [_of_body(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
     )
-    share = rotation_share(driven, seen, settings)
+    share = rotation_share(driven, observed, settings)
     if share > _SUSPICIOUS_SHARE:
         _LOG.warning(
             "Camera %r and odometry disagree by %.0f %% about rotations: closures claim less. Check the focal length.",
