@@ -47,7 +47,8 @@ def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSett
     return odometry_kept(
         graph,
         solution,
-        f"the methods disagree about the {count} verified closures. The solve keeps {accepted}, {' and '.join(findings)}, "
-        "and these bend the odometry further than its noise allows: as a body the closures are false, or the noise is too "
-        "small.",
+        f"the methods disagree about the {count} verified closures. The solve keeps {accepted}, "
+        f"{' and '.join(findings)}, "
+        "and these bend the odometry further than its noise allows: as a body the closures are false, or its noise is "
+        "too small.",
     )

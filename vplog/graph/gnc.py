@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _BRANCHES = 200
 """Of the search for the largest set of closures between two pieces of odometry: a greedy one and some more. Where
-some hundred closures join two drives, one in a hundred pairs of which disagrees by chance, an exact one does not end."""
+some hundred closures join two drives, one in a hundred pairs of which disagrees by chance, an exact one never ends."""
 
 
 class GncSettings(Settings):
