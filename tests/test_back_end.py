@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -18,10 +18,6 @@ from vplog.pipeline import Pipeline
 if TYPE_CHECKING:
     from tests.graph.drive import Drive
     from vplog.back_end import Solved
-    from vplog.data import Camera
-
-NO_CAMERA = cast("Camera", None)
-"""Only directions would need it."""
 
 
 def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
@@ -36,7 +32,7 @@ def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
         drive.odometry.odom_from_body,
         np.tile(np.diag(claimed * ODOMETRY_SIGMA**2), (count, 1, 1)),
     )
-    return solve(odometry, drive.keyframes, closures, NO_CAMERA, None, Pipeline(), execution=Execution())
+    return solve(odometry, drive.keyframes, closures, None, Pipeline(), execution=Execution())
 
 
 @pytest.mark.parametrize("claimed", [1e-6, 1 / 64, 1.0, 64.0])

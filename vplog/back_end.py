@@ -13,7 +13,6 @@ from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct
 from vplog.graph.consistency import is_loop
 from vplog.graph.cross_check import cross_checked
-from vplog.graph.directions import Directions, with_directions
 from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
@@ -24,7 +23,7 @@ from vplog.steps import step
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Camera, Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
     from vplog.execution_value import Execution
     from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.noise import NoiseSettings
@@ -76,7 +75,6 @@ def solve(
     odometry: Odometry,
     keyframes: Keyframes,
     closures: Closures,
-    camera: Camera,
     gps: Gps | None,
     settings: BackEnd,
     *,
@@ -84,15 +82,13 @@ def solve(
 ) -> Solved:
     """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
     with limited(execution.threads):
-        solved = _solve(odometry, keyframes, closures, camera, gps, settings)
+        solved = _solve(odometry, keyframes, closures, gps, settings)
     for warning in solved.warnings:
         _log.warning(warning)
     return solved
 
 
-def _solve(
-    odometry: Odometry, keyframes: Keyframes, closures: Closures, camera: Camera, gps: Gps | None, settings: BackEnd
-) -> Solved:
+def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
     solution = solve_gated(graph, settings)
@@ -105,16 +101,6 @@ def _solve(
         if kept := int((again.weight[is_loop(other)] > 0.5).sum()):
             graph, solution, source = other, again, "model"
             doubts = [*doubts, _CONTRADICTED.format(count=len(rows), kept=kept)]
-    if len(lines := without_metres(closures)):
-        directions = Directions(
-            closures.match[lines].astype(np.int64),
-            closures.query[lines].astype(np.int64),
-            closures.match_from_query[lines],
-            closures.information[lines],
-            camera.body_from_camera,
-        )
-        graph, solution = with_directions(graph, solution, directions, settings.solve)
-        rows = np.concatenate([rows, lines])
     fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
     if fixes is not None:
         solution = keep_odometry_if_further(graph, solution, fixes)
@@ -134,12 +120,6 @@ def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
     return cross_checked(graph, gated(graph, settings.solve), settings.cross_check)
 
 
-def without_metres(closures: Closures) -> Ints:
-    """Ledger rows of which turn and direction are known, but no metres."""
-    known = np.isfinite(closures.information).all((1, 2))
-    return np.flatnonzero(known & np.array([verdict is not Verdict.ACCEPTED for verdict in closures.verdict], bool))
-
-
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
     """(E,) edges whose metres are the odometry's: its own, and closures (ledger `rows`) with its scale."""
     result = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
@@ -155,7 +135,7 @@ def about_gps(solved: Solved) -> dict[str, Any] | None:
     latitude, longitude, altitude = fixes.origin
     return {
         "fixes": len(fixes),
-        "kept": int(refined.believed.sum()),
+        "kept": int(refined.inlier.sum()),
         "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude},
         "world_from_enu": refined.world_from_enu.tolist(),
     }
@@ -176,6 +156,4 @@ def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) ->
     for row in rows.tolist():
         if weight[row] < 0.5 and verdict[row] is Verdict.ACCEPTED:
             verdict[row] = Verdict.REJECTED_BY_SOLVER
-        elif weight[row] >= 0.5 and verdict[row] is not Verdict.ACCEPTED:
-            verdict[row] = Verdict.DIRECTION_ONLY
     return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)

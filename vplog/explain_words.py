@@ -29,8 +29,6 @@ _SCALE = {
     "stereo": "Its metres come from the stereo pair.",
 }
 
-_DIRECTION = "--set verify.direction.keep=true keeps the turn and the direction, without metres."
-
 
 @dataclass(frozen=True)
 class Words:
@@ -169,7 +167,7 @@ def _too_few_matches(row: Row, pipeline: Pipeline) -> str:
 def _too_few_landmarks(row: Row, pipeline: Pipeline) -> str:
     return (
         f"{pipeline.verify.metric.min_inliers} matches with a position are needed (verify.metric.min_inliers). Depth "
-        f"images, or more sideways motion around keyframe {row['match']}, would give more of them one. {_DIRECTION}"
+        f"images, or more sideways motion around keyframe {row['match']}, would give more of them one."
     )
 
 
@@ -204,8 +202,7 @@ def _poor_spread(row: Row, pipeline: Pipeline) -> str:
 
 def _degenerate(row: Row, _: Pipeline) -> str:
     return (
-        f"Depth images, or frames around keyframe {row['match']} that move sideways, would give its features "
-        f"positions. {_DIRECTION}"
+        f"Depth images, or frames around keyframe {row['match']} that move sideways, would give its features positions."
     )
 
 
@@ -246,10 +243,7 @@ def _by_solver(row: Row, _: Pipeline) -> str:
 
 
 def _direction_only(row: Row, _: Pipeline) -> str:
-    return (
-        "Metres would need landmarks: keyframes around the match that moved further, a depth image or a stereo pair. "
-        "--set verify.direction.keep=false leaves such closures out."
-    )
+    return "Metres would need landmarks: keyframes around the match that moved further, a depth image or a stereo pair."
 
 
 _CHANGES: dict[Verdict, Callable[[Row, Pipeline], str]] = {

@@ -173,7 +173,7 @@ def run(
         proposals = do(find_candidates, state, descriptors, keyframes, pipeline.propose, pipeline.sequence)
         closures = do(verify, proposals, keyframes, camera, features, pipeline.verify)
         closures = name_shared(closures, state, descriptors)
-        solved = do(solve, odometry, keyframes, closures, camera, log.gps(), pipeline)
+        solved = do(solve, odometry, keyframes, closures, log.gps(), pipeline)
         result = Run(
             log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved
         )

@@ -20,7 +20,7 @@ from pydantic import TypeAdapter
 from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
 from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_chain
-from vplog.graph.descent import LARGE_POSES
+from vplog.graph.linear import LARGE_POSES
 from vplog.graph.solve import LmSettings, OptimiserSettings
 from vplog.results.g2o import read_g2o, write_g2o
 

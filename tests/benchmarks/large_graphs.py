@@ -12,7 +12,7 @@ import numpy as np
 from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
 from vplog.graph.consistency import is_loop, odometry_chain
-from vplog.graph.descent import LARGE_POSES
+from vplog.graph.linear import LARGE_POSES
 
 from .graphs import _planar, apart, city, method, spoiled
 from .measure import Figure

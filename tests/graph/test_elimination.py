@@ -1,4 +1,4 @@
-"""Our own elimination of large graphs does what dense matrices, and GTSAM on smaller graphs, do."""
+"""Both linear solvers do what dense matrices do, and which of them is taken decides nothing."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from tests.benchmarks.graphs import city, spoiled
 from tests.benchmarks.large_graphs import drives
@@ -14,19 +15,24 @@ from vplog import geometry
 from vplog.cores import limited
 from vplog.data import EdgeKind
 from vplog.errors import GraphError
-from vplog.graph import dense, descent, inverse_fronts, normal
-from vplog.graph.cholesky import Blocks, Cholesky
+from vplog.graph import dense, inverse_fronts, linear, normal
+from vplog.graph.cholesky import Cholesky
 from vplog.graph.consistency import is_loop, residual_sigma
+from vplog.graph.descent import Objective, descend
 from vplog.graph.elimination import Elimination
-from vplog.graph.factors import Factors, as_values
+from vplog.graph.factors import Factors
+from vplog.graph.fronts import Blocks
 from vplog.graph.gnc import GncSettings
 from vplog.graph.inverse import inverse_blocks, joint_inverse
 from vplog.graph.leave_out import cost_together, tension
+from vplog.graph.linear import BayesTree, Supernodes
 from vplog.graph.lm import LmSettings
-from vplog.graph.marginals import edge_covariances, factorised
+from vplog.graph.marginals import edge_covariances
 from vplog.graph.normal import normal_equations
+from vplog.graph.solve import OptimiserSettings
 
 from .drive import ring
+from .gtsam_graph import as_values, weighted
 
 if TYPE_CHECKING:
     from vplog.data import PoseGraph
@@ -122,11 +128,11 @@ def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPa
     poses, weight = geometry.between(graph.world_from_body[:1], graph.world_from_body), np.ones(len(graph.a))
 
     def found() -> bytes:
-        matrix, slope, error = normal_equations(graph, weight, poses)
+        matrix, gradient, error = normal_equations(graph, weight, poses)
         matrix.diagonal[0] += 1e6 * np.eye(6)
         factor = Cholesky.of(Elimination.of(len(poses), graph.a, graph.b), matrix)
         assert np.diff(factor.shape.first).max() * 6 > 40
-        arrays = (matrix.diagonal, matrix.other, slope, factor.values, factor.solve(slope[:, :, None]))
+        arrays = (matrix.diagonal, matrix.other, gradient, factor.values, factor.solve(gradient[:, :, None]))
         return (
             b"".join(one.tobytes() for one in (*arrays, *inverse_blocks(factor, graph.a, graph.b)))
             + str(error).encode()
@@ -170,63 +176,97 @@ def test_normal_equations_are_those_of_gtsam(graph: PoseGraph) -> None:
     poses = geometry.between(graph.world_from_body[:1], graph.world_from_body @ geometry.exp(twist))
     weight = random.uniform(0.1, 1.0, len(graph.a))
     weight[3] = 0.0
-    matrix, slope, error = normal_equations(graph, weight, poses)
+    matrix, gradient, error = normal_equations(graph, weight, poses)
     assert error == pytest.approx(0.5 * (weight * residual_sigma(graph, poses) ** 2).sum(), rel=1e-12)
     # weights of 0 leave no factor, and the gauge is on the first pose alone
-    factors = Factors.of(graph)
-    linear = factors.weighted(np.maximum(weight, 1e-30)).linearize(as_values(poses, graph.dimension))
-    expected, right = linear.hessian()
+    linearised = weighted(graph, np.maximum(weight, 1e-30)).linearize(as_values(poses, graph.dimension))
+    expected, right = linearised.hessian()
     order = [2, 0, 1] if graph.dimension == 2 else axes
     expected = expected.reshape(-1, size, len(poses), size)[:, order][:, :, :, order].reshape(len(poses) * size, -1)
     whole, right = whole_of(matrix), right.reshape(-1, size)[:, order]
     np.testing.assert_allclose(
         whole[size:, size:], expected[size:, size:], rtol=0, atol=EXACT[graph.dimension] * np.abs(whole).max()
     )
-    np.testing.assert_allclose(slope[1:], -right[1:], rtol=0, atol=EXACT[graph.dimension] * np.abs(slope).max())
+    np.testing.assert_allclose(gradient[1:], -right[1:], rtol=0, atol=EXACT[graph.dimension] * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize(("nodes", "chords", "size", "columns"), [(40, 30, 1, 3), (60, 40, 3, 2), (30, 20, 6, 1)])
+def test_both_linear_solvers_agree(nodes: int, chords: int, size: int, columns: int) -> None:
+    matrix, _ = random_matrix(nodes, chords, size, 0)
+    random = np.random.default_rng(1)
+    ours, gtsams = Supernodes.of(Elimination.of(nodes, matrix.a, matrix.b), matrix), BayesTree(matrix)
+    right = random.normal(size=(nodes, size, columns))
+    np.testing.assert_allclose(gtsams.solve(right), ours.solve(right), rtol=1e-7, atol=1e-9)
+    for one, other in zip(
+        gtsams.inverse_blocks(matrix.a, matrix.b), ours.inverse_blocks(matrix.a, matrix.b), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+    few = np.sort(random.permutation(nodes)[:4])
+    np.testing.assert_allclose(gtsams.joint_inverse(few), ours.joint_inverse(few), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, np.nan])
+def test_gtsam_refuses_what_is_not_positive_definite(wrong: float) -> None:
+    matrix, _ = random_matrix(30, 5, 3, 0)
+    diagonal = matrix.diagonal.copy()
+    diagonal[17] *= wrong
+    tree = BayesTree(matrix._replace(diagonal=diagonal))
+    with pytest.raises(GraphError, match="does not constrain"):
+        tree.solve(np.ones((30, 3, 1)))
+    with pytest.raises(GraphError, match="does not constrain"):
+        tree.inverse_blocks(matrix.a, matrix.b)
+
+
+@pytest.mark.parametrize("kind", ["lm", "gnc", "pcm", "dcs", "cauchy", "geman_mcclure"])
+@pytest.mark.parametrize("share", [0.0, 0.3])
+@each_graph
+def test_the_linear_solver_decides_nothing(
+    graph: PoseGraph, share: float, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same graph just below and just above the size from which supernodes are taken."""
+    graph, _ = spoiled(graph, share, 0)
+    method = TypeAdapter(OptimiserSettings).validate_python({"kind": kind})
+    monkeypatch.setattr(linear, "LARGE_POSES", len(graph.world_from_body) + 1)
+    below = method(graph)
+    monkeypatch.setattr(linear, "LARGE_POSES", len(graph.world_from_body))
+    above = method(graph)
+    assert above.iterations == below.iterations
+    assert above.reason == below.reason
+    np.testing.assert_allclose(above.weight, below.weight, atol=1e-6)
+    np.testing.assert_array_equal(above.weight > 0.5, below.weight > 0.5)
+    assert above.error_after == pytest.approx(below.error_after, rel=1e-6)
+    np.testing.assert_allclose(above.world_from_body, below.world_from_body, atol=1e-4)
+    assert method(graph).world_from_body.tobytes() == above.world_from_body.tobytes()
 
 
 @each_graph
-def test_large_graphs_are_solved_as_small_ones(graph: PoseGraph, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = LmSettings(tolerance=1e-9)(graph)
-    assert "elimination" not in small.reason
-    weight, loops = np.ones(len(graph.a)), np.flatnonzero(is_loop(graph))
-    covariance = edge_covariances(Factors.of(graph), weight, small.world_from_body, loops)
-    factors, pair = Factors.of(graph), loops[:3]
-    tree = factorised(factors, weight, small.world_from_body)
-    cost = cost_together(factors, weight, small.world_from_body, tree, pair)
-    pull = tension(factors, weight, small.world_from_body, loops)
+def test_the_linear_solver_changes_no_covariance(graph: PoseGraph, monkeypatch: pytest.MonkeyPatch) -> None:
+    poses, loops = LmSettings()(graph).world_from_body, np.flatnonzero(is_loop(graph))
+    factors, weight = Factors.of(graph), np.ones(len(graph.a))
+    objective = Objective(factors, weight)
 
-    monkeypatch.setattr(descent, "LARGE_POSES", 10)
-    large = LmSettings(tolerance=1e-9)(graph)
-    assert "elimination" in large.reason
-    assert large.error_after == pytest.approx(small.error_after, rel=1e-6)
-    np.testing.assert_allclose(large.world_from_body, small.world_from_body, atol=1e-3)
-    assert LmSettings(tolerance=1e-9)(graph).world_from_body.tobytes() == large.world_from_body.tobytes()
-    found = edge_covariances(Factors.of(graph), weight, small.world_from_body, loops)
-    np.testing.assert_allclose(found, covariance, rtol=1e-5, atol=EXACT[graph.dimension] * np.abs(covariance).max())
-    tree = factorised(factors, weight, small.world_from_body)
-    assert cost_together(factors, weight, small.world_from_body, tree, pair) == pytest.approx(cost, rel=1e-5)
-    np.testing.assert_allclose(
-        tension(factors, weight, small.world_from_body, loops).cost, pull.cost, rtol=1e-4, atol=1e-6
-    )
+    def found() -> tuple[np.ndarray, float, np.ndarray]:
+        together = cost_together(factors, weight, poses, objective.information(poses), loops[:3])
+        return (
+            edge_covariances(objective, poses, loops),
+            together,
+            tension(factors, weight, poses, loops).cost,
+        )
 
-
-def test_large_graphs_lose_the_same_closures(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph, false = spoiled(GRAPHS["planar"], 0.3, 0)
-    small = GncSettings()(graph)
-    monkeypatch.setattr(descent, "LARGE_POSES", 10)
-    large = GncSettings()(graph)
-    np.testing.assert_array_equal(large.weight, small.weight)
-    assert large.error_after == pytest.approx(small.error_after, rel=1e-5)
-    assert not large.weight[false].any()
+    covariance, together, cost = found()
+    monkeypatch.setattr(linear, "LARGE_POSES", 10)
+    ours, our_together, our_cost = found()
+    np.testing.assert_allclose(ours, covariance, rtol=1e-5, atol=1e-7 * np.abs(covariance).max())
+    assert our_together == pytest.approx(together, rel=1e-5)
+    np.testing.assert_allclose(our_cost, cost, rtol=1e-4, atol=1e-6)
 
 
 def test_drives_that_only_closures_join_are_solved_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(descent, "LARGE_POSES", 10)
+    monkeypatch.setattr(linear, "LARGE_POSES", 10)
     graph = GRAPHS["drives"]
     solution = GncSettings()(graph)
     assert solution.weight[is_loop(graph)].mean() > 0.9
     apart = np.setdiff1d(np.arange(len(graph.a)), np.flatnonzero(is_loop(graph) & (graph.a < 300) & (graph.b >= 300)))
     weight = np.where(np.isin(np.arange(len(graph.a)), apart), 1.0, 0.0)
-    alone = descent.descend(Factors.of(graph), weight, graph.world_from_body, 20, 1e-6)
+    alone = descend(Factors.of(graph), weight, graph.world_from_body, 20, 1e-6)
     np.testing.assert_allclose(alone.world_from_body[300], graph.world_from_body[300], atol=1e-6)

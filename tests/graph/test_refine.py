@@ -115,7 +115,7 @@ def test_gps_fixes_scale_place_and_heading() -> None:
     fixes = fixes_on(satellites(drive, antenna_m=(0.5, 0.0, 1.0)), drive.odometry, drive.keyframes, GpsSettings())
     found = refined(drive.graph, fixes)
     assert found.scale * 1.02 == pytest.approx(1.0, abs=0.01)
-    assert found.believed.mean() > 0.95
+    assert found.inlier.mean() > 0.95
     assert found.world_from_enu is not None
     there = (fixes.enu_m @ found.world_from_enu[:3, :3].T) + found.world_from_enu[:3, 3]
     off = np.linalg.norm(antennas(found.solution.world_from_body, fixes) - there, axis=1)
@@ -138,8 +138,8 @@ def test_fixes_that_jump_are_not_believed() -> None:
     moved = replace(gps, latitude_deg=gps.latitude_deg + jumps * 40.0 / DEGREE_M)
     fixes = fixes_on(moved, drive.odometry, drive.keyframes, GpsSettings())
     found = refined(drive.graph, fixes)
-    assert not found.believed[jumps].any()
-    assert found.believed[~jumps].mean() > 0.95
+    assert not found.inlier[jumps].any()
+    assert found.inlier[~jumps].mean() > 0.95
     clean = refined(drive.graph, fixes_on(gps, drive.odometry, drive.keyframes, GpsSettings()))
     np.testing.assert_allclose(
         found.solution.world_from_body[:, :3, 3], clean.solution.world_from_body[:, :3, 3], atol=0.5

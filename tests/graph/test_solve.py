@@ -12,10 +12,10 @@ from pydantic import TypeAdapter
 
 from vplog.data import EdgeKind, PoseGraph, Solution
 from vplog.graph.consistency import chi2_quantile
-from vplog.graph.factors import Factors, as_array
 from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings
 
 from .drive import position_error, ring, without_loops
+from .gtsam_graph import as_array, weighted
 
 METHODS = [GncSettings(), LmSettings()]
 
@@ -60,7 +60,7 @@ def test_gnc_agrees_with_gtsam() -> None:
     """GTSAM's GncLMOptimizer, odometry and gauge known, keeps the same closures and ends at the same poses."""
     drive = ring(80, loops=12, false=6, seed=5)
     graph, n = drive.graph, 80
-    factors = Factors.of(graph).weighted(np.ones(len(graph.a)))
+    factors = weighted(graph, np.ones(len(graph.a)))
     values = gtsam.Values()
     for node, pose in enumerate(graph.world_from_body):
         values.insert(node, gtsam.Pose3(pose))

@@ -9,7 +9,7 @@ in one fixed order, whatever the threads.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,25 +20,15 @@ from vplog.graph.triangles import add_rows, back_run, forward_run
 from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Int32s, Ints
+    from typing import Self
+
+    from vplog.data import Floats, Ints
     from vplog.graph.elimination import Elimination
+    from vplog.graph.fronts import Blocks
 
 _BY_THREAD = 4
 """Shares for each thread of what a child hands on: the first rows of a triangle are longer."""
 OPEN = "The graph does not constrain all its poses. Check the information of its edges."
-
-
-class Blocks(NamedTuple):
-    """A symmetric matrix of n x n blocks (d, d)."""
-
-    diagonal: Floats
-    """(n, d, d)."""
-    a: Int32s | Ints
-    """(E,) row of each other block; pairs may repeat, and add."""
-    b: Int32s | Ints
-    """(E,) its column; never the same."""
-    other: Floats
-    """(E, d, d) at row a, column b; its transpose at row b, column a."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +44,7 @@ class Cholesky:
     """For each supernode (k, k + m): k its columns, m the rows below them, all in scalars."""
 
     @classmethod
-    def of(cls, shape: Elimination, matrix: Blocks) -> Cholesky:
+    def of(cls, shape: Elimination, matrix: Blocks) -> Self:
         """Raises GraphError where the matrix is not positive definite, to working precision."""
         size = matrix.diagonal.shape[1]
         wide, below = np.diff(shape.first) * size, np.diff(shape.start) * size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -14,10 +14,10 @@ from vplog import geometry
 from vplog.data import EdgeKind
 from vplog.errors import GraphError
 from vplog.graph.build import AXES, informed
-from vplog.graph.descent import is_large
+from vplog.graph.descent import Objective
 from vplog.graph.factors import Factors
 from vplog.graph.marginals import edge_covariances
-from vplog.graph.normal import half_chi2_of
+from vplog.graph.normal import edge_costs
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph, Solution
@@ -31,44 +31,11 @@ KNOWN_TO = 30
 
 
 def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:
-    """Mahalanobis distance of each edge (E,), or of those named, to the poses (N, 4, 4), e as GTSAM's Pose3 or Pose2.
+    """Mahalanobis distance of each edge (E,), or of those named, to the poses (N, 4, 4): sqrt(e^T Omega e).
 
-    sqrt(e^T information e). A planar motion has the same logarithm in the plane as in space, so one formula serves.
+    e is the residual of GTSAM's BetweenFactor of Pose3, or of Pose2 in the plane.
     """
-    if is_large(world_from_body):
-        half = half_chi2_of(graph, np.ones(len(graph.a)), world_from_body, edges)
-        return np.sqrt(np.maximum(2.0 * half, 0.0))
-    part = slice(None) if edges is None else edges
-    a, b = world_from_body[graph.a[part]], world_from_body[graph.b[part]]
-    if graph.dimension == 2:
-        error, information = _planar_errors(graph.a_from_b[part], a, b), informed(graph)[part]
-    else:
-        error = geometry.log(geometry.between(graph.a_from_b[part], geometry.between(a, b)))
-        information = graph.information[part]
-    return np.sqrt(np.maximum(np.einsum("ei,ei->e", (error[:, None, :] @ information)[:, 0], error), 0.0))
-
-
-def _planar_errors(a_from_b: Floats, world_from_a: Floats, world_from_b: Floats) -> Floats:
-    """Yaw, x, y (E, 3) of the logarithm of planar motions: geometry.log at a tenth of the work."""
-    yaw, x, y = [], [], []
-    for pose in (a_from_b, world_from_a, world_from_b):
-        yaw.append(np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
-        x.append(pose[:, 0, 3])
-        y.append(pose[:, 1, 3])
-    # from a to b, then from where b was measured to where it is
-    dx, dy = _turned(x[2] - x[1], y[2] - y[1], -yaw[1])
-    dx, dy = _turned(dx - x[0], dy - y[0], -yaw[0])
-    turn = yaw[2] - yaw[1] - yaw[0]
-    turn = np.arctan2(np.sin(turn), np.cos(turn))
-    half = turn / 2.0
-    small = np.abs(half) < 1e-4  # h cot h = 1 - h^2 / 3, exact to double precision there
-    straight = np.where(small, 1.0 - half**2 / 3.0, half / np.tan(np.where(small, 1.0, half)))
-    return np.stack([turn, straight * dx + half * dy, straight * dy - half * dx], axis=1)
-
-
-def _turned(x: Floats, y: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return cos * x - sin * y, sin * x + cos * y
+    return np.sqrt(np.maximum(2.0 * edge_costs(graph, np.ones(len(graph.a)), world_from_body, edges), 0.0))
 
 
 def degrees_of_freedom(graph: PoseGraph) -> int:
@@ -169,18 +136,12 @@ def odometry_chain(graph: PoseGraph) -> tuple[Floats, Ints]:
     back = (leads >= 0) & (graph.a[leads] > graph.b[leads])
     step[back] = geometry.inverse(step[back])
     poses = np.array(graph.world_from_body)
-    if graph.dimension == 2:
-        return _planar_chain(poses, step, leads), leads
-    if is_large(poses):
-        _spatial_chain(poses, step, leads)
-        return poses, leads
-    for node in np.flatnonzero(leads >= 0):
-        poses[node] = poses[node - 1] @ step[node]
+    _chain(poses, step, leads)
     return poses, leads
 
 
 @numba.njit(cache=True, nogil=True)
-def _spatial_chain(poses: Floats, step: Floats, leads: Ints) -> None:
+def _chain(poses: Floats, step: Floats, leads: Ints) -> None:
     """Each pose from the one before it and its step, all (N, 4, 4), in place, where an edge leads to it."""
     for node in range(1, len(poses)):
         if leads[node] >= 0:
@@ -190,28 +151,6 @@ def _spatial_chain(poses: Floats, step: Floats, leads: Ints) -> None:
                     for k in range(3):
                         total += poses[node - 1, i, k] * step[node, k, j]
                     poses[node, i, j] = total
-
-
-def _planar_chain(poses: Floats, step: Floats, leads: Ints) -> Floats:
-    """The chain of planar steps (N, 4, 4) by sums: turns first, then what they make of the shifts."""
-    first = leads < 0
-    piece = np.cumsum(first) - 1
-    start = np.flatnonzero(first)
-
-    def summed(steps: Floats, starts: Floats) -> Floats:
-        total = np.cumsum(np.where(first, 0.0, steps))
-        return total + (starts - total[start])[piece]
-
-    yaw = summed(np.arctan2(step[:, 1, 0], step[:, 0, 0]), np.arctan2(poses[start, 1, 0], poses[start, 0, 0]))
-    before = np.concatenate([yaw[:1], yaw[:-1]])
-    dx, dy = _turned(step[:, 0, 3], step[:, 1, 3], before)
-    result = np.tile(np.eye(4), (len(poses), 1, 1))
-    result[:, 0, 0] = result[:, 1, 1] = np.cos(yaw)
-    result[:, 1, 0] = np.sin(yaw)
-    result[:, 0, 1] = -result[:, 1, 0]
-    result[:, 0, 3], result[:, 1, 3] = summed(dx, poses[start, 0, 3]), summed(dy, poses[start, 1, 3])
-    result[start] = poses[start]
-    return result
 
 
 def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain | None = None) -> Bools:
@@ -233,8 +172,8 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     of it from so many on.
     """
     odometry = ~is_loop(graph)
-    kept = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
-    closures = int((kept[~odometry] > 0).sum())
+    accepted = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
+    closures = int((accepted[~odometry] > 0).sum())
     if closures == 0:
         if odometry.all():
             return solution
@@ -244,7 +183,12 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
         return solution
     try:
-        checks = max(round(redundancy(Factors.of(graph), kept, solution.world_from_body, np.flatnonzero(odometry))), 1)
+        checks = max(
+            round(
+                redundancy(Objective(Factors.of(graph), accepted), solution.world_from_body, np.flatnonzero(odometry))
+            ),
+            1,
+        )
     except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
         checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))
     bound = chi2_quantile(_SURE, checks)
@@ -272,14 +216,14 @@ def odometry_kept(graph: PoseGraph, solution: Solution, why: str) -> Solution:
     )
 
 
-def redundancy(factors: Factors, weight: Floats, poses: Floats, rows: Ints, weighted: Any = None) -> float:
-    """Degrees of freedom with which the rest of the weighted edges (E,), or of `weighted`, checks edges `rows`.
+def redundancy(objective: Objective, poses: Floats, rows: Ints) -> float:
+    """Degrees of freedom with which the rest of what is minimised checks edges `rows`.
 
-    An edge's own less the trace of its information times what the solution leaves open of it (Foerstner 1979).
+    An edge's own less the trace of its Omega times its covariance in the solution (Foerstner 1979).
     """
-    graph = factors.graph
-    left_open = edge_covariances(factors, weight, poses, rows, weighted)
-    return degrees_of_freedom(graph) * len(rows) - float(np.einsum("eij,eji->", informed(graph)[rows], left_open))
+    graph = objective.factors.graph
+    covariance = edge_covariances(objective, poses, rows)
+    return degrees_of_freedom(graph) * len(rows) - float(np.einsum("eij,eji->", informed(graph)[rows], covariance))
 
 
 @lru_cache

@@ -35,19 +35,20 @@ def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSett
     believes, the closures speak against the odometry and not against each other.
     """
     loops = is_loop(graph)
-    kept, count = int((solution.weight[loops] > 0.5).sum()), int(loops.sum())
-    if not settings.use or kept == 0 or count - kept < max(settings.rejected, settings.rejected_share * count):
+    accepted, count = int((solution.weight[loops] > 0.5).sum()), int(loops.sum())
+    if not settings.use or accepted == 0 or count - accepted < max(settings.rejected, settings.rejected_share * count):
         return solution
-    said = []
+    findings = []
     for kernel in (DcsSettings(), GemanMcClureSettings()):
         other = kernel(graph)
         if keep_odometry_if_worse(graph, other) is other:
             return solution
-        said.append(f"{kernel.kind} {int((other.weight[loops] > 0.5).sum())}")
+        findings.append(f"{kernel.kind} {int((other.weight[loops] > 0.5).sum())}")
     return odometry_kept(
         graph,
         solution,
-        f"the methods disagree about the {count} verified closures. The solve keeps {kept}, {' and '.join(said)}, and "
-        "these bend the odometry further than its noise allows: as a body the closures are false, or the noise is too "
-        "small.",
+        f"the methods disagree about the {count} verified closures. The solve keeps {accepted}, "
+        f"{' and '.join(findings)}, "
+        "and these bend the odometry further than its noise allows: as a body the closures are false, or its noise is "
+        "too small.",
     )

@@ -1,80 +1,174 @@
-"""Least squares over the edges of a graph, by GTSAM or, where the graph is large, by our own elimination."""
+"""Nonlinear least squares over the edges of a graph: Gauss-Newton, then Levenberg-Marquardt."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import geometry
 from vplog.errors import GraphError
-from vplog.graph.cholesky import OPEN, Blocks, Cholesky
-from vplog.graph.factors import GAUGE_SIGMA, Fit, anchored, least_squares
-from vplog.graph.normal import half_chi2_of, normal_equations
+from vplog.graph.cholesky import OPEN
+from vplog.graph.linear import factorised
+from vplog.graph.normal import edge_costs, normal_equations
 from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
+    from vplog.data import Floats, Ints
     from vplog.graph.factors import Factors
+    from vplog.graph.fronts import Blocks
+    from vplog.graph.linear import BayesTree, Supernodes
 
-LARGE_POSES = 10_000
-"""Poses from which on our own elimination is taken. It is faster from 1 000 on, by two to seven times, but there GTSAM
-takes a second, and nothing need be compiled."""
+_GAUGE_SIGMA = 1e-6
+"""rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""
+_FREE_SIGMA = 1e2
+"""rad and m; holds pose 0 so weakly that positions alone say where the graph is."""
 _DAMPING = 1e-5
 """First damping of Levenberg-Marquardt, and the factor by which it changes: as GTSAM."""
 _DAMPING_CHANGE = 10.0
 _MOST_DAMPING = 1e5
 """Where it gives up, as GTSAM."""
-
 _ROWS = 1 << 14
 """Poses that a thread moves at once, some megabytes."""
 
 
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where a least squares descent ended."""
+
+    world_from_body: Floats
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """A robust loss of some edges, as iteratively reweighted least squares."""
+
+    edges: Ints
+    estimator: Any
+    """An mEstimator of GTSAM."""
+
+    def cost(self, cost: Floats) -> Floats:
+        """(E,) the loss in place of half the chi-square (E,)."""
+        result = np.array(cost)
+        result[self.edges] = [self.estimator.loss(sigma) for sigma in np.sqrt(2.0 * cost[self.edges]).tolist()]
+        return result
+
+    def weight(self, cost: Floats) -> Floats:
+        """(E,) weights at half the chi-square (E,), 1 for other edges."""
+        result = np.ones(len(cost))
+        result[self.edges] = [self.estimator.weight(sigma) for sigma in np.sqrt(2.0 * cost[self.edges]).tolist()]
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Measured positions (F, 3), in the frame of the start's pose 0, of points fixed to bodies, as GPSFactorArm."""
+
+    row: Ints
+    """(F,) pose."""
+    arm_m: Floats
+    """(F, 3) in the frame of its body."""
+    position_m: Floats
+    Omega: Floats
+    """(F, 3, 3) information; 0 for those that do not count."""
+
+    def error(self, poses: Floats) -> Floats:
+        at = poses[self.row]
+        return (at[:, :3, :3] @ self.arm_m[:, :, None])[:, :, 0] + at[:, :3, 3] - self.position_m
+
+    def cost(self, poses: Floats) -> float:
+        """Half the chi-square."""
+        error = self.error(poses)
+        return float(0.5 * np.einsum("fi,fij,fj->", error, self.Omega, error))
+
+    def add_to(self, diagonal: Floats, gradient: Floats, poses: Floats) -> None:
+        """Their normal equations, in place: the position moves with the pose as R (-[arm], I)."""
+        rotation = poses[self.row, :3, :3]
+        jacobian = np.concatenate([-rotation @ geometry.skew(self.arm_m), rotation], axis=2)
+        by_error = np.swapaxes(jacobian, 1, 2) @ self.Omega
+        np.add.at(diagonal, self.row, by_error @ jacobian)
+        np.add.at(gradient, self.row, (by_error @ self.error(poses)[:, :, None])[:, :, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """What is minimised: the weighted edges (E,), under a robust loss and with positions where these are given."""
+
+    factors: Factors
+    weight: Floats
+    loss: Loss | None = None
+    positions: Positions | None = None
+
+    def cost(self, poses: Floats) -> float:
+        """Half the chi-square, or the loss, at poses (N, 4, 4)."""
+        edges = edge_costs(self.factors.graph, self.weight, poses)
+        total = float((edges if self.loss is None else self.loss.cost(edges)).sum())
+        return total if self.positions is None else total + self.positions.cost(poses)
+
+    def linearised(self, poses: Floats) -> tuple[Blocks, Floats]:
+        """Half the Hessian and the gradient (N, d) at poses (N, 4, 4), as Gauss-Newton has them."""
+        graph, weight = self.factors.graph, self.weight
+        if self.loss is not None:
+            weight = weight * self.loss.weight(edge_costs(graph, weight, poses))
+        matrix, gradient, _ = normal_equations(graph, weight, poses)
+        if self.positions is not None:
+            self.positions.add_to(matrix.diagonal, gradient, poses)
+        return matrix, gradient
+
+    def factorised(self, matrix: Blocks, damping: float) -> Supernodes | BayesTree:
+        """Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
+        diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
+        held = np.concatenate([[0], self.factors.loose(self.weight)]).astype(np.int64)
+        diagonal[:, axes, axes] += damping
+        sigma = _GAUGE_SIGMA if self.positions is None else _FREE_SIGMA
+        diagonal[held[:, None], axes, axes] += 1.0 / sigma**2
+        return factorised(matrix._replace(diagonal=diagonal), lambda: self.factors.elimination(self.weight > 0))
+
+    def information(self, poses: Floats) -> Supernodes | BayesTree:
+        """The information matrix at `poses` (N, 4, 4). Raises GraphError where these are not determined."""
+        return self.factorised(self.linearised(geometry.between(poses[:1], poses))[0], 0.0)
+
+
 def descend(factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float) -> Fit:
-    """The least error of the weighted edges (E,) from poses `start` (N, 4, 4), pose 0 staying where it is.
+    """The least cost of the weighted edges (E,) from poses `start` (N, 4, 4), as minimised()."""
+    return minimised(Objective(factors, weight), start, max_iterations, tolerance)
+
+
+def minimised(objective: Objective, start: Floats, max_iterations: int, tolerance: float) -> Fit:
+    """The least cost from poses `start` (N, 4, 4), pose 0 staying where it is.
 
     Gauss-Newton as long as its steps help, then Levenberg-Marquardt. Ends when a step gains less than `tolerance` of
-    the error. Raises GraphError where the poses are not determined.
+    the cost. Raises GraphError where the poses are not determined.
     """
-    if is_large(start):
-        return descend_large(factors, weight, start, max_iterations, tolerance)
-    return least_squares(factors, factors.weighted(weight), start, max_iterations, tolerance)
-
-
-def is_large(poses: Floats) -> bool:
-    """Whether a graph of these poses (N, 4, 4) goes through our own elimination."""
-    return len(poses) >= LARGE_POSES
-
-
-def descend_large(factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float) -> Fit:
-    """As descend(), by sparse normal equations: the same steps, without an object for each edge."""
-    graph = factors.graph
+    dimension = objective.factors.graph.dimension
     poses = geometry.between(start[:1], start)
-    matrix, slope, error = normal_equations(graph, weight, poses)
-    steps, converged, damping = 0, False, 0.0
-    last = 0.0
+    cost, (matrix, gradient) = objective.cost(poses), objective.linearised(poses)
+    steps, converged, damping, last = 0, False, 0.0, 0.0
     while steps < max_iterations and not converged and damping <= _MOST_DAMPING:
         try:
-            step = -_root(factors, weight, matrix, damping).solve(slope[:, :, None])[:, :, 0]
+            step = -objective.factorised(matrix, damping).solve(gradient[:, :, None])[:, :, 0]
         except GraphError:
             damping = max(_DAMPING, damping * _DAMPING_CHANGE)
             last = 0.0
             continue
         steps += 1
-        moved = _moved(poses, step, graph.dimension)
-        gain = error - float(half_chi2_of(graph, weight, moved).sum())
+        moved = _retracted(poses, step, dimension)
+        gain = cost - objective.cost(moved)
         # a step gains at most as much less than the one before as that did: the next is not worth its time
         coming = gain * gain / last if 0 < gain < last else abs(gain)
-        converged = bool(min(abs(gain), coming) <= tolerance * max(error, 1.0))
+        converged = bool(min(abs(gain), coming) <= tolerance * max(cost, 1.0))
         if not (gain >= 0 or converged):  # NaN too
             damping = max(_DAMPING, damping * _DAMPING_CHANGE)
             continue
-        last, error = gain, error - gain
+        last, cost = gain, cost - gain
         if gain >= 0:
             poses = moved
         if not converged and steps < max_iterations:
             damping = damping / _DAMPING_CHANGE if damping > _DAMPING else 0.0
-            matrix, slope, error = normal_equations(graph, weight, poses)
+            matrix, gradient = objective.linearised(poses)
     if damping > _MOST_DAMPING:
         if steps == 0:
             raise GraphError(OPEN)
@@ -84,22 +178,14 @@ def descend_large(factors: Factors, weight: Floats, start: Floats, max_iteration
     return Fit(anchored(poses, start[0]), steps, converged)
 
 
-def eliminated(factors: Factors, weight: Floats, poses: Floats) -> Cholesky:
-    """The weighted edges (E,), linear at `poses` (N, 4, 4). Raises GraphError where these are not determined."""
-    matrix, _, _ = normal_equations(factors.graph, weight, geometry.between(poses[:1], poses))
-    return _root(factors, weight, matrix, 0.0)
+def anchored(poses: Floats, world_from_first: Floats) -> Floats:
+    """The poses (N, 4, 4) moved as one so that the first is exactly `world_from_first`."""
+    moved = world_from_first @ geometry.inverse(poses[0]) @ poses
+    moved[0] = world_from_first
+    return moved
 
 
-def _root(factors: Factors, weight: Floats, matrix: Blocks, damping: float) -> Cholesky:
-    """Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
-    diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
-    held = np.concatenate([[0], factors.loose(weight)]).astype(np.int64)
-    diagonal[:, axes, axes] += damping
-    diagonal[held[:, None], axes, axes] += 1.0 / GAUGE_SIGMA**2
-    return Cholesky.of(factors.elimination(weight > 0), Blocks(diagonal, matrix.a, matrix.b, matrix.other))
-
-
-def _moved(poses: Floats, step: Floats, dimension: int) -> Floats:
+def _retracted(poses: Floats, step: Floats, dimension: int) -> Floats:
     """The poses (N, 4, 4), each moved in its own frame by a twist (N, d)."""
     if dimension == 3:
         with Workers() as workers:

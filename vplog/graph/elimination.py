@@ -71,7 +71,7 @@ class Elimination:
     @cached_property
     def subtrees(self) -> Subtrees:
         """What of it can be worked on side by side."""
-        return Subtrees.of(self)
+        return Subtrees.of(self.form)
 
 
 def _dissected(n: int, a: Ints, b: Ints) -> Ints:
@@ -148,15 +148,15 @@ def _postordered(parent: Ints) -> Ints:
 def _counts(n: int, first: Ints, neighbours: Ints, parent: Ints) -> Ints:
     """Rows (n,) below the diagonal of each column of the factor: row by row, along the tree."""
     count = np.zeros(n, np.int64)
-    seen = np.full(n, -1, np.int64)
+    visited = np.full(n, -1, np.int64)
     for row in range(n):
-        seen[row] = row
+        visited[row] = row
         for at in range(first[row], first[row + 1]):
             node = neighbours[at]
             if node >= row:
                 break
-            while seen[node] != row:
-                seen[node] = row
+            while visited[node] != row:
+                visited[node] = row
                 count[node] += 1
                 node = parent[node]
     return count
@@ -207,16 +207,16 @@ def _supernodes(parent: Ints, count: Ints, relaxed: float, small: int) -> tuple[
 def _structure(n: int, first: Ints, neighbours: Ints, columns: Ints, parents: Ints, start: Ints) -> Ints:
     """The rows of each supernode below its columns, in no order: its own and what its children hand on."""
     rows = np.empty(start[-1], np.int64)
-    seen = np.full(n, -1, np.int64)
+    visited = np.full(n, -1, np.int64)
     child = np.full(len(parents), -1, np.int64)
     sibling = np.full(len(parents), -1, np.int64)
     for node in range(len(parents)):
         end, count = columns[node + 1], start[node]
         for column in range(columns[node], end):
-            count = _add_rows(node, end, neighbours[first[column] : first[column + 1]], seen, rows, count)
+            count = _add_rows(node, end, neighbours[first[column] : first[column + 1]], visited, rows, count)
         below = child[node]
         while below >= 0:
-            count = _add_rows(node, end, rows[start[below] : start[below + 1]], seen, rows, count)
+            count = _add_rows(node, end, rows[start[below] : start[below + 1]], visited, rows, count)
             below = sibling[below]
         if parents[node] >= 0:
             sibling[node] = child[parents[node]]
@@ -225,11 +225,11 @@ def _structure(n: int, first: Ints, neighbours: Ints, columns: Ints, parents: In
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_rows(node: int, end: int, more: Ints, seen: Ints, rows: Ints, count: int) -> int:
+def _add_rows(node: int, end: int, more: Ints, visited: Ints, rows: Ints, count: int) -> int:
     """Put those of the rows `more` from `end` on that a supernode does not have yet behind its others in `rows`."""
     for row in more:
-        if row >= end and seen[row] != node:
-            seen[row] = node
+        if row >= end and visited[row] != node:
+            visited[row] = node
             rows[count] = row
             count += 1
     return count

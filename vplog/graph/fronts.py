@@ -11,10 +11,22 @@ from vplog.graph.dense import eliminate_front
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints
-    from vplog.graph.cholesky import Blocks
 
     Listed = tuple[Ints, Ints, Ints]
     """As of by_supernode()."""
+
+
+class Blocks(NamedTuple):
+    """A symmetric matrix of n x n blocks (d, d)."""
+
+    diagonal: Floats
+    """(n, d, d)."""
+    a: Int32s | Ints
+    """(E,) row of each other block; pairs may repeat, and add."""
+    b: Int32s | Ints
+    """(E,) its column; never the same."""
+    other: Floats
+    """(E, d, d) at row a, column b; its transpose at row b, column a."""
 
 
 class Form(NamedTuple):

@@ -1,11 +1,11 @@
-"""Graduated non-convexity: closures that do not fit the rest lose their say, odometry is always believed.
+"""Graduated non-convexity: closures that do not fit the rest lose their weight, odometry keeps its own.
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020. Three things are
-added to it, since it starts from a solve that believes every closure, which false ones can bend beyond return, and ends
+added to it, since it starts from a solve with every closure, which false ones can bend beyond return, and ends
 where no closure has a large residual, which a false one has not either where little else holds the graph:
 
 1. The start is what agrees with the odometry, by the mixture of agreement.py.
-2. Noise is often said far too large, and then says nothing about false closures. So its scale is taken from the solved
+2. Noise is often claimed far too large, and then tells no false closure. So its scale is taken from the solved
    graph as well.
 3. In the end each closure, and each group of neighbouring ones, is held against what the rest predicts (scrutiny.py).
 """
@@ -27,10 +27,10 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
-from vplog.graph.descent import descend, is_large
+from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
-from vplog.graph.lm import solve_kept
+from vplog.graph.lm import solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.scrutiny import Scrutiny
@@ -40,15 +40,9 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 
-_AT_ONCE = 3
-"""Stages that a large graph takes as one, of one least squares step. Drives of 12 000 poses keep the same closures as
-stage by stage, of 100 000 poses all but one of 5948, with half of the factorisations."""
-_FIRST_STEPS = 5
-"""Least squares steps of a large graph before its stages at most. 100 000 poses take 3; where false closures are left
-that bend a million, 20 and more do not settle them, and the stages need no settled start."""
 _BRANCHES = 200
-"""Of the search for the largest set of each two pieces of a large graph: a greedy one and some more. Where some hundred
-closures join two drives, one in a hundred pairs of which disagrees by chance, an exact search does not end."""
+"""Of the search for the largest set of closures between two pieces of odometry: a greedy one and some more. Where
+some hundred closures join two drives, one in a hundred pairs of which disagrees by chance, an exact one never ends."""
 
 
 class GncSettings(Settings):
@@ -83,7 +77,7 @@ class GncSettings(Settings):
         weight = np.ones(len(graph.a))
         if len(loops) == 0:
             start = initial_poses(factors, weight)
-            return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, "")
+            return solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
         chain = OdometryChain.of(graph)
         agreed = agreement(graph, loops, chain)
         gated = far_from_odometry(graph, self.gate_probability, chain)[loops]
@@ -95,22 +89,20 @@ class GncSettings(Settings):
             factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
         )
         state = scrutiny(weight, poses)
-        kept = int(state.weight[loops].sum())
+        accepted = int(state.weight[loops].sum())
         taken = "1 stage" if stages == 1 else f"{stages} stages"
         found = (
-            f"{kept} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. {apart} "
-            f"did not agree with it at first; {taken} and a look at what each costs the others decided. "
+            f"{accepted} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. "
+            f"{apart} disagreed with it at first; {taken} and leave-one-out tests decided. "
         )
-        return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
+        return solve_weighted(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
     def _join(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest set that agrees."""
         part = chain.part
         one, two = part[graph.a[loops]], part[graph.b[loops]]
         across = one != two
-        consistency = PcmSettings(pair_probability=self.inlier_probability)
-        if is_large(chain.poses):
-            consistency = consistency.model_copy(update={"clique_steps": _BRANCHES})
+        consistency = PcmSettings(pair_probability=self.inlier_probability, clique_steps=_BRANCHES)
         good = ~across
         # closures between other pieces say nothing about each other, so each two pieces are judged by themselves
         pairs = np.minimum(one, two) * (int(part.max()) + 1) + np.maximum(one, two)
@@ -118,8 +110,8 @@ class GncSettings(Settings):
         first = np.flatnonzero(np.diff(pairs[by_pair], prepend=-1))
         with Workers() as workers:
             tasks = [(graph, loops[rows], chain) for rows in np.split(by_pair, first)[1:]]
-            for kept, _ in workers.each(consistency.consistent, tasks):
-                good[np.searchsorted(loops, kept)] = True
+            for accepted, _ in workers.each(consistency.consistent, tasks):
+                good[np.searchsorted(loops, accepted)] = True
         return good
 
     def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats, int]:
@@ -128,18 +120,15 @@ class GncSettings(Settings):
         judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
         if len(judged) == 0:
             return weight, poses, 0
-        first, steps, growth = self.max_iterations, self.steps, self.growth
-        if is_large(poses):
-            first, steps, growth = min(first, _FIRST_STEPS), 1, growth**_AT_ONCE
-        poses = descend(factors, weight, poses, first, 1e-3).world_from_body
+        poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         stage = 0
-        for stage in range(1, self.max_stages + 1):  # noqa: B007 (told in the reason)
+        for stage in range(1, self.max_stages + 1):  # noqa: B007 (used in the reason)
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
-            poses = descend(factors, weight, poses, steps, self.stage_tolerance).world_from_body
+            poses = descend(factors, weight, poses, self.steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
-            mu *= growth
+            mu *= self.growth
         return np.where(weight > 0.5, 1.0, 0.0), poses, stage

@@ -5,31 +5,24 @@ from __future__ import annotations
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
-import gtsam
 import numpy as np
 
 from vplog import geometry
 from vplog.errors import GraphError
-from vplog.graph.cholesky import Blocks, Cholesky
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
-from vplog.graph.descent import is_large
-from vplog.graph.factors import anchored, as_array
+from vplog.graph.descent import anchored
+from vplog.graph.fronts import Blocks
+from vplog.graph.linear import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
     from vplog.graph.factors import Factors
 
 
-_LINEAR_STEPS = 300
-"""Conjugate gradients on a linear problem at most: with the chain as preconditioner they end after a step per loop."""
-_ROUGH_STEPS = 50
-"""The same for headings where there are more loops than that: what is left is within the reach of least squares."""
 _LOST_RAD = np.pi / 3.0
 """Noise of the heading, rad, beyond which the chain's whole circles may be wrong: half a circle is three sigmas."""
 _HELD = 1e6
 """How much more firmly than by any edge the first pose is held."""
-_LINEAR_TOLERANCE = 1e-4
-"""They end at this share of the first residual: what follows corrects far more."""
 
 
 def relaxed(factors: Factors, weight: Floats, chain: Floats) -> Floats | None:
@@ -41,22 +34,14 @@ def relaxed(factors: Factors, weight: Floats, chain: Floats) -> Floats | None:
     if len(factors.loose(weight)):
         return None
     try:
-        if factors.graph.dimension == 2:
-            poses = _planar(factors, weight, chain)
-        else:
-            poses = _chordal_large(factors, weight) if is_large(chain) else _chordal(factors, weight)
-    except (RuntimeError, GraphError):  # of GTSAM's elimination, and of our own
+        poses = _lago(factors, weight, chain) if factors.graph.dimension == 2 else _chordal(factors, weight)
+    except GraphError:
         return None
     return anchored(poses, factors.graph.world_from_body[0]) if np.isfinite(poses).all() else None
 
 
 def _chordal(factors: Factors, weight: Floats) -> Floats:
-    """Chordal relaxation of the rotations, and one linear step: Carlone et al., ICRA 2015, III-B."""
-    return as_array(gtsam.InitializePose3.initialize(factors.weighted(weight)), 3)
-
-
-def _chordal_large(factors: Factors, weight: Floats) -> Floats:
-    """The same relaxation of the rotations by our own elimination, and positions as a linear problem of their own."""
+    """Chordal relaxation of the rotations, then positions as a linear problem: Carlone et al., ICRA 2015, III-B."""
     graph = factors.graph
     n, held = len(graph.world_from_body), np.eye(3)
     firmness = weight * np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3.0
@@ -66,24 +51,30 @@ def _chordal_large(factors: Factors, weight: Floats) -> Floats:
     right = np.zeros((n, 3, 3))
     right[0] = firmness.max() * _HELD * held
     between = -firmness[:, None, None] * graph.a_from_b[:, :3, :3]
-    shape = factors.elimination(weight > 0)
-    columns = Cholesky.of(shape, Blocks(diagonal, graph.a, graph.b, between)).solve(right)
+    matrix = Blocks(diagonal, graph.a, graph.b, between)
+    columns = factorised(matrix, lambda: factors.elimination(weight > 0)).solve(right)
     left, _, turned = np.linalg.svd(np.swapaxes(columns, 1, 2))
     left[:, :, 2] *= np.linalg.det(left @ turned)[:, None]  # the nearest rotations
     rotation = left @ turned
     firmness = weight * np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     shift = (rotation[graph.a] @ graph.a_from_b[:, :3, 3:])[:, :, 0]
-    return geometry.pose(rotation, _apart(factors, weight, firmness, shift))
+    return geometry.pose(rotation, _potentials(factors, weight, firmness, shift))
 
 
-def _apart(factors: Factors, weight: Floats, firmness: Floats, difference: Floats) -> Floats:
-    """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first is 0."""
+def _potentials(factors: Factors, weight: Floats, firmness: Floats, difference: Floats) -> Floats:
+    """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first is 0.
+
+    The Laplacian of the graph with `firmness` (E,) as weights of the edges.
+    """
     graph = factors.graph
     diagonal = _ends(graph, firmness)
     diagonal[0] += firmness.max() * _HELD
-    right = _pull(graph, firmness[:, None] * difference)
+    right = np.zeros((len(diagonal), difference.shape[1]))
+    np.add.at(right, graph.b, firmness[:, None] * difference)
+    np.subtract.at(right, graph.a, firmness[:, None] * difference)
+    right[0] = 0.0
     matrix = Blocks(diagonal[:, None, None], graph.a, graph.b, -firmness[:, None, None])
-    return Cholesky.of(factors.elimination(weight > 0), matrix).solve(right[:, None, :])[:, 0]
+    return factorised(matrix, lambda: factors.elimination(weight > 0)).solve(right[:, None, :])[:, 0]
 
 
 def _ends(graph: PoseGraph, firmness: Floats) -> Floats:
@@ -92,17 +83,7 @@ def _ends(graph: PoseGraph, firmness: Floats) -> Floats:
     return np.asarray(np.bincount(graph.a, firmness, n) + np.bincount(graph.b, firmness, n), np.float64)
 
 
-def _pull(graph: PoseGraph, tension: Floats) -> Floats:
-    """(N, k) what tensions (E, k) of the edges add up to at their ends, the first pose being held."""
-    n = len(graph.world_from_body)
-    result = np.empty((n, tension.shape[1]))
-    for column, along in enumerate(tension.T):
-        result[:, column] = np.bincount(graph.b, along, n) - np.bincount(graph.a, along, n)
-    result[0] = 0.0
-    return result
-
-
-def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
+def _lago(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     """Linear approximation for graph optimisation: Carlone, Aragues, Castellanos, Bona, IJRR 2014 (LAGO).
 
     Along a spanning tree turns are summed without wrapping, so each other edge tells the turn between its ends but for
@@ -116,24 +97,12 @@ def _planar(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     if (1.0 / graph.information[~is_loop(graph), 2, 2]).sum() > _LOST_RAD**2:
         yaw = _turned_least(graph, weight, turn, yaw)
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
-    many = (np.abs(graph.a - graph.b) != 1).sum() > _LINEAR_STEPS
-    steps = _ROUGH_STEPS if many else _LINEAR_STEPS
-    large = is_large(chain)
-    if large:
-        yaw = yaw[0] + _apart(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]
-    else:
-        yaw = _spread(graph, weight * graph.information[:, 2, 2], turn[:, None], yaw[:, None], steps)[:, 0]
+    yaw = yaw[0] + _potentials(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]
     zero = np.zeros(len(yaw))
     poses = geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
     shift = (poses[graph.a, :2, :2] @ graph.a_from_b[:, :2, 3:])[:, :, 0]
     firmness = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
-    if large:
-        poses[:, :2, 3] = _apart(factors, weight, weight * firmness, shift)
-        return poses
-    if many:  # factorising is faster
-        poses[:, :2, 3] = _placed(graph, weight * firmness, shift)
-        return poses
-    poses[:, :2, 3] = _spread(graph, weight * firmness, shift, poses[:, :2, 3], _LINEAR_STEPS)
+    poses[:, :2, 3] = _potentials(factors, weight, weight * firmness, shift)
     return poses
 
 
@@ -161,55 +130,6 @@ def _turned_least(graph: PoseGraph, weight: Floats, turn: Floats, yaw: Floats) -
                 result[there] = result[node] + step[edge]
                 heappush(waiting, (total, there))
     return np.array(result)
-
-
-def _placed(graph: PoseGraph, firmness: Floats, shift: Floats) -> Floats:
-    """What _spread finds for positions (N, 2), from the origin and by factorisation."""
-    linear = gtsam.NonlinearFactorGraph()
-    linear.add(gtsam.PriorFactorPoint2(0, np.zeros(2), gtsam.noiseModel.Isotropic.Precision(2, 1e12)))
-    noise = {one: gtsam.noiseModel.Isotropic.Precision(2, one) for one in np.unique(firmness[firmness > 0]).tolist()}
-    for a, b, moved, one in zip(graph.a.tolist(), graph.b.tolist(), shift, firmness.tolist(), strict=True):
-        if one > 0:
-            linear.add(gtsam.BetweenFactorPoint2(a, b, moved, noise[one]))
-    values = gtsam.Values()
-    for node in range(len(graph.world_from_body)):
-        values.insert(node, np.zeros(2))
-    values = values.retract(linear.linearize(values).optimize())
-    return np.asarray(gtsam.utilities.extractPoint2(values), np.float64)
-
-
-def _spread(graph: PoseGraph, firmness: Floats, difference: Floats, start: Floats, steps: int) -> Floats:
-    """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first stays.
-
-    Conjugate gradients on the normal equations. The preconditioner is the same problem on the chain of poses alone,
-    which two running sums solve; a link that has no edge is given the mean firmness.
-    """
-    n, k = start.shape
-    a, b = graph.a, graph.b
-
-    chain = np.bincount(np.maximum(a, b), np.where(np.abs(a - b) == 1, firmness, 0.0), n)[1:, None]
-    chain = np.where(chain > 0, chain, firmness.mean())
-
-    def precondition(residual: Floats) -> Floats:
-        flow = np.cumsum(residual[:0:-1], axis=0)[::-1]  # through each link goes what everything after it pulls
-        return np.concatenate([np.zeros((1, k)), np.cumsum(flow / chain, axis=0)])
-
-    values = np.array(start)
-    residual = _pull(graph, firmness[:, None] * (difference - values[b] + values[a]))
-    direction = step = precondition(residual)
-    energy = first = (residual * step).sum(0)
-    for _ in range(steps):
-        if (energy <= _LINEAR_TOLERANCE**2 * first).all():
-            break
-        back = _pull(graph, firmness[:, None] * (direction[b] - direction[a]))
-        along = (direction * back).sum(0)
-        length = np.divide(energy, along, out=np.zeros(k), where=along > 0)
-        values = values + length * direction
-        residual = residual - length * back
-        step = precondition(residual)
-        before, energy = energy, (residual * step).sum(0)
-        direction = step + np.divide(energy, before, out=np.zeros(k), where=before > 0) * direction
-    return values
 
 
 def initial_poses(factors: Factors, weight: Floats, bound: float = np.inf) -> Floats:

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from vplog.graph.fronts import found, rows_of_child
-from vplog.graph.inverse_fronts import hand_down, invert_run, invert_together, note
+from vplog.graph.inverse_fronts import hand_down, invert_run, invert_together, store_blocks
 from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
@@ -30,15 +30,15 @@ def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tupl
     low, high = np.minimum(one, two), np.maximum(one, two)
     where = np.searchsorted(shape.first, low, "right") - 1  # the front that holds both
     order = np.argsort(where, kind="stable")
-    asked = np.searchsorted(where[order], np.arange(len(wide) + 1))
+    requested = np.searchsorted(where[order], np.arange(len(wide) + 1))
     low, high = low[order], high[order]
-    kept = np.zeros((3, len(order), size, size))
+    blocks = np.zeros((3, len(order), size, size))
 
-    needed = _needed(shape.parent, np.diff(asked))
+    needed = _needed(shape.parent, np.diff(requested))
     handed = np.flatnonzero((shape.parent >= 0) & needed)
     children = handed[np.argsort(shape.parent[handed], kind="stable")]
     child = np.searchsorted(shape.parent[children], np.arange(len(wide) + 1))
-    form, wanted = shape.form, (asked, low, high, kept)
+    form, wanted = shape.form, (requested, low, high, blocks)
     known: dict[int, Floats] = {}
     with Workers() as workers:
         for node in reversed(shape.subtrees.top):
@@ -50,7 +50,7 @@ def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tupl
                 front[wide[node] :, wide[node] :] = known.pop(node)
             root = factor.values[factor.begin[node] : factor.begin[node + 1]].reshape(wide[node], length)
             invert_together(front, root, workers)
-            note(node, front, form, size, wanted)
+            store_blocks(node, front, form, size, wanted)
             tasks = []
             for below_it in children[child[node] : child[node + 1]].tolist():
                 known[below_it] = np.empty((below[below_it], below[below_it]))
@@ -63,8 +63,8 @@ def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tupl
         tree = (form, size, factor.begin, factor.values, needed, (child, children, below), wanted)
         tasks = [(*run, roots, *tree) for run, roots in zip(shape.subtrees.runs, given, strict=True)]
         workers.each(invert_run, tasks)
-    result = np.empty_like(kept)
-    result[:, order] = kept
+    result = np.empty_like(blocks)
+    result[:, order] = blocks
     turned = (one > two)[:, None, None]  # kept as first, both, second in order of elimination
     aa, ab, bb = result
     return (
@@ -138,9 +138,9 @@ def _squared(lines: Floats, result: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _needed(parent: Ints, asked: Ints) -> np.ndarray:
+def _needed(parent: Ints, requested: Ints) -> np.ndarray:
     """Whether each supernode or one of those below it is asked for."""
-    needed = asked > 0
+    needed = requested > 0
     for node in range(len(parent)):
         if needed[node] and parent[node] >= 0:
             needed[parent[node]] = True

@@ -38,7 +38,7 @@ def invert_together(front: Floats, root: Floats, workers: Workers) -> None:
         begun = max(end - AT_ONCE, 0)
         _gained(root, begun, end, gain)
         parts = workers.ranges(end, length, _LEAST_SHARE)
-        workers.each(_told, [(front, begun, end, gain, left, right) for left, right in parts])
+        workers.each(_cross_rows, [(front, begun, end, gain, left, right) for left, right in parts])
         _within(front, root, begun, end)
         end = begun
 
@@ -52,13 +52,13 @@ def invert_front(front: Floats, root: Floats) -> None:
     while end > 0:
         begun = max(end - AT_ONCE, 0)
         _gained(root, begun, end, gain)
-        _told(front, begun, end, gain, end, length)
+        _cross_rows(front, begun, end, gain, end, length)
         _within(front, root, begun, end)
         end = begun
 
 
 @numba.njit(cache=True, nogil=True)
-def _told(front: Floats, begun: int, end: int, gain: Floats, low: int, high: int) -> None:
+def _cross_rows(front: Floats, begun: int, end: int, gain: Floats, low: int, high: int) -> None:
     """Rows begun:end of the inverse in columns low:high, all after `end`, and their mirror image."""
     length = len(front)
     share = np.empty(AT_ONCE)
@@ -108,12 +108,12 @@ def _gained(root: Floats, begun: int, end: int, gain: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def note(node: int, front: Floats, form: Form, size: int, wanted: Wanted) -> None:
+def store_blocks(node: int, front: Floats, form: Form, size: int, wanted: Wanted) -> None:
     """Keep the blocks that are asked of a supernode."""
     first, start, rows, _, _ = form
-    asked, low, high, result = wanted
+    requested, low, high, result = wanted
     wide = first[node + 1] - first[node]
-    for pair in range(asked[node], asked[node + 1]):
+    for pair in range(requested[node], requested[node + 1]):
         one = (low[pair] - first[node]) * size
         if high[pair] < first[node + 1]:
             two = (high[pair] - first[node]) * size
@@ -181,7 +181,7 @@ def invert_run(
             for i in range(left):
                 front[wide + i, wide:] = stack[used + i * left : used + (i + 1) * left]
         invert_front(front, values[begin[node] : begin[node + 1]].reshape(wide, length))
-        note(node, front, form, size, wanted)
+        store_blocks(node, front, form, size, wanted)
         for at in range(child[node], child[node + 1]):
             count = below[children[at]]
             to = rows_of_child(node, children[at], form, size)

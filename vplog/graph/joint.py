@@ -127,9 +127,9 @@ def join(
             if at not in apart and len(one.query) and one.later in inside and one.earlier in inside
         ]
         graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
-        believed = _as_found(drives, members, graph)
-        tried = solve(believed)
-        solution = keep_odometry_if_worse(believed, tried, KNOWN_TO)
+        as_estimated = _as_found(drives, members, graph)
+        tried = solve(as_estimated)
+        solution = keep_odometry_if_worse(as_estimated, tried, KNOWN_TO)
         held = dict(zip(ties, rows, strict=True))
         places = {at: _places(between[at], settings.spacing, tried.weight[held[at]]) for at in ties if joined[at]}
         loose = [at for at, count in places.items() if count < settings.least_closures]
@@ -153,8 +153,8 @@ def join(
 
 def _places(one: Between, spacing: int, weight: Floats | None = None) -> int:
     """Places of the drive that has fewer, of closures with weight (L,): keyframes so far from one to the next."""
-    kept = slice(None) if weight is None else weight > 0.5
-    return min(spaced_apart(one.query[kept], spacing), spaced_apart(one.match[kept], spacing))
+    accepted = slice(None) if weight is None else weight > 0.5
+    return min(spaced_apart(one.query[accepted], spacing), spaced_apart(one.match[accepted], spacing))
 
 
 def spaced_apart(keyframes: Ints, spacing: int) -> int:

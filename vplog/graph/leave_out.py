@@ -16,14 +16,13 @@ import numpy as np
 from vplog import geometry
 from vplog.graph.build import AXES, informed
 from vplog.graph.consistency import OdometryChain
+from vplog.graph.descent import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
 
 if TYPE_CHECKING:
-    import gtsam
-
     from vplog.data import Floats, Int32s, Ints, PoseGraph
-    from vplog.graph.cholesky import Cholesky
     from vplog.graph.factors import Factors
+    from vplog.graph.linear import BayesTree, Supernodes
 
 _ALONE = 1e-9
 """Least share of a closure's say that the rest has, so that no quotient is infinite."""
@@ -53,8 +52,8 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     """Of the closures `loops` (K,), all with weight, after least squares over the weighted edges (E,) at `poses`."""
     graph = factors.graph
     axes = AXES[graph.dimension]
-    error, turned = _errors(graph, poses, loops)
-    covariance = turned @ edge_covariances(factors, weight, poses, loops) @ np.swapaxes(turned, 1, 2)
+    error, Jr_inv = _errors(graph, poses, loops)
+    covariance = Jr_inv @ edge_covariances(Objective(factors, weight), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
     information = informed(graph)[loops] * weight[loops, None, None]
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     # leverage: the share of the closure's own say in where its ends are, 1 where nothing else tells
@@ -70,16 +69,14 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     )
 
 
-def cost_together(
-    factors: Factors, weight: Floats, poses: Floats, tree: gtsam.GaussianBayesTree | Cholesky, loops: Ints
-) -> float:
-    """By how much chi-square falls without all of a few closures, to first order; `tree` as of marginals.factorised."""
+def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Supernodes | BayesTree, loops: Ints) -> float:
+    """By how much chi-square falls without all of a few closures, to first order; `tree` of Objective.information()."""
     size = len(AXES[factors.graph.dimension])
-    error, turned = _errors(factors.graph, poses, loops)
+    error, Jr_inv = _errors(factors.graph, poses, loops)
     information = informed(factors.graph)[loops] * weight[loops, None, None]
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     whiten = np.zeros((len(loops) * size, len(loops) * size))
-    for row, matrix in enumerate(root @ turned):
+    for row, matrix in enumerate(root @ Jr_inv):
         whiten[row * size : (row + 1) * size, row * size : (row + 1) * size] = matrix
     leverage, turn = np.linalg.eigh(whiten @ joint_covariance(factors, tree, poses, loops) @ whiten.T)
     whitened = turn.T @ (root @ error[:, AXES[factors.graph.dimension], None]).ravel()
@@ -93,8 +90,8 @@ def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tu
     # with next to no weight they are in the factorisation, which then knows their covariance, and change nothing
     barely = np.array(weight)
     barely[loops] = 1e-9
-    error, turned = _errors(graph, poses, loops)
-    covariance = turned @ edge_covariances(factors, barely, poses, loops) @ np.swapaxes(turned, 1, 2)
+    error, Jr_inv = _errors(graph, poses, loops)
+    covariance = Jr_inv @ edge_covariances(Objective(factors, barely), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
     covariance = covariance + np.linalg.inv(informed(graph)[loops])
     error = error[:, axes]
     squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
@@ -217,8 +214,8 @@ def _nearest(a: Int32s, b: Int32s, count: int) -> list[Ints]:
     other = np.arange(len(a))[:, None] + beside
     inside = (other >= 0) & (other < len(a))
     other = order[np.clip(other, 0, len(a) - 1)]
-    away = np.abs(a[other].astype(np.int64) - a[order, None]) + np.abs(b[other].astype(np.int64) - b[order, None])
-    best = np.argsort(np.where(inside, away, np.iinfo(np.int64).max), axis=1, kind="stable")[:, :count]
+    rows = np.abs(a[other].astype(np.int64) - a[order, None]) + np.abs(b[other].astype(np.int64) - b[order, None])
+    best = np.argsort(np.where(inside, rows, np.iinfo(np.int64).max), axis=1, kind="stable")[:, :count]
     result = np.empty((len(a), count), np.int64)
     result[order] = np.take_along_axis(other, best, axis=1)
     return list(result.T)

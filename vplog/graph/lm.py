@@ -10,14 +10,14 @@ from pydantic import Field
 from vplog.data import Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.descent import LARGE_POSES, descend, is_large
+from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
-    from vplog.graph.factors import Fit
+    from vplog.graph.descent import Fit
 
 
 class LmSettings(Settings):
@@ -35,16 +35,15 @@ class LmSettings(Settings):
         graph, _ = checked(graph)
         factors = Factors.of(graph)
         weight = np.ones(len(graph.a))
-        return solve_kept(factors, weight, initial_poses(factors, weight), self.max_iterations, self.tolerance, "")
+        return solve_weighted(factors, weight, initial_poses(factors, weight), self.max_iterations, self.tolerance, "")
 
 
-def solve_kept(
+def solve_weighted(
     factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float, found: str
 ) -> Solution:
     """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
     fit = descend(factors, weight, start, max_iterations, tolerance)
-    by = f" by sparse elimination, as for all of {LARGE_POSES} poses or more," if is_large(start) else ""
-    return as_solution(factors.graph, weight, fit, f"{found}Least squares{by}")
+    return as_solution(factors.graph, weight, fit, f"{found}Least squares")
 
 
 def as_solution(graph: PoseGraph, weight: Floats, fit: Fit, found: str) -> Solution:

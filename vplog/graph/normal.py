@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numba
 import numpy as np
 
-from vplog.graph.cholesky import Blocks
+from vplog.graph.fronts import Blocks
 from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
@@ -40,13 +40,13 @@ class _Edges(NamedTuple):
 class _Sums(NamedTuple):
     """What the edges are added up to, zero at first."""
 
-    half: Floats
+    cost: Floats
     """(E,) half the chi-square."""
     diagonal: Floats
-    """(n, d, d), or empty where nothing but half the chi-square is asked for, as are those below."""
+    """(n, d, d), or empty where only costs are computed, as are those below."""
     other: Floats
     """(E, d, d)."""
-    slope: Floats
+    gradient: Floats
     """(n, d)."""
 
 
@@ -67,10 +67,10 @@ def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[B
         begin, listed = _by_range(np.array([low for low, _ in ranges] + [n]), graph.a, graph.b)
         parts = zip(begin[:-1], begin[1:], ranges, strict=True)
         workers.each(terms, [(listed[first:last], *part, given, poses, sums) for first, last, part in parts])
-    return Blocks(sums.diagonal, graph.a, graph.b, sums.other), sums.slope, float(sums.half.sum())
+    return Blocks(sums.diagonal, graph.a, graph.b, sums.other), sums.gradient, float(sums.cost.sum())
 
 
-def half_chi2_of(graph: PoseGraph, weight: Floats, poses: Floats, edges: Ints | None = None) -> Floats:
+def edge_costs(graph: PoseGraph, weight: Floats, poses: Floats, edges: Ints | None = None) -> Floats:
     """Half the weighted chi-square of each edge (E,), or of those named, at `poses`."""
     terms, given = _terms(graph, weight)
     none = np.empty((0, 0, 0))
@@ -79,7 +79,7 @@ def half_chi2_of(graph: PoseGraph, weight: Floats, poses: Floats, edges: Ints | 
     with Workers() as workers:
         parts = workers.ranges(0, len(wanted), _LEAST_SHARE, _BY_THREAD)
         workers.each(terms, [(wanted[low:high], 0, len(poses), given, poses, sums) for low, high in parts])
-    return sums.half if edges is None else sums.half[edges]
+    return sums.cost if edges is None else sums.cost[edges]
 
 
 def _terms(graph: PoseGraph, weight: Floats) -> tuple[Terms, _Edges]:
@@ -119,25 +119,25 @@ def _by_range(ends: Ints, a: Int32s, b: Int32s) -> tuple[Ints, Ints]:
 
 @numba.njit(cache=True, nogil=True)
 def _planar(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sums: _Sums) -> None:
-    """Add what these edges say about poses low:high; nothing but half the chi-square where `diagonal` is empty.
+    """Add the normal equations of these edges for poses low:high; only costs where `diagonal` is empty.
 
-    What belongs to an edge and not to a pose is told by whoever has its first end.
+    What belongs to an edge and not to a pose is added by the range that has its first end.
     """
     a, b, measured, _, weight = given
-    error, move, bend, turned, say = np.empty(3), np.zeros((3, 3)), np.eye(3), np.empty((3, 3)), np.empty((3, 3))
+    error, Ad, Jr_inv, turned, JtOmega = np.empty(3), np.zeros((3, 3)), np.eye(3), np.empty((3, 3)), np.empty((3, 3))
     for at in range(len(edges)):
         edge = int(edges[at])
         if weight[edge] == 0.0:
             continue
-        one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
-        # b seen from a, and that seen from where b was measured
+        one, two, z = poses[a[edge]], poses[b[edge]], measured[edge]
+        # a_from_b, and from there to where b was measured
         dx, dy = two[0, 3] - one[0, 3], two[1, 3] - one[1, 3]
         x, y = one[0, 0] * dx + one[1, 0] * dy, one[0, 1] * dx + one[1, 1] * dy
         c = one[0, 0] * two[0, 0] + one[1, 0] * two[1, 0]
         s = one[0, 0] * two[1, 0] - one[1, 0] * two[0, 0]
-        ex, ey = x - seen[0, 3], y - seen[1, 3]
-        ex, ey = seen[0, 0] * ex + seen[1, 0] * ey, seen[0, 1] * ex + seen[1, 1] * ey
-        turn = atan2(seen[0, 0] * s - seen[1, 0] * c, seen[0, 0] * c + seen[1, 0] * s)
+        ex, ey = x - z[0, 3], y - z[1, 3]
+        ex, ey = z[0, 0] * ex + z[1, 0] * ey, z[0, 1] * ex + z[1, 1] * ey
+        turn = atan2(z[0, 0] * s - z[1, 0] * c, z[0, 0] * c + z[1, 0] * s)
         h = turn / 2.0
         straight = 1.0 - h**2 / 3.0 - h**4 / 45.0 - 2.0 * h**6 / 945.0  # h cot h where h is small
         curve = 1.0 / 12.0 + turn * turn / 720.0
@@ -145,27 +145,27 @@ def _planar(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sums
             straight = h * cos(h) / sin(h)
             curve = (1.0 - straight) / (turn * turn)
         error[0], error[1], error[2] = turn, straight * ex + h * ey, straight * ey - h * ex
-        # Ad(b_from_a), negative; b_from_a turns by -turn of b and shifts by (-c x - s y, s x - c y)
-        move[0, 0] = -1.0
-        move[1, 0], move[2, 0] = -(s * x - c * y), -(c * x + s * y)
-        move[1, 1], move[1, 2], move[2, 1], move[2, 2] = -c, -s, s, -c
+        # -Ad(b_from_a); b_from_a turns by -turn of b and shifts by (-c x - s y, s x - c y)
+        Ad[0, 0] = -1.0
+        Ad[1, 0], Ad[2, 0] = -(s * x - c * y), -(c * x + s * y)
+        Ad[1, 1], Ad[1, 2], Ad[2, 1], Ad[2, 2] = -c, -s, s, -c
         # I + ad / 2 + curve ad^2 with ad = (0 0 0, y 0 -turn, -x turn 0) of the residual
-        bend[1, 0] = error[2] / 2.0 + curve * turn * error[1]
-        bend[2, 0] = -error[1] / 2.0 + curve * turn * error[2]
-        bend[1, 1] = bend[2, 2] = 1.0 - curve * turn * turn
-        bend[1, 2], bend[2, 1] = -h, h
-        _product(bend, move, turned)
-        _add(edge, low, high, given, error, turned, bend, sums, say)
+        Jr_inv[1, 0] = error[2] / 2.0 + curve * turn * error[1]
+        Jr_inv[2, 0] = -error[1] / 2.0 + curve * turn * error[2]
+        Jr_inv[1, 1] = Jr_inv[2, 2] = 1.0 - curve * turn * turn
+        Jr_inv[1, 2], Jr_inv[2, 1] = -h, h
+        _product(Jr_inv, Ad, turned)
+        _add(edge, low, high, given, error, turned, Jr_inv, sums, JtOmega)
 
 
 @numba.njit(cache=True, nogil=True)
 def _spatial(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sums: _Sums) -> None:
-    """Add what these edges say about poses low:high; nothing but half the chi-square where `diagonal` is empty.
+    """Add the normal equations of these edges for poses low:high; only costs where `diagonal` is empty.
 
-    What belongs to an edge and not to a pose is told by whoever has its first end.
+    What belongs to an edge and not to a pose is added by the range that has its first end.
     """
     a, b, measured, _, weight = given
-    error, move, bend, moved, say = (
+    error, Ad, Jr_inv, by_a, JtOmega = (
         np.empty(6), np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     )  # fmt: skip
     ad, square, fourth = np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6))
@@ -174,33 +174,33 @@ def _spatial(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sum
         edge = int(edges[at])
         if weight[edge] == 0.0:
             continue
-        one, two, seen = poses[a[edge]], poses[b[edge]], measured[edge]
-        for i in range(3):  # b seen from a
+        one, two, z = poses[a[edge]], poses[b[edge]], measured[edge]
+        for i in range(3):  # a_from_b
             x[i] = 0.0
             for k in range(3):
                 x[i] += one[k, i] * (two[k, 3] - one[k, 3])
             for j in range(3):
                 turned[i, j] = one[0, i] * two[0, j] + one[1, i] * two[1, j] + one[2, i] * two[2, j]
-        for i in range(3):  # that seen from where b was measured
+        for i in range(3):  # b_measured_from_b
             shift[i] = 0.0
             for k in range(3):
-                shift[i] += seen[k, i] * (x[k] - seen[k, 3])
+                shift[i] += z[k, i] * (x[k] - z[k, 3])
             for j in range(3):
-                rest[i, j] = seen[0, i] * turned[0, j] + seen[1, i] * turned[1, j] + seen[2, i] * turned[2, j]
+                rest[i, j] = z[0, i] * turned[0, j] + z[1, i] * turned[1, j] + z[2, i] * turned[2, j]
         _logarithm(rest, shift, error)
-        # Ad(b_from_a), negative: R^T and -R^T [x] with a_from_b = (R, x)
+        # -Ad(b_from_a): R^T and -R^T [x] with a_from_b = (R, x)
         for i in range(3):
             r0, r1, r2 = turned[0, i], turned[1, i], turned[2, i]
-            move[i, 0], move[i, 1], move[i, 2] = -r0, -r1, -r2
-            move[3 + i, 3], move[3 + i, 4], move[3 + i, 5] = -r0, -r1, -r2
-            move[3 + i, 0], move[3 + i, 1], move[3 + i, 2] = (
+            Ad[i, 0], Ad[i, 1], Ad[i, 2] = -r0, -r1, -r2
+            Ad[3 + i, 3], Ad[3 + i, 4], Ad[3 + i, 5] = -r0, -r1, -r2
+            Ad[3 + i, 0], Ad[3 + i, 1], Ad[3 + i, 2] = (
                 r1 * x[2] - r2 * x[1],
                 r2 * x[0] - r0 * x[2],
                 (r0 * x[1] - r1 * x[0]),
             )
-        _bend(error, bend, ad, square, fourth)
-        _product(bend, move, moved)
-        _add(edge, low, high, given, error, moved, bend, sums, say)
+        _right_jacobian_inverse(error, Jr_inv, ad, square, fourth)
+        _product(Jr_inv, Ad, by_a)
+        _add(edge, low, high, given, error, by_a, Jr_inv, sums, JtOmega)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -249,8 +249,8 @@ def _product(a: Floats, b: Floats, result: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _bend(error: Floats, bend: Floats, ad: Floats, square: Floats, fourth: Floats) -> None:
-    """The inverse of the right Jacobian of the exponential at a twist (6,), in `bend`; the others are room for it.
+def _right_jacobian_inverse(error: Floats, Jr_inv: Floats, ad: Floats, square: Floats, fourth: Floats) -> None:
+    """The inverse of the right Jacobian of the exponential at a twist (6,), in `Jr_inv`; the others are room for it.
 
     x / (1 - exp(-x)) of x = ad(e), which is 1 + x / 2 + p x^2 + q x^4 exactly as (x^2 + angle^2)^2 x = 0.
     """
@@ -260,9 +260,9 @@ def _bend(error: Floats, bend: Floats, ad: Floats, square: Floats, fourth: Float
     else:
         half = sqrt(angle2) / 2.0
         even = half * cos(half) / sin(half) - 1.0  # x / 2 coth(x / 2) - 1, a function of x^2, at -angle^2
-        its_slope = (half / sin(half) ** 2 - cos(half) / sin(half)) / (8.0 * half)
-        p = -its_slope - 2.0 * even / angle2
-        q = -(even + its_slope * angle2) / angle2**2
+        derivative = (half / sin(half) ** 2 - cos(half) / sin(half)) / (8.0 * half)
+        p = -derivative - 2.0 * even / angle2
+        q = -(even + derivative * angle2) / angle2**2
     for at in range(3):
         after, last = (at + 1) % 3, (at + 2) % 3
         ad[at, after] = ad[3 + at, 3 + after] = -error[last]
@@ -272,23 +272,31 @@ def _bend(error: Floats, bend: Floats, ad: Floats, square: Floats, fourth: Float
     _product(square, square, fourth)
     for i in range(6):
         for j in range(6):
-            bend[i, j] = ad[i, j] / 2.0 + p * square[i, j] + q * fourth[i, j]
-        bend[i, i] += 1.0
+            Jr_inv[i, j] = ad[i, j] / 2.0 + p * square[i, j] + q * fourth[i, j]
+        Jr_inv[i, i] += 1.0
 
 
 @numba.njit(cache=True, nogil=True)
 def _add(  # noqa: PLR0912 (one loop nest, compiled)
-    edge: int, low: int, high: int, given: _Edges, error: Floats, by_a: Floats, by_b: Floats, sums: _Sums, say: Floats
+    edge: int,
+    low: int,
+    high: int,
+    given: _Edges,
+    error: Floats,
+    by_a: Floats,
+    by_b: Floats,
+    sums: _Sums,
+    JtOmega: Floats,
 ) -> None:
     """Half the chi-square of one edge, which moves with its ends as `by_a` and `by_b` (d, d) say; its share of the
     normal equations of poses low:high is added."""
     size, a, b = len(error), given.a[edge], given.b[edge]
-    believed, weight = given.information[edge], given.weight[edge]
-    half, diagonal, other, slope = sums
+    Omega, weight = given.information[edge], given.weight[edge]
+    cost, diagonal, other, gradient = sums
     if low <= a < high:
         for i in range(size):
             for j in range(size):
-                half[edge] += 0.5 * weight * error[i] * believed[i, j] * error[j]
+                cost[edge] += 0.5 * weight * error[i] * Omega[i, j] * error[j]
     if len(diagonal) == 0:
         return
     for end in range(2):
@@ -297,15 +305,15 @@ def _add(  # noqa: PLR0912 (one loop nest, compiled)
             continue
         for i in range(size):  # J^T of the edge times its information
             for j in range(size):
-                say[i, j] = 0.0
+                JtOmega[i, j] = 0.0
                 for k in range(size):
-                    say[i, j] += by[k, i] * believed[k, j]
-                say[i, j] *= weight
+                    JtOmega[i, j] += by[k, i] * Omega[k, j]
+                JtOmega[i, j] *= weight
         for i in range(size):
             for j in range(size):
-                slope[node, i] += say[i, j] * error[j]
+                gradient[node, i] += JtOmega[i, j] * error[j]
                 for k in range(size):
-                    diagonal[node, i, j] += say[i, k] * by[k, j]
+                    diagonal[node, i, j] += JtOmega[i, k] * by[k, j]
                 if end == 0:
                     for k in range(size):
-                        other[edge, i, j] += say[i, k] * by_b[k, j]
+                        other[edge, i, j] += JtOmega[i, k] * by_b[k, j]

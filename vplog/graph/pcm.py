@@ -17,7 +17,7 @@ from vplog.graph.clique import largest_clique
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
-from vplog.graph.lm import solve_kept
+from vplog.graph.lm import solve_weighted
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -55,14 +55,14 @@ class PcmSettings(Settings):
         if len(loops):
             weight[loops] = 0.0
             near = loops[~far_from_odometry(graph, self.gate_probability)[loops]]
-            kept, exact = self.consistent(graph, near)
-            weight[kept] = 1.0
+            accepted, exact = self.consistent(graph, near)
+            weight[accepted] = 1.0
             found = (
-                f"{len(kept)} of {len(loops)} closures were kept, the largest consistent set "
+                f"{len(accepted)} of {len(loops)} closures were kept, the largest consistent set "
                 f"{'there is' if exact else 'found'}; {len(loops) - len(near)} were too far from the odometry. "
             )
         start = initial_poses(factors, weight)
-        return solve_kept(factors, weight, start, self.max_iterations, self.tolerance, found)
+        return solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, found)
 
     def consistent(self, graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> tuple[Ints, bool]:
         """The largest set among the edges `loops` found, in order, and whether there is none larger.
@@ -107,13 +107,13 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChai
     for first in range(0, len(one), _PAIRS):
         this, other = one[first : first + _PAIRS], two[first : first + _PAIRS]
         error = geometry.log(geometry.between(displaced[this], displaced[other]))[:, axes]
-        walk_a, walk_b = (
+        noise_a, noise_b = (
             np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None]
             * (chain.total[end[other]] - chain.total[end[this]])
             for end in (a, b)
         )
         turned = np.swapaxes(after[this], 1, 2)
-        covariance = noise[this] + noise[other] + walk_b + after[this] @ walk_a @ turned
+        covariance = noise[this] + noise[other] + noise_b + after[this] @ noise_a @ turned
         chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
         result[this, other] = result[other, this] = chi2 <= bound
     return result

@@ -15,14 +15,12 @@ from pydantic import Field
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, redundancy, residual_sigma
-from vplog.graph.descent import descend
-from vplog.graph.factors import Factors, least_squares
-from vplog.graph.satellites import Fixes, believe, chi2_of_fixes, with_fixes, world_from_enu
+from vplog.graph.descent import Objective, minimised
+from vplog.graph.factors import Factors
+from vplog.graph.satellites import Fixes, chi2_of_fixes, inlier_fixes, with_fixes, world_from_enu
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from vplog.data import Bools, Floats, PoseGraph, Solution
     from vplog.graph.satellites import GpsSettings
 
@@ -63,7 +61,7 @@ class Refined:
     """Factor of the odometry's covariance, 1 where it was not judged."""
     scale: float
     """Factor of the odometry's metres, 1 where it was not judged."""
-    believed: Floats
+    inlier: Floats
     """(F,) 1 for the GPS fixes that were kept, 0 for the others; empty without GPS."""
     world_from_enu: Floats | None
     """(4, 4) from the plane of the first fix, None without GPS."""
@@ -82,30 +80,29 @@ def refine(
     `of_odometry` (E,) marks edges whose metres are the odometry's: its own, and closures whose scale is taken from it.
     The weights of edges stay as they are. Raises GraphError where too few fixes agree.
     """
-    weight, poses, believed = solution.weight, solution.world_from_body, np.zeros(0)
+    weight, poses, inlier = solution.weight, solution.world_from_body, np.zeros(0)
     loops = is_loop(graph)
     checked = bool((weight[loops] > 0).any())
     if fixes is not None and gps is not None:
-        poses, believed = believe(Factors.of(graph), weight, poses, fixes, gps)
+        poses, inlier = inlier_fixes(Factors.of(graph), weight, poses, fixes, gps)
         checked = True
     if not checked or not (settings.noise or settings.scale):
-        return _told(graph, solution, poses, 1.0, 1.0, fixes, believed)
+        return _refined(graph, solution, poses, 1.0, 1.0, fixes, inlier)
 
     noise, scale, present, before = 1.0, 1.0, graph, (1.0, 1.0)
     for _ in range(settings.max_rounds):
         present = rescaled(graph, of_odometry, ~loops, noise, scale)
-        factors = Factors.of(present)
-        weighted = None if fixes is None else with_fixes(factors, weight, poses, fixes, believed)
-        poses = _settled(factors, weight, weighted, poses, 1e-6)
+        objective = _objective(present, weight, poses, fixes, inlier)
+        poses = minimised(objective, poses, _STEPS, 1e-6).world_from_body
         before = noise, scale
         if settings.noise:
-            noise *= _misjudged(factors, weight, weighted, poses, ~loops, settings.least_redundancy)
+            noise *= _variance_factor(objective, poses, ~loops, settings.least_redundancy)
             noise = float(np.clip(noise, 1.0 / settings.most_change, settings.most_change))
         if settings.scale:
-            scale += _scale_step(graph, weight, of_odometry, ~loops, noise, scale, poses, fixes, believed, settings)
+            scale += _scale_step(graph, weight, of_odometry, ~loops, noise, scale, poses, fixes, inlier, settings)
         if abs(np.log(noise / before[0])) < 0.05 and abs(scale - before[1]) < _STEP:
             break
-    return _told(present, solution, poses, before[0], before[1], fixes, believed)
+    return _refined(present, solution, poses, before[0], before[1], fixes, inlier)
 
 
 def rescaled(graph: PoseGraph, of_odometry: Bools, odometry: Bools, noise: float, scale: float) -> PoseGraph:
@@ -122,26 +119,23 @@ def rescaled(graph: PoseGraph, of_odometry: Bools, odometry: Bools, noise: float
     return replace(graph, a_from_b=a_from_b, information=information)
 
 
-def _settled(factors: Factors, weight: Floats, weighted: Any, start: Floats, tolerance: float) -> Floats:
-    """The best poses (N, 4, 4) from `start` for the weighted edges, or for the graph `weighted` where that is given."""
-    if weighted is None:
-        return descend(factors, weight, start, _STEPS, tolerance).world_from_body
-    return least_squares(factors, weighted, start, _STEPS, tolerance).world_from_body
+def _objective(graph: PoseGraph, weight: Floats, poses: Floats, fixes: Fixes | None, inlier: Floats) -> Objective:
+    """The weighted edges (E,) of the graph, and the fixes (F,) in the world of the poses where there are any."""
+    factors = Factors.of(graph)
+    return Objective(factors, weight) if fixes is None else with_fixes(factors, weight, poses, fixes, inlier)
 
 
-def _misjudged(
-    factors: Factors, weight: Floats, weighted: Any, poses: Floats, odometry: Bools, least_redundancy: float
-) -> float:
+def _variance_factor(objective: Objective, poses: Floats, odometry: Bools, least_redundancy: float) -> float:
     """By what factor the odometry's covariance is too small: its chi-square over its share of the redundancy.
 
     Variance components: Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1979.
     """
-    graph, edges = factors.graph, np.flatnonzero(odometry)
+    graph, edges = objective.factors.graph, np.flatnonzero(odometry)
     try:
-        checks = redundancy(factors, weight, poses, edges, weighted)
+        checks = redundancy(objective, poses, edges)
     except GraphError:
         # noise so large that rounding decides: all that the constraints could check, so that the next round has less
-        checks = float(degrees_of_freedom(graph) * min(np.count_nonzero(weight[~odometry]), len(edges)))
+        checks = float(degrees_of_freedom(graph) * min(np.count_nonzero(objective.weight[~odometry]), len(edges)))
     if checks < least_redundancy:
         return 1.0
     chi2 = float((residual_sigma(graph, poses)[edges] ** 2).sum())
@@ -157,7 +151,7 @@ def _scale_step(
     scale: float,
     poses: Floats,
     fixes: Fixes | None,
-    believed: Floats,
+    inlier: Floats,
     settings: RefineSettings,
 ) -> float:
     """A secant step towards the scale of least error, poses following it: by the slope here and a step aside.
@@ -165,10 +159,9 @@ def _scale_step(
     At the best poses for a scale the error does not change with the poses, so its slope is that with the poses fixed.
     """
 
-    def slope(at: float, start: Floats) -> float:
-        factors = Factors.of(rescaled(graph, of_odometry, odometry, noise, at))
-        weighted = None if fixes is None else with_fixes(factors, weight, start, fixes, believed)
-        best = _settled(factors, weight, weighted, start, 1e-8)
+    def gradient(at: float, start: Floats) -> float:
+        present = rescaled(graph, of_odometry, odometry, noise, at)
+        best = minimised(_objective(present, weight, start, fixes, inlier), start, _STEPS, 1e-8).world_from_body
         errors = [
             float((weight * residual_sigma(rescaled(graph, of_odometry, odometry, noise, at + side), best) ** 2).sum())
             for side in (-_STEP, _STEP)
@@ -176,37 +169,39 @@ def _scale_step(
         return (errors[1] - errors[0]) / (4.0 * _STEP) + (at - 1.0) / settings.scale_sigma**2
 
     aside = settings.scale_sigma / 4.0
-    here, there = slope(scale, poses), slope(scale + aside, poses)
+    here, there = gradient(scale, poses), gradient(scale + aside, poses)
     curve = (there - here) / aside
     if curve <= 0.0:  # nothing to find: the prior alone would curve it upwards
         return 0.0
     return float(np.clip(-here / curve, -_LONGEST, _LONGEST))
 
 
-def _told(
+def _refined(
     graph: PoseGraph,
     solution: Solution,
     poses: Floats,
     noise: float,
     scale: float,
     fixes: Fixes | None,
-    believed: Floats,
+    inlier: Floats,
 ) -> Refined:
     """The refined solution, its reason saying what was learned."""
-    world, said = None, []
+    world, sentences = None, []
     if noise != 1.0:
-        said.append(f"The odometry's noise is {np.sqrt(noise):.2g} times what was assumed, by the constraints kept.")
+        sentences.append(
+            f"The odometry's noise is {np.sqrt(noise):.2g} times what was assumed, by the constraints kept."
+        )
     if scale != 1.0:
-        said.append(f"Its metres are {abs(1.0 / scale - 1.0):.2%} too {'long' if scale < 1.0 else 'short'}.")
+        sentences.append(f"Its metres are {abs(1.0 / scale - 1.0):.2%} too {'long' if scale < 1.0 else 'short'}.")
     if fixes is not None:
-        world = world_from_enu(poses, fixes, np.maximum(believed, 1e-9))
-        chi2 = chi2_of_fixes(poses, fixes, world)[believed > 0]
+        world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
+        chi2 = chi2_of_fixes(poses, fixes, world)[inlier > 0]
         beyond = int((chi2 > chi2_quantile(0.99, 3)).sum())
-        said.append(
-            f"{int(believed.sum())} of {len(fixes)} GPS fixes were used, {beyond} of them beyond 99 % of their noise."
+        sentences.append(
+            f"{int(inlier.sum())} of {len(fixes)} GPS fixes were used, {beyond} of them beyond 99 % of their noise."
         )
     error = float(0.5 * (solution.weight * residual_sigma(graph, poses) ** 2).sum())
     refined = replace(
-        solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *said])
+        solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *sentences])
     )
-    return Refined(graph, refined, noise, scale, believed, world)
+    return Refined(graph, refined, noise, scale, inlier, world)

@@ -11,7 +11,8 @@ from pydantic import Field
 
 from vplog.graph.build import checked
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.factors import Factors, least_squares
+from vplog.graph.descent import Loss, Objective, minimised
+from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import as_solution
 from vplog.settings import Settings
@@ -48,12 +49,12 @@ def solve_robustly(graph: PoseGraph, settings: KernelSettings, kernel: Callable[
     half = chi2_quantile(settings.inlier_probability, degrees_of_freedom(graph))
     estimator = kernel(half)
     start = initial_poses(factors, np.ones(len(graph.a)), half)
-    robust = factors.robust(loops, estimator)
-    fit = least_squares(factors, robust, start, settings.max_iterations, settings.tolerance)
+    objective = Objective(factors, np.ones(len(graph.a)), Loss(loops, estimator))
+    fit = minimised(objective, start, settings.max_iterations, settings.tolerance)
     weight = np.ones(len(graph.a))
     weight[loops] = [estimator.weight(sigma) for sigma in residual_sigma(graph, fit.world_from_body, loops).tolist()]
-    kept = int((weight[loops] > 0.5).sum())
-    found = f"{kept} of {len(loops)} closures have more than half their weight. Robust least squares"
+    accepted = int((weight[loops] > 0.5).sum())
+    found = f"{accepted} of {len(loops)} closures have more than half their weight. Robust least squares"
     return as_solution(graph, weight, fit, found)
 
 
@@ -95,7 +96,9 @@ class GemanMcClureSettings(KernelSettings):
 
     def __call__(self, graph: PoseGraph) -> Solution:
         return solve_robustly(
-            graph, self, lambda half: mEstimator.GemanMcClure.Create(math.sqrt(half / (math.sqrt(2.0) - 1.0)))
+            graph,
+            self,
+            lambda half: mEstimator.GemanMcClure.Create(math.sqrt(half / (math.sqrt(2.0) - 1.0))),
         )
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import gtsam
 import numpy as np
 from pydantic import Field
 
@@ -13,7 +12,7 @@ from vplog import geometry
 from vplog.errors import GraphError
 from vplog.geodesy import local_enu
 from vplog.graph.consistency import chi2_quantile
-from vplog.graph.factors import least_squares
+from vplog.graph.descent import Objective, Positions, minimised
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.settings import Settings
 
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Gps, Ints, Keyframes, Odometry
     from vplog.graph.factors import Factors
 
-_FREE = 1e2
-"""m and rad; holds the first pose so weakly that the fixes alone say where the graph is."""
 _LEAST = 3
 """Fixes that fix where a graph is and how it is turned."""
 
@@ -142,22 +139,19 @@ def chi2_of_fixes(poses: Floats, fixes: Fixes, world: Floats) -> Floats:
     return (error * np.linalg.solve(fixes.covariance, error[:, :, None])[:, :, 0]).sum(1)
 
 
-def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, believed: Floats) -> Any:
-    """The weighted edges (E,) with the believed fixes (F,) in the world of `start`, and nothing that holds pose 0."""
-    result = factors.weighted(weight)
-    loose = gtsam.noiseModel.Isotropic.Sigma(6, _FREE)
-    result.replace(0, gtsam.PriorFactorPose3(0, gtsam.Pose3(), loose))
-    first_from_enu = geometry.inverse(start[0]) @ world_from_enu(start, fixes, believed)
-    turned = first_from_enu[:3, :3]
-    position = fixes.enu_m @ turned.T + first_from_enu[:3, 3]
-    covariance = turned @ fixes.covariance @ turned.T
-    for at in np.flatnonzero(believed > 0).tolist():
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance[at] / believed[at])
-        result.add(gtsam.GPSFactorArm(int(fixes.row[at]), position[at], fixes.arm_m[at], noise))
-    return result
+def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, inlier: Floats) -> Objective:
+    """The weighted edges (E,) with the fixes (F,), weighted, in the world of `start`, and pose 0 free to move."""
+    first_from_enu = geometry.inverse(start[0]) @ world_from_enu(start, fixes, inlier)
+    R = first_from_enu[:3, :3]
+    Omega = np.linalg.inv(R @ fixes.covariance @ R.T) * inlier[:, None, None]
+    return Objective(
+        factors,
+        weight,
+        positions=Positions(fixes.row, fixes.arm_m, geometry.transform(first_from_enu, fixes.enu_m), Omega),
+    )
 
 
-def believe(
+def inlier_fixes(
     factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings
 ) -> tuple[Floats, Floats]:
     """Poses (N, 4, 4), pose 0 as given, and which fixes (F,) are believed, 0 or 1: jumps are not.
@@ -165,23 +159,22 @@ def believe(
     Graduated non-convexity with the truncated least squares loss (Yang et al., RA-L 2020) over the fixes, the edges
     keeping their weights. The first solve believes all of them, so their frame is found whatever the odometry drifted.
     """
-    bound, believed, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
+    bound, inlier, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
     mu = 0.0
     for _ in range(settings.max_stages):
-        weighted = with_fixes(factors, weight, poses, fixes, believed)
-        poses = least_squares(factors, weighted, poses, 20, 1e-4).world_from_body
-        chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(believed, 1e-9)))
+        poses = minimised(with_fixes(factors, weight, poses, fixes, inlier), poses, 20, 1e-4).world_from_body
+        chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)))
         mu = bound / max(2.0 * chi2.max() - bound, bound) if mu == 0.0 else mu * settings.growth  # remark 5
-        believed = truncated_weights(chi2, bound, mu)
-        if ((believed == 0) | (believed == 1)).all():
+        inlier = truncated_weights(chi2, bound, mu)
+        if ((inlier == 0) | (inlier == 1)).all():
             break
-    believed = np.where(believed > 0.5, 1.0, 0.0)
-    if believed.sum() < _LEAST:
+    inlier = np.where(inlier > 0.5, 1.0, 0.0)
+    if inlier.sum() < _LEAST:
         raise GraphError(
-            f"Only {int(believed.sum())} of {len(fixes)} GPS fixes agree with the odometry and each other. "
+            f"Only {int(inlier.sum())} of {len(fixes)} GPS fixes agree with the odometry and each other. "
             "Run without --gps, or set gps.unknown_sigma_m to what the receiver does."
         )
-    return poses, believed
+    return poses, inlier
 
 
 def only(fixes: Fixes, rows: Bools) -> Fixes:

@@ -10,9 +10,8 @@ import numpy as np
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, residual_sigma
-from vplog.graph.descent import descend
+from vplog.graph.descent import Objective, descend
 from vplog.graph.leave_out import cost_together, distance, group_costs, groups, tension
-from vplog.graph.marginals import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -64,72 +63,72 @@ class Scrutiny:
         returned = np.zeros(len(weight), bool)
         cleared: set[bytes] = set()
         for _ in range(_MOST_ROUNDS):
-            kept = self.loops[state.weight[self.loops] > 0]
-            if len(kept) == 0:
+            accepted = self.loops[state.weight[self.loops] > 0]
+            if len(accepted) == 0:
                 return state
             try:
-                pull = tension(self.factors, state.weight, state.poses, kept)
+                pull = tension(self.factors, state.weight, state.poses, accepted)
             except GraphError:  # what is nearly open cannot be predicted; least squares may still find its best place
                 return state
             cost = np.minimum(pull.cost, state.chi2)  # first order may say more than there is
             limit = self.limit(state, cost, pull.log_spread)
             if (cost > limit).any():
-                out = kept[(cost > limit) & (cost >= _WORST_SHARE * cost[cost > limit].max())]
-                state = self.settle(_with(state.weight, out, 0.0), state.poses)
+                out = accepted[(cost > limit) & (cost >= _WORST_SHARE * cost[cost > limit].max())]
+                state = self.settle(_with_weight(state.weight, out, 0.0), state.poses)
                 continue
-            smaller = self.without_a_false_place(state, kept, pull, cleared)
+            smaller = self.without_a_false_place(state, accepted, pull, cleared)
             if smaller is not None:
                 state = smaller
                 continue
-            away = self.loops[(state.weight[self.loops] == 0) & ~returned[self.loops]]
-            back = self.predicted(state, away, pull.freedom)
+            rejected = self.loops[(state.weight[self.loops] == 0) & ~returned[self.loops]]
+            back = self.predicted(state, rejected, pull.freedom)
             if len(back) == 0:
                 return state
             returned[back] = True  # once: what goes again stays away
-            state = self.settle(_with(state.weight, back, 1.0), state.poses)
+            state = self.settle(_with_weight(state.weight, back, 1.0), state.poses)
         return state
 
-    def without_a_false_place(self, state: State, kept: Ints, pull: Tension, cleared: set[bytes]) -> State | None:
+    def without_a_false_place(self, state: State, accepted: Ints, pull: Tension, cleared: set[bytes]) -> State | None:
         """The state without the first group of neighbouring closures that costs the rest too much; None: none does.
 
         Groups support each other, so each that pulls hard enough to be suspected is looked at as a whole, and solved
         without where that speaks against it, too. Those that turn out well are added to `cleared`.
         """
         factors = self.factors
-        places = groups(factors.graph, kept, self.chain)
-        suspicion = np.minimum(group_costs(factors.graph, state.poses, kept, pull, places, self.chain), state.chi2)
+        places = groups(factors.graph, accepted, self.chain)
+        suspicion = np.minimum(group_costs(factors.graph, state.poses, accepted, pull, places, self.chain), state.chi2)
         size = np.array([len(place) for place in places])
         limit = np.full(len(places), np.inf)  # of one: answered already
         for members in np.unique(size[size > 1]).tolist():
             limit[size == members] = self.limit_of_group(state, suspicion[size == members], members)
         ratio = suspicion / np.maximum(limit, 1e-300)
-        suspects = [kept[places[at]] for at in np.argsort(-ratio, kind="stable").tolist() if ratio[at] > 1.0]
+        suspects = [accepted[places[at]] for at in np.argsort(-ratio, kind="stable").tolist() if ratio[at] > 1.0]
         suspects = [members for members in suspects[:_MOST_SUSPECTS] if members.tobytes() not in cleared]
         if not suspects:
             return None
-        tree = factorised(factors, state.weight, state.poses)
+        information = Objective(factors, state.weight).information(state.poses)
         for members in suspects:
             cost = state.chi2  # of many, solving without them takes less than foretelling what that gives
             if len(members) <= _MOST_FORETOLD:
-                cost = min(cost_together(factors, state.weight, state.poses, tree, members), cost)
+                cost = min(cost_together(factors, state.weight, state.poses, information, members), cost)
             if cost > self.limit_of_group(state, np.array([cost]), len(members))[0]:
-                smaller = self.settle(_with(state.weight, members, 0.0), state.poses)
+                smaller = self.settle(_with_weight(state.weight, members, 0.0), state.poses)
                 cost = state.chi2 - smaller.chi2
                 if cost > self.limit_of_group(state, np.array([cost]), len(members))[0]:
                     return smaller
             cleared.add(members.tobytes())
         return None
 
-    def predicted(self, state: State, away: Ints, freedom: Floats) -> Ints:
+    def predicted(self, state: State, rejected: Ints, freedom: Floats) -> Ints:
         """Closures among those put away that the solved graph predicts."""
         graph = self.factors.graph
         most = self.limit(state, np.zeros(1))[0]
         # a closure is at least this near if the rest predicts it no worse than any that is kept
-        away = away[residual_sigma(graph, state.poses, away) ** 2 <= most * (1.0 + freedom.max())]
-        if len(away) == 0:
-            return away
-        apart, log_spread = distance(self.factors, state.weight, state.poses, away)
-        return away[apart <= self.limit(state, np.zeros(len(away)), log_spread)]
+        rejected = rejected[residual_sigma(graph, state.poses, rejected) ** 2 <= most * (1.0 + freedom.max())]
+        if len(rejected) == 0:
+            return rejected
+        apart, log_spread = distance(self.factors, state.weight, state.poses, rejected)
+        return rejected[apart <= self.limit(state, np.zeros(len(rejected)), log_spread)]
 
     def limit(self, state: State, cost: Floats, log_spread: Floats | None = None) -> Floats:
         """(K,) how much chi-square each closure may cost the rest; the least of three bounds.
@@ -144,10 +143,10 @@ class Scrutiny:
            the nearer it has to be. But what true ones are off on average is not held against them.
         """
         d = degrees_of_freedom(self.factors.graph)
-        said = chi2_quantile(self.probability, d)
+        claimed = chi2_quantile(self.probability, d)
         scale = self._scale(state, cost, 1)
         tail = d * (2.0 / (d + 2.0)) ** (2.0 / d) / (1.0 - self.probability)
-        bound = np.minimum(said, scale * tail)
+        bound = np.minimum(claimed, scale * tail)
         false = len(state.weight) - int(state.weight.sum())
         if log_spread is None or false == 0:
             return bound
@@ -161,8 +160,8 @@ class Scrutiny:
         d = degrees_of_freedom(self.factors.graph)
         tail = d * (2.0 / (d + 2.0)) ** (2.0 / d) / (1.0 - self.probability)
         among = chi2_quantile(self.probability, (members - 1) * d)
-        said = chi2_quantile(self.probability, members * d)
-        return np.minimum(said, self._scale(state, cost, members) * (tail + among))
+        claimed = chi2_quantile(self.probability, members * d)
+        return np.minimum(claimed, self._scale(state, cost, members) * (tail + among))
 
     def _scale(self, state: State, cost: Floats, members: int) -> Floats:
         """Factor (K,) of the noise's variance as the graph without so many closures shows it; inf where it does not."""
@@ -178,7 +177,7 @@ class Scrutiny:
         return State(weight, poses, float((weight * residual_sigma(self.factors.graph, poses) ** 2).sum()))
 
 
-def _with(weight: Floats, edges: Ints, value: float) -> Floats:
+def _with_weight(weight: Floats, edges: Ints, value: float) -> Floats:
     result = np.array(weight)
     result[edges] = value
     return result

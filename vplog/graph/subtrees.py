@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
-    from vplog.graph.elimination import Elimination
+    from vplog.graph.fronts import Form
 
 _PIECES = 64
 """A run takes no more than this share of the work: 16 threads have four each, and few fronts are above them all."""
@@ -32,7 +32,7 @@ class Subtrees:
     """Of each of the top."""
 
     @classmethod
-    def of(cls, shape: Elimination) -> Subtrees:
+    def of(cls, shape: Form) -> Subtrees:
         parent, wide, below = shape.parent, np.diff(shape.first), np.diff(shape.start)
         work = wide * (wide + below).astype(float) ** 2
         total = _with_those_below(parent, work)

@@ -51,14 +51,14 @@ def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
     return np.column_stack([earlier, later[earlier]]).astype(np.int64)
 
 
-def rotation_share(driven: Floats, seen: Floats, settings: CalibrationSettings) -> float:
+def rotation_share(driven: Floats, observed: Floats, settings: CalibrationSettings) -> float:
     """By what share the camera's rotations disagree with the odometry's, at least `least_share`.
 
     `driven` and `seen` are (P, 4, 4) motions of the body over turning pairs, by odometry and by the images alone.
     """
     if len(driven) < 8:  # the median of fewer says little
         return settings.least_share
-    expected, found = geometry.so3_log(driven[:, :3, :3]), geometry.so3_log(seen[:, :3, :3])
+    expected, found = geometry.so3_log(driven[:, :3, :3]), geometry.so3_log(observed[:, :3, :3])
     ratio = (found * expected).sum(axis=1) / (expected**2).sum(axis=1)
     return float(np.clip(abs(np.median(ratio) - 1.0), settings.least_share, settings.most_share))
 

@@ -10,11 +10,10 @@ from pydantic import Field
 
 from vplog import geometry
 from vplog.data import Verdict
-from vplog.loops import two_way, undistort, verify_direction, verify_epipolar, verify_metric
+from vplog.loops import two_way, undistort, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
 from vplog.loops.landmarks import Landmarks, LandmarkSettings, inverse_depth, landmarks_of
 from vplog.loops.matching import MatchSettings, first_matches, match_features
-from vplog.loops.verify_direction import DirectionSettings
 from vplog.loops.verify_epipolar import EpipolarSettings
 from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
@@ -47,8 +46,6 @@ class VerifySettings(Settings):
     both_ways: bool = True
     """Whether a pose that is believed is looked for again the other way round, the match in the query's landmarks: the
     two must agree within their joint noise, and make one closure together."""
-    direction: DirectionSettings = DirectionSettings()
-    """What is kept of two calibrated views that agree without metres."""
     epipolar: EpipolarSettings = EpipolarSettings()
     """When two images agree, for an uncalibrated camera."""
 
@@ -104,8 +101,7 @@ def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[in
         else:
             if known is None:
                 known = _landmarks(earlier, match)
-            row = _check_metric(later, own, mine, found, known, earlier.stereo, settings.metric)
-            rows.append(_with_direction(later, earlier, row, own, theirs, mine, found))
+            rows.append(_check_metric(later, own, mine, found, known, earlier.stereo, settings.metric))
     return rows
 
 
@@ -176,29 +172,6 @@ def _check_metric(
         return Row(matches, count, pose)
     scale = ("stereo" if stereo else "depth") if known.from_depth else "odometry"
     return Row(matches, count, pose, scale, (mine.astype(np.int32), found.astype(np.int32)))
-
-
-def _with_direction(
-    later: Drive, earlier: Drive, row: Row, own: Features, theirs: Features, mine: np.ndarray, found: np.ndarray
-) -> Row:
-    """The row with turn and direction, where that is asked for and metres are what it lacks."""
-    settings = later.settings
-    if not settings.direction.keep or row.pose.verdict not in (Verdict.DEGENERATE_MOTION, Verdict.TOO_FEW_LANDMARKS):
-        return row
-    query = undistort.rays(later.camera, own.points[mine])
-    match = undistort.rays(earlier.camera, theirs.points[found])
-    good = np.isfinite(query).all(axis=1) & np.isfinite(match).all(axis=1)
-    pose = verify_direction.solve(
-        row.pose.verdict,
-        query[good],
-        match[good],
-        own.points[mine[good]] / [own.width, own.height],
-        later.camera,
-        settings.landmarks.pixel_sigma,
-        settings.metric.systematic_px,
-        settings.direction,
-    )
-    return replace(row, pose=pose)
 
 
 def _of_both(pose: Pose, back: Pose, share: float) -> Pose:

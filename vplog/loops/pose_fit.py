@@ -20,7 +20,7 @@ _CONVERGED = 1e-3
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def agreement(match_from_query, points, covariance, seen, sigma):
+def agreement(match_from_query, points, covariance, rays, sigma):
     """Squared Mahalanobis distance (K,) and length (K,) of the image errors of landmarks (K, 3) with `covariance`
     (K, 3, 3), seen at (K, 2) with standard deviation `sigma`; NaN behind the query."""
     K = points.shape[0]
@@ -36,14 +36,14 @@ def agreement(match_from_query, points, covariance, seen, sigma):
                 a += by_point[0, i] * covariance[k, i, j] * by_point[0, j]
                 b += by_point[0, i] * covariance[k, i, j] * by_point[1, j]
                 c += by_point[1, i] * covariance[k, i, j] * by_point[1, j]
-        x, y = predicted[0] - seen[k, 0], predicted[1] - seen[k, 1]
+        x, y = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1]
         squared[k] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
         length[k] = math.sqrt(x * x + y * y)
     return squared, length
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fit(match_from_query, points, covariance, seen, rho, variance, sigma):
+def fit(match_from_query, points, covariance, rays, rho, variance, sigma):
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation.
 
     Landmarks (K, 3) with covariance (K, 3, 3) were seen at (K, 2) with standard deviation `sigma`, and where the query
@@ -64,7 +64,7 @@ def fit(match_from_query, points, covariance, seen, rho, variance, sigma):
             freedom += size
             if not _predict(rotation, shift, points[k], predicted, by_point, by_pose):
                 continue  # a step took it behind the query: it says nothing
-            residual[0], residual[1], residual[2] = predicted[0] - seen[k, 0], predicted[1] - seen[k, 1], 0.0
+            residual[0], residual[1], residual[2] = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1], 0.0
             if size == 3:
                 residual[2] = predicted[2] - rho[k]
             _weigh(by_point, covariance[k], sigma * sigma, variance[k], size, weight)

@@ -87,8 +87,8 @@ def propose(rankings: Iterable[tuple[Ranking, Int32s]], settings: ProposeSetting
     """
     found = []
     for ranking, support in rankings:
-        kept = _suppress(ranking.rows, settings.suppress, settings.per_query)
-        found.append((ranking.rows[kept], ranking.score[kept], support[kept]))
+        chosen = _suppress(ranking.rows, settings.suppress, settings.per_query)
+        found.append((ranking.rows[chosen], ranking.score[chosen], support[chosen]))
     counts = np.array([len(rows) for rows, _, _ in found], np.int64)
     return Proposals(
         query=np.repeat(np.arange(len(found)), counts).astype(np.int32),
@@ -101,15 +101,15 @@ def propose(rankings: Iterable[tuple[Ranking, Int32s]], settings: ProposeSetting
 
 def _suppress(rows: Int32s, within: int, keep: int) -> list[int]:
     """Positions of the first `keep` rows, best first, that are not within `within` rows of a better one."""
-    kept: list[int] = []
+    chosen: list[int] = []
     better: list[int] = []  # the rows of those
     for at, row in enumerate(rows.tolist()):
         for other in better:
             if -within <= row - other <= within:
                 break
         else:
-            kept.append(at)
+            chosen.append(at)
             better.append(row)
-            if len(kept) == keep:
+            if len(chosen) == keep:
                 break
-    return kept
+    return chosen

@@ -22,8 +22,8 @@ def reversed_pose(b_from_a: Floats, covariance: Floats) -> tuple[Floats, Floats]
 
     (T exp(d))^-1 = T^-1 exp(-Ad_T d).
     """
-    move = geometry.adjoint(b_from_a)
-    return geometry.inverse(b_from_a), move @ covariance @ move.T
+    Ad = geometry.adjoint(b_from_a)
+    return geometry.inverse(b_from_a), Ad @ covariance @ Ad.T
 
 
 def agree(pose: Floats, covariance: Floats, other: Floats, other_covariance: Floats) -> bool:

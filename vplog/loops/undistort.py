@@ -52,12 +52,12 @@ def project(camera: Camera, points: Floats) -> Floats:
     front = points[:, 2] > 0
     if not front.any():
         return result
-    seen = np.ascontiguousarray(points[front], np.float64).reshape(-1, 1, 3)
+    in_front = np.ascontiguousarray(points[front], np.float64).reshape(-1, 1, 3)
     zero = np.zeros(3)
     if fisheye:
-        pixels, _ = cv2.fisheye.projectPoints(seen, zero, zero, matrix, distortion)
+        pixels, _ = cv2.fisheye.projectPoints(in_front, zero, zero, matrix, distortion)
     else:
-        pixels, _ = cv2.projectPoints(seen, zero, zero, matrix, distortion if distortion.size else None)
+        pixels, _ = cv2.projectPoints(in_front, zero, zero, matrix, distortion if distortion.size else None)
     result[front] = np.asarray(pixels).reshape(-1, 2)
     return result
 

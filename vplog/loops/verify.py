@@ -79,9 +79,9 @@ def verify_between(
         cv2.setNumThreads(1)  # one candidate, one thread; the pool is the only parallelism
         return check_queries(later, earlier, match, queries)
 
-    def back(query: int, matches: list[int], believed: list[Row]) -> list[Row]:
+    def back(query: int, matches: list[int], accepted: list[Row]) -> list[Row]:
         cv2.setNumThreads(1)
-        return check_back(later, earlier, query, matches, believed, bent)
+        return check_back(later, earlier, query, matches, accepted, bent)
 
     rows: dict[int, Row] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
@@ -93,8 +93,8 @@ def verify_between(
             if progress is not None:
                 progress(len(rows), total)
         if later.settings.both_ways:
-            believed = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
-            groups = _by(proposals.query, proposals.match, believed)
+            accepted = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
+            groups = _by(proposals.query, proposals.match, accepted)
             queries = [int(proposals.query[group[0]]) for group in groups]
             matches = [proposals.match[group].tolist() for group in groups]
             one_way = [[rows[at] for at in group.tolist()] for group in groups]
@@ -124,10 +124,10 @@ def calibration_share(drive: Drive, threads: int = 1) -> float:
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
     driven = geometry.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
-    seen = np.array(
+    observed = np.array(
         [_of_body(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
     )
-    share = rotation_share(driven, seen, settings)
+    share = rotation_share(driven, observed, settings)
     if share > _SUSPICIOUS_SHARE:
         _LOG.warning(
             "Camera %r and odometry disagree by %.0f %% about rotations: closures claim less. Check the focal length.",
@@ -147,7 +147,6 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
     count, camera = len(rows), later.camera
     pose, information = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
     body_from_camera = geometry.adjoint(camera.body_from_camera)
-    camera_from_body = geometry.adjoint(geometry.inverse(camera.body_from_camera))
     twists = [body_twists(drive.keyframes) for drive in (earlier, later)]
     stamp_sigma_s = later.settings.calibration.stamp_sigma_s
     for at, row in enumerate(rows):
@@ -159,9 +158,6 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
             total = body_from_camera @ (covariance + motion_covariance(found, share)) @ body_from_camera.T
             speeds = twists[0][proposals.match[at]], twists[1][proposals.query[at]]
             known = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
-            information[at] = (known + known.T) / 2.0
-        elif row.pose.information is not None:  # turn and direction alone
-            known = camera_from_body.T @ row.pose.information @ camera_from_body
             information[at] = (known + known.T) / 2.0
     return Closures(
         query=proposals.query.astype(np.int32),

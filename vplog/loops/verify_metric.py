@@ -73,8 +73,6 @@ class Pose:
     """(4, 4)."""
     covariance: Floats | None = None
     """(6, 6) rotation first, in the query's frame."""
-    information: Floats | None = None
-    """(6, 6) in place of a covariance, where the translation's length is not known."""
 
 
 def solve(
