@@ -161,7 +161,7 @@ def _drive(run: Path) -> tuple[Keyframes, graph_joint.Drive]:
 def _ledger(tie: Tie) -> Closures:
     ledger = tables.read_joins(tie.path).get((tie.later, tie.earlier))
     if ledger is None:
-        raise ResultError(f"{tie.path} is not of {tie.later} in {tie.earlier}. Move it away, and run again.")
+        raise ResultError(f"{tie.path} is not of {tie.later} in {tie.earlier}. Move it out of the map, and run again.")
     return ledger
 
 

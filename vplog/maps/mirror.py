@@ -179,7 +179,7 @@ class Mirror:
         except OSError as error:
             raise ResultError(f"Cannot read {place}: {reason(error)}.") from None
         if digest != about["sha256"]:
-            raise ResultError(f"{place} is damaged: it does not have the sha256 that its manifest names. Run again.")
+            raise ResultError(f"{place} is damaged: its sha256 is not that of its manifest. Run again.")
         part.replace(target)
         if self.cache is not None:
             self.cache.keep(digest, target)

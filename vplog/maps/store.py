@@ -252,7 +252,7 @@ class Store:
         library, settings = record.get("library"), record.get("settings")
         known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
-            raise ResultError(f"{path} has no sound library or settings. Run `vplog batch` again to write it anew.")
+            raise ResultError(f"{path} lacks a valid library or settings. Run `vplog batch` again.")
         return Head(library, settings)
 
     def write_head(self, head: Head) -> None:
@@ -410,7 +410,7 @@ def _sweep(store: Store) -> None:
 def add_library(store: Store, made: Path, digest: str) -> Path:
     """Make a folder in staging the library of this hash; it stays as it is where the map has it."""
     if not HASH.fullmatch(digest):
-        raise LibraryError(f"{made} has no sound hash ({digest[:20]!r}). Build the library anew.")
+        raise LibraryError(f"{made} has no valid hash ({digest[:20]!r}). Build it again: vplog library")
     folder = store.library(digest)
     try:
         folder.parent.mkdir(exist_ok=True)
