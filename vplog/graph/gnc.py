@@ -1,4 +1,4 @@
-"""Graduated non-convexity: closures that do not fit the rest lose their say, odometry is always believed.
+"""Graduated non-convexity: inconsistent closures are down-weighted, odometry keeps its weight.
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020. Three things are
 added to it, since it starts from a solve that believes every closure, which false ones can bend beyond return, and ends
@@ -88,18 +88,16 @@ class GncSettings(Settings):
         agreed = agreement(graph, loops, chain)
         gated = far_from_odometry(graph, self.gate_probability, chain)[loops]
         weight[loops] = (agreed.probability > 0.5) & ~gated & self._join(graph, loops, chain)
-        apart = int((weight[loops] == 0).sum() - gated.sum())
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
-        weight, poses, stages = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
+        weight, poses = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
         scrutiny = Scrutiny(
             factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
         )
         state = scrutiny(weight, poses)
-        kept = int(state.weight[loops].sum())
-        taken = "1 stage" if stages == 1 else f"{stages} stages"
+        kept, far = int(state.weight[loops].sum()), int(gated.sum())
         found = (
-            f"{kept} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. {apart} "
-            f"did not agree with it at first; {taken} and a look at what each costs the others decided. "
+            f"{kept} of {len(loops)} closures were kept; {far} were too far from the odometry, "
+            f"{len(loops) - kept - far} inconsistent with the others. "
         )
         return solve_kept(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
@@ -122,24 +120,23 @@ class GncSettings(Settings):
                 good[np.searchsorted(loops, kept)] = True
         return good
 
-    def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats, int]:
-        """Algorithm 1 of the paper over the closures of weight 1: weights 0 or 1, poses, and stages taken."""
+    def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats]:
+        """Algorithm 1 of the paper over the closures of weight 1: weights 0 or 1, and poses."""
         weight = np.array(weight)
         judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
         if len(judged) == 0:
-            return weight, poses, 0
+            return weight, poses
         first, steps, growth = self.max_iterations, self.steps, self.growth
         if is_large(poses):
             first, steps, growth = min(first, _FIRST_STEPS), 1, growth**_AT_ONCE
         poses = descend(factors, weight, poses, first, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
-        stage = 0
-        for stage in range(1, self.max_stages + 1):  # noqa: B007 (told in the reason)
+        for _ in range(self.max_stages):
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
             poses = descend(factors, weight, poses, steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
             mu *= growth
-        return np.where(weight > 0.5, 1.0, 0.0), poses, stage
+        return np.where(weight > 0.5, 1.0, 0.0), poses

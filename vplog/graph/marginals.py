@@ -125,4 +125,4 @@ def _bayes_tree(factors: Factors, weighted: gtsam.NonlinearFactorGraph, poses: F
     try:
         return weighted.linearize(values).eliminateMultifrontal()
     except RuntimeError:
-        raise GraphError("The graph does not constrain all its poses. Check the information of its edges.") from None
+        raise GraphError("The graph does not constrain all its poses. Check the edges and their information.") from None
