@@ -35,7 +35,7 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     """Bag of bounding boxes with the paper's numbers (section IV)."""
 
     kind: Literal["bobb_paper"] = "bobb_paper"
-    """Which recogniser."""
+    """Name of the recogniser."""
     references: int = Field(default=4, ge=1)
     """J: reference images that explain an image."""
     boxes: int = Field(default=4, ge=1)
@@ -55,7 +55,7 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     aspects: tuple[PositiveFloat, ...] = Field(default=(0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0), min_length=1)
     """Width to height of the boxes tried, in units of the image's own; votes never shrink a box, so all are largest."""
     seed: int = Field(default=0, ge=0)
-    """Of the windows and the partitions."""
+    """Seed of the windows and the partitions."""
 
     @model_validator(mode="after")
     def _has_boxes(self) -> Self:

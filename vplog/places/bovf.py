@@ -44,7 +44,7 @@ class BovfSettings(RelearnedSettings):
     """Bag of visual features: tf-idf, cosine, inverted file."""
 
     kind: Literal["bovf"] = "bovf"
-    """Which recogniser."""
+    """Name of the recogniser."""
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
     words: int = Field(default=16_000, ge=1, le=65_536)
@@ -55,7 +55,7 @@ class BovfSettings(RelearnedSettings):
     """Whether a word counts by the root of how often it occurs: Jegou et al., On the burstiness of visual elements,
     CVPR 2009, section 4.1. A fence is then not a place."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres of k-means."""
+    """Seed of the first centres of k-means."""
 
     def learn(self, references: Iterable[Reference], threads: int) -> BovfState:
         """Words and their idf from the references. Raises LibraryError where they are fewer than two or featureless."""

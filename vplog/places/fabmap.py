@@ -45,7 +45,7 @@ class FabmapSettings(RelearnedSettings):
     """FAB-MAP 2.0: Chow-Liu tree, one image a place, inverted index, posterior over places and a new one."""
 
     kind: Literal["fabmap"] = "fabmap"
-    """Which recogniser."""
+    """Name of the recogniser."""
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
     words: int = Field(default=11_000, ge=1, le=65_536)
@@ -69,7 +69,7 @@ class FabmapSettings(RelearnedSettings):
     """Weigh the evidence by what it is worth among the references themselves: words that occur together are not so
     many independent observations, so without it the posterior is far too certain."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres of k-means and the samples."""
+    """Seed of the first centres of k-means and the samples."""
 
     @model_validator(mode="after")
     def _detects(self) -> Self:

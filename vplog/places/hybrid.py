@@ -55,7 +55,7 @@ class HybridSettings(RelearnedSettings):
     """Boxes of BoBB and signs of a few words: 96 + 64 bytes."""
 
     kind: Literal["hybrid"] = "hybrid"
-    """Which recogniser."""
+    """Name of the recogniser."""
     bobb: BobbSettings = BobbSettings(references=8)
     """The boxes. Two references fewer than BoBB alone, so that a place stays within 160 bytes; its least size and its
     patches are the words' own, too."""
@@ -75,7 +75,7 @@ class HybridSettings(RelearnedSettings):
     """How much the words count against the boxes, in standard deviations of either between the references: a half is
     as much. What the library explains badly has few boxes in common, and is then told by the words."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres, and of the directions' rotation."""
+    """Seed of the first centres, and of the directions' rotation."""
 
     def learn(self, references: Iterable[Reference], threads: int) -> HybridState:
         """Index the references, learn words, and how scores vary. Raises LibraryError where there are no features."""

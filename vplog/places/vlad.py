@@ -35,7 +35,7 @@ class VladSettings(RelearnedSettings):
     """Vector of locally aggregated descriptors, whitened by PCA."""
 
     kind: Literal["vlad"] = "vlad"
-    """Which recogniser."""
+    """Name of the recogniser."""
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
     centres: int = Field(default=64, ge=1, le=4096)
@@ -46,7 +46,7 @@ class VladSettings(RelearnedSettings):
     shrinkage: float = Field(default=1.0, ge=0)
     """Multiple of the mean variance added to each direction's before whitening: few references tell it badly."""
     seed: int = Field(default=0, ge=0)
-    """Of the first centres of k-means."""
+    """Seed of the first centres of k-means."""
 
     def learn(self, references: Iterable[Reference], threads: int) -> VladState:
         """Centres and PCA from the references. Raises LibraryError where they are fewer than two or featureless."""
