@@ -137,7 +137,7 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("infp drive.mcap", "Did you mean info?"),
         ("map exprt M -o x.parquet", "Did you mean export?"),
         ("fly", "Verbs: info, library, run,"),
-        ("--json info drive.mcap", "--json goes behind the verb: vplog VERB --json"),
+        ("--json info drive.mcap", "--json goes after the verb: vplog VERB --json"),
         ("run A -o OUT --otput x", "Did you mean --output?"),
         ("run A --otput x", "no option --otput. Did you mean --output?"),
         ("run A -o OUT --odometry /odom", "--odometry-topic, --odometry-file"),

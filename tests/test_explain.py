@@ -114,7 +114,7 @@ def test_what_is_missing_is_left_out_or_said() -> None:
     assert "verify.min_matches=9" in words.change
     direction = told(a_row(Verdict.ACCEPTED, covariance=None, scale="none"))
     assert "73.7 degrees" in direction.geometry
-    assert "how far is not" in direction.geometry
+    assert "its distance is not" in direction.geometry
     assert " m " not in direction.geometry
     apart = told(a_row(Verdict.ACCEPTED, residual_before=None))
     assert "unknown number of sigma" in apart.solver

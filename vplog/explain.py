@@ -41,7 +41,7 @@ def explain(
     """
     record = run_record.read_single_run(folder)
     if picture is not None and picture.suffix not in (".png", ".svg"):
-        raise ResultError(f"A picture is a .png or .svg, and {picture} is neither.")
+        raise ResultError(f"{picture} is neither a .png nor a .svg. Name one with -o.")
     try:
         pipeline = Pipeline.read(_part(record, folder, "settings"), f"{folder}/run.json")
     except SettingsError as error:
@@ -97,7 +97,7 @@ def worst(closures: Closures, _keyframes: Keyframes) -> int:
 
 def _part(record: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
     if not isinstance(record.get(name), dict):
-        raise ResultError(f"{folder}/run.json lacks {name}. Write it again with `vplog run`.")
+        raise ResultError(f"{folder}/run.json lacks {name}. Run `vplog run` again.")
     return record[name]
 
 
@@ -139,7 +139,7 @@ def _boxes(
             state = pipeline.places.load(library, 1)
             column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
             if made_by != state.hash:
-                raise LibraryError(f"{original(library)} is not the library of this run")
+                raise LibraryError(f"{original(library)} is not the library of this run.")
         query, match = state.from_arrow(column.take([row["query"], row["match"]]))
     except (LibraryError, LogError) as error:
         return [], str(error).rstrip(".")

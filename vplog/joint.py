@@ -181,7 +181,7 @@ def _alone(
     done = replace(done, keyframes=replace(done.keyframes, drive=name))
     camera = logs.open(path, topics).camera()
     if len(store) != len(done.keyframes.stamp_ns):
-        raise LogError(f"{path} changed while it was read. Run again.")
+        raise LogError(f"{path} changed while it was read. Run again when it is complete.")
     column, _ = tables.read_descriptors(folder / "descriptors.parquet")
     drive = drive_of(done.keyframes, camera, store.__getitem__, pipeline.verify, camera.baseline_m)
     return Alone(name, folder, done, drive, state.from_arrow(column))

@@ -212,7 +212,7 @@ class StageCache:
             head, _, content = content_of(data, key).tobytes().partition(b"\n")
             said, value = json.loads(head), codec.from_bytes(content)
             if not isinstance(said, list):
-                raise DamagedError("it holds something else")
+                raise DamagedError("it holds another type of result")
         except FileNotFoundError:
             raise AbsentError from None
         except Exception as error:  # whatever bytes do to a reader
@@ -231,7 +231,7 @@ class StageCache:
                 self.put(file_name(name, key), sealed(key, content))
             except ResultError as error:
                 self._full = True
-                self._warnings.append(f"What the stages came to is not kept for another run. {error}")
+                self._warnings.append(f"Results of stages are not cached for later runs. {error}")
         return hashlib.sha256(content).hexdigest()
 
     def put(self, name: str, data: bytes) -> Path:
@@ -248,7 +248,7 @@ class StageCache:
     def damaged(self, path: Path, error: Exception) -> None:
         """Say that a file was found damaged and is not used."""
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        self._warnings.append(f"{path.name} in {self.folder} is not used, and made anew: {reason}.")
+        self._warnings.append(f"{path.name} in {self.folder} is not used, its stage runs again: {reason}.")
 
     def know_inputs(self, drive: Path | Sequence[Path], inputs: Inputs) -> dict[str, str]:
         """sha256 of the files of the drive, which are read unless it is known; a later run then knows it.
@@ -269,7 +269,7 @@ class StageCache:
     def finish(self, drive: Path | Sequence[Path], inputs: Inputs, parts: Sequence[str]) -> None:
         """The run is done: remove what it did not use. `parts` are the files of its features, in order."""
         if look_of(drive) != inputs.look:
-            self._warnings.append("The log changed while it was read, so nothing is kept for another run.")
+            self._warnings.append("The log changed while it was read, so nothing is cached for later runs.")
             self._remove(set())
         if not self.keep or look_of(drive) != inputs.look:
             return
