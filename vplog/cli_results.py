@@ -93,10 +93,7 @@ def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
 def _add_truth_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--distance-m", type=positive, metavar="M", help="largest distance within one place (default: 6)")
     sub.add_argument(
-        "--heading-deg",
-        type=positive,
-        metavar="DEG",
-        help="largest angle of optical axes there (default: 45)",
+        "--heading-deg", type=positive, metavar="DEG", help="largest angle between optical axes (default: 45)"
     )
     sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
     sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help="add to the truth's stamps (default: 0)")

@@ -93,8 +93,8 @@ def _truth_options() -> argparse.ArgumentParser:
         help="pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS",
     )
     sub.add_argument("--tolerance", type=at_least(0), metavar="N", help="index: frames either side (default: 0)")
-    sub.add_argument("--distance-m", type=positive, metavar="M", help="poses, gps: most in a place (default: 6)")
-    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: most between views (default: 45)")
+    sub.add_argument("--distance-m", type=positive, metavar="M", help="poses, gps: same place within (default: 6)")
+    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: and turned by at most (default: 45)")
     sub.add_argument(
         "--min-gap", type=at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
     )
@@ -118,11 +118,7 @@ def _add_study(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
     sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
     sub.add_argument(
-        "--sizes",
-        type=_counts,
-        default=(10, 20, 50, 100),
-        metavar="L,L",
-        help="sizes (default: 10,20,50,100)",
+        "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="library sizes (default: 10,20,50,100)"
     )
     sub.add_argument("--seeds", type=at_least_one, default=3, metavar="N", help="libraries per figure (default: 3)")
     sub.add_argument(

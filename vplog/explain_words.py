@@ -154,7 +154,7 @@ def _too_few_matches(row: Row, pipeline: Pipeline) -> str:
     return (
         f"{needed} matches are needed (verify.min_matches), or their part among the strongest "
         f"{pipeline.verify.matching.first_look} features. --set verify.min_matches={row['matches']}, or a "
-        f"verify.matching.ratio above {ratio:g}, would have it looked at, and many false candidates with it."
+        f"verify.matching.ratio above {ratio:g}, would verify it, and many false candidates with it."
     )
 
 

@@ -103,9 +103,8 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
             )
         if found != wanted:
             raise LibraryError(
-                f"{source} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do "
-                f"not compare. Describe it again: vplog map redescribe {source} --library "
-                f"{whose}/libraries/{wanted} -o MAP."
+                f"{source} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do not "
+                f"compare. Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
             )
     return str(wanted)
 
