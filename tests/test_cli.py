@@ -395,7 +395,7 @@ def image_folder(folder: Path, _: Path) -> Path:
         (no_odometry, "odometry"),
         (no_messages, "odometry"),
         (one_frame, "two"),
-        (no_decodable_image, "decoded"),
+        (no_decodable_image, "decodes"),
         (only_nan_odometry, "odometry"),
         (image_folder, "odometry"),
     ],
