@@ -71,7 +71,7 @@ def test_parts_are_solved_each_by_itself_and_that_is_said(tmp_path: Path) -> Non
     (tmp_path / "in.g2o").write_text(text)
     done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o", "lm")
     said = " ".join(done.record["warnings"])
-    assert "2 parts" in said
+    assert "2 unconnected parts" in said
     assert "from 0, 40 on" in said
     assert "1 poses have no edge" in said
     poses = read_g2o(tmp_path / "out.g2o").graph.world_from_body

@@ -59,7 +59,7 @@ def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Drive, verb:
         told = json.loads(said.out)
         fate = [(one["was"], one["drive"], one["state"]) for one in told["drives"]]
         assert fate == [("drive", "drive", "computed"), ("lost", "lost", "failed")]
-        assert "/no/such.mcap is not there any more" in told["drives"][1]["error"]
+        assert "/no/such.mcap no longer exists" in told["drives"][1]["error"]
         with map_store.reading(new) as store:
             made_by = tables.read_metadata(store.table("descriptors", "drive"))["vplog.library"]
             assert map_store.one_library(store)[0] == told["library"] == made_by != library
@@ -110,5 +110,5 @@ def test_where_every_log_is_gone_the_same_command_goes_on(finished: Path, tmp_pa
     (other / "library.json").write_text(json.dumps({**record, "hash": "f" * 64}))
     for _ in range(2):
         told = redescribe_map(tmp_path / "map", other, tmp_path / "new")
-        assert [(one["state"], "not there any more" in one["error"]) for one in told["drives"]] == [("failed", True)]
+        assert [(one["state"], "no longer exists" in one["error"]) for one in told["drives"]] == [("failed", True)]
         assert not (tmp_path / "new").exists()

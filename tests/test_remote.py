@@ -180,7 +180,7 @@ def test_a_copy_is_known_by_what_it_is_of(bucket: str, tmp_path: Path) -> None:
 def test_a_run_by_url_is_begun_again(bucket: str, verb: Callable[..., Said]) -> None:
     said = verb("run", "--resume", "-o", f"{bucket}/run")
     assert said.code == 2
-    assert "sent when it is finished" in said.err
+    assert "uploaded when finished" in said.err
 
 
 def test_nothing_is_sent_of_what_failed(bucket: str) -> None:

@@ -266,7 +266,7 @@ def test_a_full_disk_costs_the_cache_but_not_the_run(
         file.unlink()
     monkeypatch.setattr(StageCache, "put", full)
     record = run(log, again, load_pipeline("default", QUICK)).record
-    assert [said for said in record["warnings"] if "are not stored" in said and "No space left" in said]
+    assert [said for said in record["warnings"] if "are not cached" in said and "No space left" in said]
     assert len(record["warnings"]) == 1
     assert results(again) == results(whole)
 
@@ -280,11 +280,11 @@ def test_parts_computed_elsewhere_spare_the_run_all_images(
     for part in reversed(todo):
         data = compute_part(part, threads=1 + part.number)
         assert data == (whole / ".cache" / part.file).read_bytes()
-        with pytest.raises(ResultError, match="came damaged"):
+        with pytest.raises(ResultError, match="arrived damaged"):
             put_part(cache, part, data[:-1])
         put_part(cache, part, data)
     assert missing_parts(cache, todo) == []
-    with pytest.raises(LogError, match="is not what it was"):
+    with pytest.raises(LogError, match="changed during the run"):
         compute_part(replace(todo[0], lengths=""))
     decoded.clear()
     run(log, tmp_path / "run", pipeline, cache=CacheOptions(cache))
@@ -495,9 +495,11 @@ def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, v
         (out / "run.json").write_text(json.dumps({**account, "finished": False, **changed}))
         return verb("run", "--resume", "-o", out).error
 
-    assert "is not there" in begun(log=str(tmp_path / "gone.mcap")) or "No log at" in begun(log=str(tmp_path / "gone"))
+    assert "no longer exists" in begun(log=str(tmp_path / "gone.mcap")) or "No log at" in begun(
+        log=str(tmp_path / "gone")
+    )
     assert "lacks log" in begun(log=None)
-    assert "same command again" in begun(topics=None)
+    assert "without --resume" in begun(topics=None)
     assert "lacks library.from" in begun(library={})
     assert "no_such_setting" in begun(settings={"no_such_setting": 1})
     assert "is not a library" in begun(library={"from": str(tmp_path / "lost")})

@@ -75,7 +75,7 @@ def test_what_is_no_file_is_one_line(answer: bytes, told: str, verb: Callable[..
     [
         (b"HTTP/1.1 206 Partial Content\r\nContent-Length: 0\r\n\r\n", "sends none from byte 100"),
         (PART + b"\r\n", "sends none from byte 100"),
-        (PART + b"Content-Range: bytes 0-9/10240\r\n\r\n" + DATA[:10], "from byte 0 on, asked for byte 100"),
+        (PART + b"Content-Range: bytes 0-9/10240\r\n\r\n" + DATA[:10], "from byte 0 on, not from byte 100"),
         (b"HTTP/1.1 206 P\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\nabc", "is not HTTP"),
         (FOUND + DATA, "does not answer range requests"),
     ],

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _CONTRADICTED = (
-    "The odometry's covariance was not believed: with it no closure is left, and with the drift model {kept} of the "
-    "{count} verified ones agree, so it claims too little."
+    "The odometry's covariance is too small and was replaced by the drift model: with it the solver keeps no "
+    "closure, with the model {kept} of {count}."
 )
 
 

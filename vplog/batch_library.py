@@ -40,7 +40,7 @@ def map_library(
     known = store.head().library if begun else None
     if known is not None and not store.library(known).is_dir():
         raise LibraryError(
-            f"{store} lacks its library {known[:12]}. Build the map again in another folder with `vplog batch`."
+            f"{store} lacks its library {known[:12]}. Copy it back, or make another map with `vplog batch`."
         )
     made = store.staging / "library"
     if given is not None:

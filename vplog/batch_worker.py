@@ -86,7 +86,7 @@ def compute_drive(task: Task) -> Outcome:
             )  # fmt: skip
         peak = done.record["totals"]["peak_memory_mb"]
         if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):
-            error = f"{task.about['log']} changed while it was read. Run again."
+            error = f"{task.about['log']} changed while it was read. Run again when it is complete."
         else:
             if done.keyframes.drive != task.drive:
                 keys.name_keyframes(task.folder / "keyframes.parquet", task.drive)
@@ -103,6 +103,6 @@ def compute_drive(task: Task) -> Outcome:
         error, may_pass = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True
     except Exception as problem:  # a fault of ours in one drive must not stop the others
         text = " ".join(str(problem).split())[:200]
-        error = f"Internal error: {type(problem).__name__}: {text}. `vplog run` shows more."
+        error = f"Internal error: {type(problem).__name__}: {text}. `vplog run LOG --debug` shows where."
     seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
     return Outcome(error, may_pass, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)

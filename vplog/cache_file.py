@@ -75,11 +75,11 @@ def check_file(path: Path, key: str | None = None) -> None:
 
 def _check_head(head: bytes, key: str | None, length: int, checksum: Callable[[], int]) -> None:
     if len(head) < _HEAD.size or head[: len(_MAGIC)] != _MAGIC:
-        raise DamagedError("it is no file of this version")
+        raise DamagedError("another version wrote it")
     _, own, told, summed = _HEAD.unpack(head)
     if key is not None and own != bytes.fromhex(key):
         raise DamagedError("it belongs to another result")
     if told != length:
         raise DamagedError(f"it holds {length} bytes instead of {told}")
     if checksum() != summed:
-        raise DamagedError("its content does not have the checksum it names")
+        raise DamagedError("its checksum does not match")

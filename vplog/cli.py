@@ -159,7 +159,7 @@ def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
 
 
 def info(arguments: argparse.Namespace) -> None:
-    """What is in a log, what would be used, what is wrong, the command to run."""
+    """Show what is in a log, what a run would use, what is wrong, and the command to run."""
     from vplog.info import preflight
 
     found = preflight(arguments.log, topics_of(arguments))
@@ -182,7 +182,7 @@ def info(arguments: argparse.Namespace) -> None:
 
 
 def library(arguments: argparse.Namespace) -> None:
-    """Build a reference library of frames of logs."""
+    """Build a reference library from frames of logs."""
     from vplog.libraries import build_library
 
     pipeline, warnings = pipeline_of(arguments), []
@@ -202,7 +202,7 @@ def library(arguments: argparse.Namespace) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """A recorded drive to an optimised trajectory; several, to one map of those that closures join."""
+    """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
     from vplog.remote import local_copy
     from vplog.report import outcome_of
 
@@ -246,7 +246,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
     from vplog.resume import asked_for
 
     if "://" in str(arguments.shown):
-        arguments.refuse("argument --resume: a run by URL is sent when it is finished; begin it again")
+        arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
     asking, asked_by = vars(arguments), ("pipeline", "set", "library", "gps")
     names = [name for name in asking if name in asked_by or name.endswith(("_topic", "_file"))]
     given = [name for name in names if asking[name] not in (None, [], False, "default")]
@@ -259,7 +259,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
 
 
 def config(arguments: argparse.Namespace) -> None:
-    """Every setting of a pipeline, as YAML that a pipeline file may hold."""
+    """Print every setting of a pipeline as YAML, in the form of a pipeline file."""
     import yaml
 
     tree = pipeline_of(arguments).model_dump(mode="json")
@@ -270,7 +270,7 @@ def config(arguments: argparse.Namespace) -> None:
 
 
 def schemas(arguments: argparse.Namespace) -> None:
-    """Write the contracts for outsiders."""
+    """Write the schemas of tables, MCAP messages and settings."""
     from vplog.pipeline import pipeline_schema
     from vplog.results.contracts import write_schemas
 
@@ -292,7 +292,7 @@ def _folder(path: Path) -> None:
 
 
 def demo(arguments: argparse.Namespace) -> None:
-    """Render a small drive, run on it, evaluate it."""
+    """Render a small drive, run on it and evaluate the result."""
     from vplog.demo import DemoSettings, make_drive
     from vplog.evaluation import evaluate as evaluate_run
     from vplog.pipeline import CacheOptions
@@ -329,7 +329,7 @@ def _parser() -> argparse.ArgumentParser:
     topics = topic_options()
     threads = argparse.ArgumentParser(add_help=False)
     threads.add_argument(
-        "--threads", type=at_least_one, default=available(), metavar="N", help="workers (default: all cores)"
+        "--threads", type=at_least_one, default=available(), metavar="N", help="threads (default: all cores)"
     )
     settings = settings_options("default", "default")
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
@@ -365,7 +365,7 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
     )
     add("config", config, settings)
-    sub = group("help", "What a verb does, and all its options.")
+    sub = group("help", "Show what a verb does, and all its options.")
     sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
     sub.set_defaults(verb=lambda arguments: parser.parse_args([*arguments.words, "--help"]), debug=False)
     return parser
@@ -373,9 +373,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=place, metavar="LOG")
-    text = "one line alone, and exit status 1 where a run cannot work"
+    text = "print one line; exit status 1 if a run would fail"
     sub.add_argument("--check", action="store_true", help=text)
-    text = "also write a page with pictures of the drive"
+    text = "also write an HTML page with pictures of the drive"
     sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
 
 
@@ -388,9 +388,9 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("logs", type=place, nargs="*", metavar="LOG")
     sub.add_argument("--library", type=place, metavar="LIB", help="reference library (default: made from the drive)")
     sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
-    sub.add_argument("--gps", action="store_true", help="take the log's satellite fixes as constraints too")
-    sub.add_argument("--resume", action="store_true", help="go on with the run in OUT that was killed; needs no LOG")
+    sub.add_argument("--gps", action="store_true", help="use the log's satellite fixes as constraints")
+    sub.add_argument("--resume", action="store_true", help="continue the interrupted run in OUT; needs no LOG")
     _add_force(sub)
     sub.add_argument(
-        "--no-cache", dest="cache", action="store_false", help="keep nothing in OUT for a run with other settings"
+        "--no-cache", dest="cache", action="store_false", help="do not cache results of stages in OUT for later runs"
     )

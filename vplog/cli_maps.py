@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def export_map(arguments: argparse.Namespace) -> None:
-    """The places of a map or of runs in one Parquet file: all, those of some drives, or those in a box on earth."""
+    """Write the places of a map or of runs to one Parquet file: all, or those of some drives or in a box on earth."""
     from vplog.maps.export import export_map as write_map
 
     with Progress(arguments) as progress:
@@ -53,7 +53,7 @@ def export_map(arguments: argparse.Namespace) -> None:
 
 
 def merge_maps(arguments: argparse.Namespace) -> None:
-    """Take drives of maps, or places of exported files, into another map that has the same library."""
+    """Copy drives of maps, or places of exported files, into another map with the same library."""
     from vplog.maps.merge import merge_maps as merge
 
     with Progress(arguments) as progress:
@@ -71,7 +71,7 @@ def join_map(arguments: argparse.Namespace) -> None:
 
 
 def remove_drives(arguments: argparse.Namespace) -> None:
-    """Take drives out of a map, as removing their folders does."""
+    """Remove drives from a map."""
     from vplog.maps.remove import remove_drives as remove
 
     found = remove(arguments.map, arguments.drives)
@@ -85,7 +85,7 @@ def remove_drives(arguments: argparse.Namespace) -> None:
 
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
-    """The drives of a map in another map, described with another library; their logs are read again."""
+    """Copy a map to another, its drives described with another library; their logs are read again."""
     with _processes(arguments) as processes, Progress(arguments) as progress:
         from vplog.redescribe import redescribe_map as redescribe
 
@@ -112,7 +112,7 @@ def _processes(arguments: argparse.Namespace, drives: int | None = None) -> Iter
 
 
 def batch(arguments: argparse.Namespace) -> None:
-    """Many recorded drives to one map that grows, each drive in a process of its own, here or over a Ray cluster."""
+    """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
     from vplog.errors import SettingsError
 
     if arguments.odometry_file is not None and len(arguments.logs) > 1:
@@ -151,7 +151,7 @@ def _end(
 
 
 def info_map(arguments: argparse.Namespace) -> None:
-    """The drives, places and library of a map, and what failed."""
+    """Show the drives, places and library of a map, and what failed."""
     from vplog.errors import ResultError
     from vplog.maps.info import describe_map
 
@@ -164,7 +164,7 @@ def info_map(arguments: argparse.Namespace) -> None:
 
 
 def query_map(arguments: argparse.Namespace) -> None:
-    """The places of a map that are most like each view of a log, searched here or by the workers of a Ray cluster."""
+    """Find the places of a map most like each view of a log, here or on the workers of a Ray cluster."""
     from vplog.engine import opened
     from vplog.maps.query import query_map as find_places
 
@@ -181,7 +181,7 @@ def query_map(arguments: argparse.Namespace) -> None:
 
 
 def index_map(arguments: argparse.Namespace) -> None:
-    """Bring the index of a map up to its drives, as the next query would: it is what queries search."""
+    """Bring the index that queries search up to date with the drives of a map, as the next query would."""
     from vplog.maps.query import index_map as update
 
     cache = _cache(arguments)
@@ -210,14 +210,14 @@ def add_maps(
 ) -> None:  # fmt: skip
     """The verb `batch`, and the verb `map` with its own verbs."""
     _add_batch(add("batch", batch, topics, threads, settings_options(None, "that of the map, else default")))
-    text = "Look into a map of many drives, search, export, merge, join or change it."
+    text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
     sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
     sub.set_defaults(verb=info_map)
     sub.add_argument("map", type=place, metavar="MAP")
-    text = "read every file and hold it against its sha256; status 1 and a line for each that is damaged"
+    text = "check every file against its sha256; a line for each damaged one, and exit status 1"
     sub.add_argument("--check", action="store_true", help=text)
-    text = "where a log's views are in a map"
+    text = "find where a log's views are in a map"
     sub = maps.add_parser("query", help=text, description=query_map.__doc__, parents=[common, topics, threads])
     sub.set_defaults(verb=query_map)
     sub.add_argument("map", type=place, metavar="MAP")
@@ -231,25 +231,25 @@ def add_maps(
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     sub.add_argument("--address", metavar="HOST:PORT", help="Ray cluster (default: one of this machine's cores)")
     _add_cache(sub)
-    text = "make what queries search"
+    text = "build the index that queries search"
     sub = maps.add_parser("index", help=text, description=index_map.__doc__, parents=[common, threads])
     sub.set_defaults(verb=index_map)
     sub.add_argument("map", type=place, metavar="MAP")
     _add_cache(sub)
     _add_export(maps, common)
-    text = "take the drives of maps into another map"
+    text = "copy drives of maps into another map"
     sub = maps.add_parser("merge", help=text, description=merge_maps.__doc__, parents=[common])
     sub.set_defaults(verb=merge_maps)
     sub.add_argument(
         "maps", type=place, nargs="+", metavar="MAP|FILE.parquet", help="maps, or places that `map export` wrote"
     )
-    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="this one alone; may be given again")
-    sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP", help="map that they go to")
-    text = "what joins the drives of a map"
+    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="only this drive; repeatable")
+    sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP", help="target map")
+    text = "find closures between the drives of a map and solve them together"
     sub = maps.add_parser("join", help=text, description=join_map.__doc__, parents=[common, threads])
     sub.set_defaults(verb=join_map)
     sub.add_argument("map", type=place, metavar="MAP")
-    sub = maps.add_parser("remove", help="take drives out", description=remove_drives.__doc__, parents=[common])
+    sub = maps.add_parser("remove", help="remove drives", description=remove_drives.__doc__, parents=[common])
     sub.set_defaults(verb=remove_drives)
     sub.add_argument("map", type=place, metavar="MAP")
     sub.add_argument("drives", nargs="+", metavar="DRIVE", help="as `map info` names them")
@@ -264,9 +264,9 @@ def add_maps(
 
 
 def _add_cache(sub: argparse.ArgumentParser) -> None:
-    text = "what is read of a map by URL stays in this folder (default: $VPLOG_CACHE, else ~/.cache/vplog)"
+    text = "folder that caches what is read of a map by URL (default: $VPLOG_CACHE, else ~/.cache/vplog)"
     sub.add_argument("--cache", type=local, metavar="DIR", help=text)
-    text = "most that stays there, in GB; what was not used for longest goes first, 0 keeps nothing (default: 20)"
+    text = "largest size of the cache in GB; least recently used files go first, 0 keeps none (default: 20)"
     sub.add_argument("--cache-gb", type=not_negative, metavar="GB", help=text)
 
 
@@ -275,10 +275,10 @@ def _add_export(maps: argparse._SubParsersAction[argparse.ArgumentParser], commo
     sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
     sub.set_defaults(verb=export_map)
     sub.add_argument("sources", type=place, nargs="+", metavar="MAP|RUN")
-    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="of a map; may be given again")
+    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="only this drive; repeatable")
     sub.add_argument(
         "--box", type=_box, metavar="LAT0,LON0,LAT1,LON1",
-        help="places in it alone, in degrees; LON0 beyond LON1 crosses the antimeridian (write --box=-33.9,...)",
+        help="only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)",
     )  # fmt: skip
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
     sub.add_argument("-o", "--output", type=local_file, required=True, metavar="FILE.parquet", help="file to write")
@@ -302,19 +302,19 @@ def _add_workers(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--jobs", type=at_least_one, metavar="N", help=text)
     text = "processes of this machine, or tasks of a Ray cluster (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
-    text = "the Ray cluster, as `ray start` says it, or auto (default: one of this machine for the time of the batch)"
+    text = "HOST:PORT of a Ray cluster, or auto (default: one on this machine for the time of the batch)"
     sub.add_argument("--address", metavar="HOST:PORT", help=text)
-    text = "more attempts at a drive whose worker was killed or could not read or write (default: 2)"
+    text = "retries of a drive whose worker was killed or had an I/O error (default: 2)"
     sub.add_argument("--retries", type=at_least(0), default=2, metavar="N", help=text)
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="a drive each")
+    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="one drive each")
     sub.add_argument("-o", "--map", type=place, required=True, metavar="MAP", help="folder, s3:// or gs:// of the map")
     _add_workers(sub)
     text = "do not look for closures between the drives at the end"
     sub.add_argument("--no-join", dest="join", action="store_false", help=text)
-    text = "keep intermediate results, 0.35 MB a keyframe, so that other settings read no images; local maps only"
+    text = "cache results of stages, 0.35 MB a keyframe, so that other settings read no images; local maps only"
     sub.add_argument("--keep-cache", action="store_true", help=text)
     text = "reference library (default: the map's, else one of the first logs)"
     sub.add_argument("--library", type=place, metavar="LIB", help=text)

@@ -53,7 +53,7 @@ def local_file_or_stdout(text: str) -> Path:
 
 def _path(text: str) -> Path:
     if text == "-":
-        raise argparse.ArgumentTypeError("the standard streams are of no use here: name a path (./- is one too)")
+        raise argparse.ArgumentTypeError("stdin and stdout cannot be used here: name a path (./- for a file named -)")
     return Path(text)
 
 

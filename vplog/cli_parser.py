@@ -58,7 +58,7 @@ class Parser(argparse.ArgumentParser):
             others = [one.prog for one in self._family if name in one._option_string_actions]
             near = nearest(name, known, cutoff=0.75)
             if self._subparsers is not None and others:
-                self.error(f"{name} goes behind the verb: {self.prog} VERB {name}")
+                self.error(f"{name} goes after the verb: {self.prog} VERB {name}")
             where = f" It is an option of {', '.join(others[:3])}." if others else ""
             longer = [one for one in known if one.startswith(f"{name}-")]
             meant = f" Write it in full: {', '.join(longer)}." if longer else ""

@@ -206,11 +206,11 @@ def _truth_notes(found: dict[str, Any]) -> list[str]:
     truth, notes = found.get("truth_is"), []
     if truth is not None and truth["frame"] != "body":
         what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
-        notes.append(f"The truth is that of {what}: closures and drift are those of the body, ATE and RPE not.")
+        notes.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
     if truth is not None and not truth["oriented"]:
         notes.append(
-            "The truth never turns, the odometry does: it holds positions alone. Closures are judged by place, without "
-            "heading; for their poses give a truth with orientations."
+            "The truth has no orientations, so closures are judged by place, without heading. To judge their "
+            "poses, give a truth with orientations."
         )
     if found.get("interpolated"):
         notes.append("Few poses have a stamp within 0.01 s of the truth's: poses are interpolated at its stamps.")
@@ -315,7 +315,7 @@ def print_export(found: dict[str, Any]) -> None:
 
 
 def print_joined(found: dict[str, Any]) -> None:
-    print(f"{found['map']}: {found['pairs']} pairs of drives looked at, {found['pairs_computed']} of them now")
+    print(f"{found['map']}: {found['pairs']} pairs of drives compared, {found['pairs_computed']} of them now")
     for component in found["components"]:
         print_line("together", f"{', '.join(component['drives'])}, in joint/{component['folder']}")
     if found["alone"]:
@@ -354,7 +354,7 @@ def print_answers(found: dict[str, Any]) -> None:
     ]
     print_table(("view", "drive", "keyframe", "score", "support"), rows)
     warn(found["warnings"])
-    print(f"{found['log']}: {found['answered']} of {found['views']} views are like a place of {found['map']}")
+    print(f"{found['log']}: {found['answered']} of {found['views']} views match a place of {found['map']}")
     if found["written"]:
         print(f"written   {found['written']}")
 

@@ -29,7 +29,7 @@ _BINARY = ("geoparquet", "rrd")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """A run, of one or several drives, against ground truth."""
+    """Evaluate a run, of one or several drives, against ground truth."""
     from vplog.evaluation import evaluate as evaluate_run
 
     found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), _truth_options(arguments))
@@ -37,7 +37,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def explain(arguments: argparse.Namespace) -> None:
-    """One candidate closure of a run in words, and a picture of both frames."""
+    """Explain one candidate closure of a run in words and a picture of both frames."""
     from vplog.explain import between, numbered, worst
     from vplog.explain import explain as explain_closure
 
@@ -58,7 +58,7 @@ def optimize(arguments: argparse.Namespace) -> None:
 
 
 def report(arguments: argparse.Namespace) -> None:
-    """Write the report of a finished run anew, against a truth where one is given."""
+    """Write the report of a finished run again, against a truth where one is given."""
     from vplog.retell import report as write_report
 
     found = write_report(
@@ -72,7 +72,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """A finished run in the format of another tool."""
+    """Write a finished run in the format of another tool."""
     from vplog.export import export as export_run
 
     with _file_or_stdout(arguments, arguments.format in _BINARY) as path:
@@ -91,9 +91,9 @@ def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
 
 
 def _add_truth_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--distance-m", type=positive, metavar="M", help="frames of one place are within (default: 6)")
+    sub.add_argument("--distance-m", type=positive, metavar="M", help="largest distance within one place (default: 6)")
     sub.add_argument(
-        "--heading-deg", type=positive, metavar="DEG", help="and their optical axes turned by less (default: 45)"
+        "--heading-deg", type=positive, metavar="DEG", help="largest angle between optical axes (default: 45)"
     )
     sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
     sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help="add to the truth's stamps (default: 0)")
@@ -130,7 +130,7 @@ def add_results(
     sub.add_argument("run", type=place, metavar="RUN")
     sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
     _add_truth_options(sub)
-    sub.add_argument("--log", type=place, metavar="LOG", help="of the run, to draw what result.mcap has no picture of")
+    sub.add_argument("--log", type=place, metavar="LOG", help="log of the run, for pictures that result.mcap lacks")
     sub.add_argument("-o", "--output", type=local_file, metavar="FILE.html", help="page (default: RUN/report.html)")
     sub = add("export", export)
     sub.add_argument("run", type=place, metavar="RUN")
@@ -142,7 +142,7 @@ def add_results(
     sub.add_argument(
         "-o", "--output", type=place, required=True, metavar="OUT", help="the graph at its solved poses, as g2o"
     )
-    sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="how false closures are met (default: gnc)")
+    sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
 
 
 def _add_explain(sub: argparse.ArgumentParser) -> None:
@@ -156,7 +156,7 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     text = "picture, .png or .svg (default: RUN/closure-K.png)"
     sub.add_argument("-o", "--output", type=local_file, metavar="PICTURE.png", help=text)
     sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
-    sub.add_argument("--no-picture", action="store_true", help="words alone; the log is not needed")
+    sub.add_argument("--no-picture", action="store_true", help="no picture; the log is not needed")
 
 
 def _seconds(text: str) -> float:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def compare(arguments: argparse.Namespace) -> None:
-    """Place recognisers side by side on two drives, or on one that comes back."""
+    """Compare recognisers on two drives, or on one that revisits places."""
     from vplog.compare import compare as compare_methods
     from vplog.methods import split_methods
 
@@ -40,7 +40,7 @@ def compare(arguments: argparse.Namespace) -> None:
 
 
 def study(arguments: argparse.Namespace) -> None:
-    """The experiments of the paper on two or more drives of one route, or on one that comes back."""
+    """Run the paper's experiments on two or more drives of one route, or on one that revisits places."""
     from vplog.methods import split_methods
     from vplog.study.study import METHODS
     from vplog.study.study import study as run_study
@@ -94,11 +94,11 @@ def _truth_options() -> argparse.ArgumentParser:
     )
     sub.add_argument("--tolerance", type=at_least(0), metavar="N", help="index: frames either side (default: 0)")
     sub.add_argument("--distance-m", type=positive, metavar="M", help="poses, gps: same place within (default: 6)")
-    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: and turned by less (default: 45)")
+    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: and turned by at most (default: 45)")
     sub.add_argument(
         "--min-gap", type=at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
     )
-    sub.add_argument("--library-size", type=at_least_one, default=100, metavar="L", help="of a drive (default: 100)")
+    sub.add_argument("--library-size", type=at_least_one, default=100, metavar="L", help="its images (default: 100)")
     return sub
 
 
@@ -110,7 +110,7 @@ def _add_comparison(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument("--sequence", type=at_least_one, metavar="L", help="also match sequences of L frames")
     sub.add_argument("--library", type=place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
-    sub.add_argument("--library-seed", type=at_least(0), default=0, metavar="S", help="of their choice (default: 0)")
+    sub.add_argument("--library-seed", type=at_least(0), default=0, metavar="S", help="of that choice (default: 0)")
     sub.add_argument("-o", "--output", type=local, metavar="OUT", help="folder for compare.json, scores and curves")
 
 
@@ -118,9 +118,9 @@ def _add_study(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
     sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
     sub.add_argument(
-        "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="of libraries (default: 10,20,50,100)"
+        "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="library sizes (default: 10,20,50,100)"
     )
-    sub.add_argument("--seeds", type=at_least_one, default=3, metavar="N", help="libraries a figure (default: 3)")
+    sub.add_argument("--seeds", type=at_least_one, default=3, metavar="N", help="libraries per figure (default: 3)")
     sub.add_argument(
         "--only", type=lambda text: text.split(","), metavar="E,E",
         help="pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)",

@@ -53,7 +53,7 @@ def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
     """
     with drawn(folder, "reliability", 5.5, 5.5) as figure:
         top, below = figure.subplots(2, 1, height_ratios=(4, 1), sharex=True)
-        top.plot([0, 1], [0, 1], color="0.6", linestyle=":", label="as it says")
+        top.plot([0, 1], [0, 1], color="0.6", linestyle=":", label="calibrated")
         for number, (plain_name, one) in enumerate(found.items()):
             filled, colour = one.count > 0, f"C{number % 10}"
             top.plot(
@@ -63,7 +63,7 @@ def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
             )  # fmt: skip
             width = (one.edges[1] - one.edges[0]) / len(found)
             below.bar(one.edges[:-1] + number * width, one.count, width, align="edge", color=colour)
-        top.set(ylabel="share of answers that are right", title="What the probability of an answer is worth")
+        top.set(ylabel="share of answers that are right", title="Reliability of the probabilities of answers")
         below.set(xlabel="probability of the best answer", ylabel="answers", xlim=(0, 1.02))
         below.set_yscale("log")  # of loop detection, most answers are improbable and few are certain
         below.set_ylim(bottom=0.5)

@@ -200,9 +200,9 @@ _SENTENCES = {
     Verdict.DEGENERATE_MOTION: "The map frames around the match moved too little or too straight for triangulation.",
     Verdict.NO_CALIBRATION: "The images agree by epipolar geometry, but without calibration there is no metric pose.",
     Verdict.IMPLAUSIBLE_POSE: "The pose found would put the camera further away than a shared view can be.",
-    Verdict.TOO_FAR: "The views agree, but are further apart than one place is wide; nearer keyframes tell it better.",
+    Verdict.TOO_FAR: "The views agree, but are further apart than one place is wide; nearer keyframes fit better.",
     Verdict.INCONSISTENT: "The pose from query to match and the one from match to query do not agree.",
-    Verdict.DIRECTION_ONLY: "Turn and direction agree with the robust solve, which took them without metres.",
+    Verdict.DIRECTION_ONLY: "Kept by the robust solve with rotation and direction only, without metres.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
 }
 

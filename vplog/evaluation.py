@@ -129,7 +129,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
     """
     if truth == "gps":
-        raise TruthError(f"{folder} holds several drives; hold each against its own GPS: vplog evaluate {folder}/DRIVE")
+        raise TruthError(f"{folder} holds several drives; each has its own GPS: vplog evaluate {folder}/DRIVE")
     known = _read_truth(truth, options)
     drives: dict[str, Evaluation] = {}
     uncovered: dict[str, str] = {}

@@ -42,7 +42,7 @@ def explain(
     """
     record = run_record.read_single_run(folder)
     if picture is not None and picture.suffix not in (".png", ".svg"):
-        raise ResultError(f"A picture is a .png or .svg, and {picture} is neither.")
+        raise ResultError(f"{picture} is neither a .png nor a .svg. Name one with -o.")
     _part(record, folder, "settings")
     pipeline = recorded_pipeline(folder, record)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
@@ -96,7 +96,7 @@ def worst(closures: Closures, _keyframes: Keyframes) -> int:
 
 def _part(record: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
     if not isinstance(record.get(name), dict):
-        raise ResultError(f"{folder}/run.json lacks {name}. Write it again with `vplog run`.")
+        raise ResultError(f"{folder}/run.json lacks {name}. Run `vplog run` again.")
     return record[name]
 
 

@@ -95,7 +95,7 @@ def _caption(view: View) -> str:
         ),
     ]
     if max(count, len(a.agrees) - count) > _MOST_LINES:
-        sentences.append(f"Of either, {_MOST_LINES} lines at most are drawn.")
+        sentences.append(f"At most {_MOST_LINES} lines of each are drawn.")
     if view.boxes:
         sentences.append(
             "Coloured: parts of the two views found in one spot of a reference image below. There, whole lines are "

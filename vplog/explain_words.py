@@ -68,7 +68,7 @@ def _proposed(row: Row, keyframes: Keyframes, siblings: list[str]) -> str:
     sentences = [
         f"Keyframe {query} ({at_s[0]:.1f} s into the drive) was proposed as a return to keyframe {match} "
         f"({at_s[1]:.1f} s), {between_m:.1f} m of path earlier.",
-        f"It is no. {row['rank'] + 1} of this keyframe's {len(siblings)} candidates, "
+        f"It ranks {row['rank'] + 1} of this keyframe's {len(siblings)} candidates, "
         f"{siblings.count(Verdict.ACCEPTED.value)} of them accepted; its score is {row['score']:.3f}"
         + (
             f", with {_count(row['support'], 'neighbouring pair')} in agreement by sequence." if row["support"] else "."
@@ -100,7 +100,7 @@ def _geometry(row: Row) -> str:
         turn = geometry.rotation(np.array([row["qx"], row["qy"], row["qz"], row["qw"]]))
         turned = f"is turned by {np.degrees(geometry.angle(turn)):.1f} degrees"
         if row["scale"] == "none":
-            sentences.append(f"By it keyframe {row['query']} {turned}; which way it lies is known, how far is not.")
+            sentences.append(f"By it keyframe {row['query']} {turned}; its direction is known, its distance is not.")
         else:
             sentences.append(
                 f"By it keyframe {row['query']} lies {np.linalg.norm(moved):.2f} m from keyframe {row['match']} "
@@ -112,13 +112,10 @@ def _geometry(row: Row) -> str:
 
 def _certainty(covariance: list[float] | None) -> str:
     if covariance is None:
-        return "In some direction nothing fixes it."
+        return "In some direction nothing constrains it."
     matrix = np.reshape(covariance, (6, 6))
     turn, shift = (np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0.0)) for part in (matrix[:3, :3], matrix[3:, 3:]))
-    return (
-        f"It is claimed to {shift:.3f} m and {np.degrees(turn):.2f} degrees: one standard deviation, in the "
-        "worst direction."
-    )
+    return f"Its standard deviation in the worst direction is {shift:.3f} m and {np.degrees(turn):.2f} degrees."
 
 
 def _solver(row: Row, keyframes: Keyframes, world_from_body: Floats, reason: str) -> str:
@@ -132,9 +129,9 @@ def _solver(row: Row, keyframes: Keyframes, world_from_body: Floats, reason: str
         return f"It was not given to the solver. {apart}"
     before, after = (_sigma(row[f"residual_{when}"]) for when in ("before", "after"))
     return (
-        f"The odometry alone is {before} away from it, and the solved trajectory {after} (of a right closure "
+        f"The odometry alone is {before} away from it, and the solved trajectory {after} (for a true closure "
         f"{_TYPICAL_SIGMA} is usual, and more than {_MOST_SIGMA} rare). Its weight in the robust solve is "
-        f"{row['weight']:.2f}. {apart} Of the whole run the solver says: {reason}"
+        f"{row['weight']:.2f}. {apart} The solve of the whole run: {reason}"
     )
 
 
@@ -160,7 +157,7 @@ def _too_few_matches(row: Row, pipeline: Pipeline) -> str:
     return (
         f"{needed} matches are needed (verify.min_matches), or their part among the strongest "
         f"{pipeline.verify.matching.first_look} features. --set verify.min_matches={row['matches']}, or a "
-        f"verify.matching.ratio above {ratio:g}, would have it looked at, and many false candidates with it."
+        f"verify.matching.ratio above {ratio:g}, would verify it, and many false candidates with it."
     )
 
 
@@ -222,22 +219,23 @@ def _implausible(_: Row, pipeline: Pipeline) -> str:
 
 def _too_far(_: Row, pipeline: Pipeline) -> str:
     return (
-        f"Up to {pipeline.verify.metric.max_distance_m:g} m are taken (verify.metric.max_distance_m). Nearer keyframes "
-        "of the same pass say the same with a smaller error; see the other candidates of this keyframe."
+        f"Up to {pipeline.verify.metric.max_distance_m:g} m are taken (verify.metric.max_distance_m). Nearer "
+        "keyframes of the same pass have a smaller error; see the other candidates of this keyframe."
     )
 
 
 def _inconsistent(row: Row, _: Pipeline) -> str:
     return (
-        "Both ways must give one pose. Where they do not, the scene repeats itself, or too little of it is seen from "
-        f"both; see the other candidates of keyframe {row['query']}. --set verify.both_ways=false asks one way alone."
+        "Both ways must give one pose. Where they do not, the scene repeats itself, or too little of it is seen "
+        f"from both; see the other candidates of keyframe {row['query']}. --set verify.both_ways=false checks one "
+        "way."
     )
 
 
 def _by_solver(row: Row, _: Pipeline) -> str:
     return (
-        "It would be kept if the odometry or other closures agreed with it. Where it is right, the odometry's noise is "
-        f"claimed too small or the neighbouring closures are false: look at the candidates around keyframe "
+        "It would be kept if the odometry or other closures agreed with it. Where it is right, the odometry's "
+        "noise is set too small or the neighbouring closures are false: look at the candidates around keyframe "
         f"{row['query']} with a weight of 1, and at the noise settings (`noise`)."
     )
 

@@ -66,7 +66,7 @@ class Extracted:
                 stream.seek(CONTENT_AT)
                 begin = CONTENT_AT + _LENGTH.size + (told := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
                 if begin > length:
-                    raise DamagedError("its head is longer than the file")
+                    raise DamagedError("its header is longer than the file")
                 head = json.loads(stream.read(told))
             rows = [_Row(*map(int, row)) for row in head["rows"]]
             lost = [str(why) for why in head["lost"]]
@@ -74,10 +74,10 @@ class Extracted:
         except FileNotFoundError:
             raise AbsentError from None
         except (OSError, ValueError, TypeError, KeyError, RecursionError, struct.error) as error:
-            raise DamagedError(f"its head cannot be read: {error}") from None
+            raise DamagedError(f"its header cannot be read: {error}") from None
         for row in rows:
             if min(row[1:]) < 0 or not row.width or not row.height or begin + row.end > length:
-                raise DamagedError("its head names places behind its end")
+                raise DamagedError("its header points beyond its end")
         self.stamp_ns += [row.stamp_ns for row in rows]
         self.lost += lost
         self.undecodable += undecodable

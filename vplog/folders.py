@@ -43,8 +43,8 @@ def regular_files(folder: Path) -> Iterator[str]:
             yield entry.name
         elif kind := _kind(entry):
             raise ResultError(
-                f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold their own files alone. Put a "
-                "copy of what is meant in its place."
+                f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold only files of their own. "
+                "Replace it with a copy of the file."
             )
 
 

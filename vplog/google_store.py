@@ -84,7 +84,7 @@ def _greet(endpoint: str, bucket: str, wait_s: float) -> None:
     except (OSError, ValueError, http.client.HTTPException) as error:
         why = getattr(error, "reason", error)
         if not isinstance(why, ssl.SSLError):  # it is there; the client has certificates of its own
-            raise OSError(f"{endpoint} does not answer ({why}); is there a network") from None
+            raise OSError(f"{endpoint} does not answer ({why}); check the network") from None
 
 
 def _has_credentials() -> bool:
@@ -121,7 +121,7 @@ def plain(text: str) -> str:
     said = " ".join((found[1] if found else text).split())[:200].rstrip(". ")
     if "access token" in text or re.search(r"UNAUTHENTICATED|PERMISSION_DENIED", text):
         return (
-            f"Google Cloud says: {said}. Log in with `gcloud auth application-default login`, or set "
+            f"Google Cloud answers: {said}. Log in with `gcloud auth application-default login`, or set "
             "GOOGLE_APPLICATION_CREDENTIALS to the key of an account that may"
         )
     return said

@@ -211,7 +211,7 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
             f"--odometry-topic {topic.name} takes it"
         )
     if topic.role in ("tf", "tf_static"):
-        return "nothing moves or stands by it that another topic does not tell"
+        return "it adds no transform to those of other topics"
     if topic.role == "depth" and any(other.part == "right" for other in found.topics):
         return "depth comes from the pair"
     option = f"--{topic.role}-topic {topic.name}"

@@ -63,8 +63,8 @@ def _about_parts(part: Ints, ids: Ints) -> list[str]:
     said = [f"{alone} poses have no edge and stay where they are."] if alone else []
     if (size > 1).sum() > 1:
         said.append(
-            f"The graph is in {int((size > 1).sum())} parts that no edge joins (from {', '.join(first)} on"
-            f"{', ..' if (size > 1).sum() > 5 else ''}); each is solved by itself and stays where its first pose is."
+            f"The graph has {int((size > 1).sum())} unconnected parts (from {', '.join(first)} "
+            f"on{', ..' if (size > 1).sum() > 5 else ''}); each is solved by itself with its first pose fixed."
         )
     return said
 

@@ -138,7 +138,7 @@ def _check_seal(path: Path, footer_alone: bool = False) -> None:
             stream.seek(0)
             sound = _summed(stream, start) == body
     if not sound:
-        raise ValueError("It is damaged: it does not have the checksum that it names.")
+        raise ValueError("It is damaged: its checksum does not match.")
 
 
 def _summed(stream: BinaryIO, count: int) -> int:
@@ -247,7 +247,7 @@ def _is_text(kind: pa.DataType) -> bool:
 def _check(needed: int, path: Path) -> None:
     size = path.stat().st_size
     if needed > (most := max(ALWAYS_BYTES, MOST_TIMES * size)):
-        raise ValueError(f"Its {size} bytes tell of {needed // 10**6} MB, and {most // 10**6} MB is the most they may.")
+        raise ValueError(f"Its {size} bytes claim to unpack to {needed // 10**6} MB; the limit is {most // 10**6} MB.")
 
 
 def _row_bytes(kind: pa.DataType) -> int:

@@ -134,7 +134,7 @@ def compute_part(part: Part, threads: int = 1) -> bytes:
     paths = [located(path) for path in part.log]
     log = logs.open_drive(paths, part.topics)
     if inputs_of(paths, None).lengths != part.lengths:
-        raise LogError(f"{paths[0]} is not what it was when its parts were told. Is it still being written or copied?")
+        raise LogError(f"{paths[0]} changed during the run. Run again when it is written or copied to its end.")
     return sealed(part.key, _content(log, part, _frames(log, [part], threads)))
 
 
@@ -143,9 +143,7 @@ def put_part(cache: Path, part: Part, data: bytes) -> None:
     try:
         content_of(data, part.key)
     except DamagedError as error:
-        raise ResultError(
-            f"Part {part.number} of {shown(part.log[0])} came damaged: {error}. Compute it again."
-        ) from None
+        raise ResultError(f"Part {part.number} of {shown(part.log[0])} arrived damaged: {error}. Run again.") from None
     try:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -68,9 +68,9 @@ class Pipeline(Settings):
     solve: OptimiserSettings = GncSettings()
     """Robust solve of the pose graph."""
     cross_check: CrossCheckSettings = CrossCheckSettings()
-    """Other methods asked where the solve rejects much."""
+    """Other methods compared where the solve rejects much."""
     refine: RefineSettings = RefineSettings()
-    """What the constraints kept say of the odometry."""
+    """Noise and scale of the odometry by the constraints kept."""
     gps: GpsSettings = GpsSettings()
     """Satellite fixes as constraints."""
     join: JoinSettings = JoinSettings()

@@ -99,8 +99,8 @@ class Head:
 
     def _error(self) -> SettingsError:
         return SettingsError(
-            f"The Ray cluster at {self._address} has lost its head. What is in the map stays there. Start the cluster "
-            "again, and run again."
+            f"The Ray cluster at {self._address} has lost its head node. The map keeps what it has. Start the "
+            "cluster and run again."
         )
 
 
@@ -156,7 +156,7 @@ def _check_answers(address: str) -> None:
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or "//" in host:
         raise SettingsError(
-            f"--address {address} is no HOST:PORT of a Ray cluster. Take what `ray start --head` says, or auto."
+            f"--address {address} is no HOST:PORT of a Ray cluster. Give what `ray start --head` prints, or auto."
         )
     command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--skip-version-check"]
     try:

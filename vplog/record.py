@@ -37,7 +37,7 @@ def stored_log(text: str, whose: str, again: str) -> Path:
     try:
         if path.exists():
             return path
-        why = "is not there any more"
+        why = "no longer exists"
     except OSError as error:
         why = f"cannot be opened ({reason(error)})"
     no_query = _NO_QUERY if text.startswith("http") else ""
@@ -53,7 +53,7 @@ def reopened(
     """The log of a run by its run.json, or the one given in its place. Raises LogError, which says how to give it
     `again`, or ResultError where none is."""
     if log is None and not isinstance(account.get("log"), str):
-        raise ResultError("The run's run.json lacks log. Run `vplog run` again to write it anew.")
+        raise ResultError("The run's run.json lacks log. Run `vplog run` again.")
     parts = account.get("parts") or [account.get("log")]
     known = [log] if log is not None else [stored_log(str(part), "The log of the run", again) for part in parts]
     if log is not None and not log.exists():
@@ -84,7 +84,7 @@ def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
     if not (library / "library.json").is_file():
         told = account.get("library")
         if not isinstance(told, dict) or not isinstance(told.get("from"), str):
-            raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again to write it anew.")
+            raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
         library = located(told["from"])
     with local_copy(library) as here:
         yield here

@@ -66,9 +66,7 @@ def redescribe_map(
         log = drives[drive]["log"]
         try:
             if ALONE in drives[drive]:
-                raise LogError(
-                    f"Places alone are known of it. Put its log into the map first: vplog batch LOG -o {root}"
-                )
+                raise LogError(f"Only its places are known. Add its log to the map first: vplog batch LOG -o {root}")
             stored_log(
                 log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
             )

@@ -33,7 +33,7 @@ class LibrarySettings(Settings):
     least_gain: float = Field(default=0.005, gt=0, lt=1)
     """`coverage` without a size stops where one more reference adds less than this share of what is explained."""
     seed: int = Field(default=0, ge=0)
-    """Of a random choice."""
+    """Seed of a random choice."""
 
 
 def choose(stamp_ns: Ints, settings: LibrarySettings) -> Ints:

@@ -76,7 +76,7 @@ def _checked(url: str, scheme: str) -> str:
             "them out: a store's keys come from the environment, and a web server takes a signed link."
         )
     if store and "?" in url:
-        raise SettingsError(f"{shown(url)} has a query behind it, which {scheme}:// takes none. Spell ? in a name %3F.")
+        raise SettingsError(f"{shown(url)} has a query, which {scheme}:// does not take. Write ? in a name as %3F.")
     return url.replace("#", "%23") if store else url
 
 

@@ -51,8 +51,8 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
         raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")
     if not isinstance(account.get("topics"), dict):  # of an older version
         raise ResultError(
-            f"{out}/run.json does not say all that its run was asked for. Give the same command again without "
-            "--resume: what is done is found."
+            f"{out}/run.json lacks options of its run. Give the full command without --resume: finished stages are "
+            "reused."
         )
     known = [str(located(text).resolve()) for text in _texts(account, out)]
     paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query

@@ -176,9 +176,7 @@ def earth_of(trajectory: Trajectory, gps: Gps | None, known: dict[str, Any] | No
         except (KeyError, TypeError, ValueError, OverflowError):
             origin, world_from_enu = [], np.empty(0)
         if world_from_enu.shape != (4, 4) or not np.isfinite([*origin, *world_from_enu.ravel()]).all():
-            raise ResultError(
-                "The `gps` of a run.json does not say where the run is. Run it again: vplog run LOG --gps"
-            )
+            raise ResultError("run.json's `gps` lacks the run's place on earth. Run again: vplog run LOG --gps")
         return Earth((origin[0], origin[1], origin[2]), geometry.inverse(world_from_enu))
     if gps is None or len(trajectory.stamp_ns) < 2:
         return None

@@ -179,7 +179,7 @@ class StageCache:
             self.put(file_name(name, key), sealed(key, json.dumps(warnings).encode() + b"\n" + content))
         except ResultError as error:
             self._full = True
-            self._warnings.append(f"The results of the stages are not stored for another run. {error}")
+            self._warnings.append(f"The results of the stages are not cached for another run. {error}")
 
     def put(self, name: str, data: bytes) -> Path:
         """Write a file as a whole. Raises ResultError."""
@@ -195,7 +195,7 @@ class StageCache:
     def damaged(self, path: Path, error: Exception) -> None:
         """Say that a file was found damaged and is not used."""
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        self._warnings.append(f"{path.name} in {self.folder} is not used, and made anew: {reason}.")
+        self._warnings.append(f"{path.name} in {self.folder} is not used, its stage runs again: {reason}.")
 
     def _know_inputs(self) -> dict[str, str]:
         """sha256 of the files of the drive, which are read unless it is known; a later run then knows it.
@@ -215,7 +215,7 @@ class StageCache:
         self.hashes()
         inputs, changed = self.inputs, look_of(self.drive) != self.inputs.look
         if changed:
-            self._warnings.append("The log changed while it was read, so nothing is stored for another run.")
+            self._warnings.append("The log changed while it was read, so nothing is cached for another run.")
             self._remove(set())
         if self.keep and not changed:
             known = {"look": inputs.look, "token": inputs.token, "hashes": inputs.hashes, **_known_inputs(self.folder)}

@@ -49,7 +49,7 @@ def get_range(url: str, start: int, count: int, length: int) -> bytes:
             raise OSError("the server does not answer range requests; download the file first")
         found = _CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
         if found and int(found[1]) != start:
-            raise OSError(f"the server sends from byte {found[1]} on, asked for byte {start}")
+            raise OSError(f"the server sent from byte {found[1]} on, not from byte {start}")
         while len(data) < count and (block := answer.read1(count - len(data))):
             data += block
             if time.monotonic() - began > _TIMEOUT_S + len(data) / _SLOWEST:

@@ -34,7 +34,8 @@ def gated(graph: PoseGraph) -> tuple[np.ndarray, str]:
 
 
 @pytest.mark.parametrize(
-    ("off_m", "why"), [(0.7, "the methods disagree about the 40"), (1.1, "closures bend it"), (3.0, "none of the 40")]
+    ("off_m", "why"),
+    [(0.7, "robust methods disagree about the 40"), (1.1, "closures its chi-square"), (3.0, "none of the 40")],
 )
 def test_poisoned_closures_leave_the_odometry_and_a_sentence(off_m: float, why: str) -> None:
     graph = poisoned(off_m)

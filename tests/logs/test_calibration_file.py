@@ -129,16 +129,16 @@ def test_camchain_makes_a_pair_without_any_calibration_in_the_log(tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "no mapping"),
-        ("- 1", "no mapping"),
+        ("", "not a mapping"),
+        ("- 1", "not a mapping"),
         ("a: [", "not YAML"),
         ("a: 1", "neither camera_matrix nor intrinsics"),
         ("camera_matrix: {data: [1, 2]}", "where 9 numbers"),
         ("intrinsics: [1, 2, 3, .nan]", "where 4 numbers"),
         ("camera_model: omni\nintrinsics: [1, 2, 3, 4]", "camera_model 'omni'"),
         ("intrinsics: [1, 2, 3, 4]\ndistortion_model: fov", "distortion_model 'fov'"),
-        ("intrinsics: [1, 2, 3, 4]\nresolution: [1, -5]", "no size"),
-        ("intrinsics: [1, 2, 3, 4]\nT_BS: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "no rotation"),
+        ("intrinsics: [1, 2, 3, 4]\nresolution: [1, -5]", "not an image size"),
+        ("intrinsics: [1, 2, 3, 4]\nT_BS: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "not rigid"),
         ("a: &a [1]\nb: &b [*a, *a]\nintrinsics: [*b, *b]", "where 4 numbers"),
     ],
 )

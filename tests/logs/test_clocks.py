@@ -97,7 +97,7 @@ def test_a_real_gap_is_no_jump_and_is_told() -> None:
     log_ns[25:] += 60 * SECOND
     stamp_ns, _ = stamps(true_ns, log_ns).order("/t", notes := Notes())
     np.testing.assert_array_equal(stamp_ns, true_ns)
-    assert notes.lines == ["/t: 1 gap, the longest 60.1 s, 2.4 s behind its first message."]
+    assert notes.lines == ["/t: 1 gap, the longest 60.1 s, 2.4 s after its first message."]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_a_topic_on_another_clock_is_moved_where_it_fits_nowhere_and_told_of_whe
         stamp_ns, _ = odometry.order("/odometry", notes := Notes())
         assert (np.abs(stamp_ns - true_ns[::2]).max() <= JITTER_NS) == moved
         assert quiet.lines == []
-        assert ("of another clock" if moved else "Were they recorded late") in notes.lines[0]
+        assert ("from another clock" if moved else "Were they recorded late") in notes.lines[0]
 
 
 def test_a_clock_that_is_set_in_a_whole_log(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_a_list_of_topics_with_holes_is_read(tmp_path: Path) -> None:
     db.close()
     np.testing.assert_array_equal(logs.open(path).stamps(), DRIVE.stamp_ns)
     (tmp_path / "packed.mcap").write_bytes(zstandard.compress(b"anything"))
-    assert "holds something else than a log" in refusal(tmp_path / "packed.mcap")
+    assert "does not hold a log" in refusal(tmp_path / "packed.mcap")
 
 
 def test_kind_is_told_by_content(tmp_path: Path) -> None:

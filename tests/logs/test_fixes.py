@@ -66,7 +66,7 @@ def test_sound_fixes_are_all_taken(seed: int) -> None:
     ({"latitude_deg": 139.7, "longitude_deg": 35.6}, "swapped"),
     ({"latitude_deg": 91.0, "longitude_deg": 100.0}, "out of range"),
     ({"longitude_deg": 400.0}, "out of range"),
-    ({"latitude_deg": 5.0, "longitude_deg": 5.0}, "further from the others"),
+    ({"latitude_deg": 5.0, "longitude_deg": 5.0}, "nothing moves that far"),
 ]))  # fmt: skip
 def test_what_is_no_position_is_left_out_and_said(seed: int, case: tuple[dict[str, Any], str]) -> None:
     rng = np.random.default_rng(seed)

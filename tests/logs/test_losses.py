@@ -78,7 +78,7 @@ def test_a_cut_bag_is_counted_by_its_metadata(storage: str, share: float, tmp_pa
     try:
         found, losses, _ = opened(folder)
     except LogError as error:
-        assert any(why in str(error) for why in ("nothing in it can be read", "no image that can be decoded"))
+        assert any(why in str(error) for why in ("nothing in it can be read", "decodes: "))
         return
     outside = lost_by_topic(losses, "cut", "damaged_bytes", "unknown_channel")
     assert Counter(found) + outside == RECORDED

@@ -87,7 +87,7 @@ def test_what_is_not_one_drive_is_refused(tmp_path: Path) -> None:
     next_day = write_raw(tmp_path / "next_day.mcap", [(*alien, START_NS + 86_400 * 10**9, b"1")])
     assert "24.0 hours lie between" in refusal(a, b, next_day)
     other = KINDS["ros1"](tmp_path, 5, SECOND)
-    assert "different kinds (mcap, ros1)" in refusal(a, other)
+    assert "are not one drive" in refusal(a, other)
     assert "no file" in refusal(a, tmp_path / "missing.mcap")
     assert "is a folder; give it by itself" in refusal(a, b.parent)
     longer = [

@@ -221,7 +221,7 @@ def test_repairs_in_a_whole_log(tmp_path: Path) -> None:
     np.testing.assert_array_equal(odometry.stamp_ns, drive.stamp_ns + LATENCY_NS)
     notes = " ".join(log.warnings)
     assert "out of order" in notes
-    assert "Lost: 1 message with the stamp of an earlier one, at t=0.100 s: /cam/image/compressed 1 of 5." in notes
+    assert "Lost: 1 message with the same stamp as an earlier one, at t=0.100 s: /cam/image/compressed 1 of 5." in notes
     assert "/odom has no header stamps" in notes
 
 

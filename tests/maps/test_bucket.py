@@ -277,7 +277,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     with map_store.writing(root) as gone:  # it ends without giving its lock back
         pass
     monkeypatch.setattr(bucket_lock, "_machine", lambda: "another machine")
-    with pytest.raises(SettingsError, match=r"ends by itself within 1\d\d s"), map_store.writing(root):
+    with pytest.raises(SettingsError, match=r"expires within 1\d\d s"), map_store.writing(root):
         pass
     monkeypatch.setattr(bucket_lock, "LEASE_S", -1.0)
     monkeypatch.setattr(bucket_lock, "RENEWALS", -20)

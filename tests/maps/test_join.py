@@ -192,7 +192,7 @@ def test_a_drive_that_was_replaced_is_said(copy: Path, verb: Callable[..., Said]
     assert "replaced" not in verb("map", "info", copy).err
     record = copy / "runs" / "drive=after" / "drive.json"
     run_record.write_run_json(record, {**run_record.read_run_json(record), "key": "of another log"})
-    assert "after was replaced since" in verb("map", "info", copy).err
+    assert "after was replaced after" in verb("map", "info", copy).err
     path = copy / "joint.json"
     joint = run_record.read_run_json(path)
     joint["groups"][0]["components"] = [{"folder": "x", "drives": 3}]
@@ -246,7 +246,7 @@ def test_a_pair_without_its_log_is_left_out_and_tried_again(copy: Path) -> None:
     told = joined(copy)
     assert told["components"] == []
     [warning] = told["warnings"]
-    assert warning.startswith("before in after was left out. The log of before /gone.mcap is not there any more")
+    assert warning.startswith("before in after was left out. The log of before /gone.mcap no longer exists")
     run_record.write_run_json(record, about)
     told = joined(copy)
     assert (told["searched"], told["pairs_computed"], told["warnings"]) == (["before"], 1, [])

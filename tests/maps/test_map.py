@@ -73,7 +73,7 @@ def test_a_drive_goes_with_its_folders(root: Path, verb: Verb) -> None:
     shutil.rmtree(root / "runs" / "drive=ten")
     told = verb("map", "info", root, "--json").json
     assert [one["drive"] for one in told["drives"]] == ["all", "back 1/2"]
-    assert sum("drive=ten is of no drive" in problem for problem in told["problems"]) == len(map_store.TABLES)
+    assert sum("drive=ten belongs to no drive" in problem for problem in told["problems"]) == len(map_store.TABLES)
     for folder in root.glob("*/drive=ten"):
         shutil.rmtree(folder)
     told = verb("map", "info", root, "--json").json
@@ -110,7 +110,7 @@ def test_a_drive_is_found_where_it_is(root: Path, drive: Drive, verb: Verb, tmp_
     best = [answer for answer in told["answers"] if answer["rank"] == 0]
     assert all(answer["query_stamp_ns"] == answer["stamp_ns"] for answer in best if answer["drive"] == "all")
     assert sum(answer["keyframe"] == answer["query"] for answer in best) >= 0.9 * len(best)
-    assert "views are like a place" in verb(*query, "-o", out, "--threads", 1).out
+    assert "views match a place" in verb(*query, "-o", out, "--threads", 1).out
     assert hashlib.sha256(out.read_bytes()).hexdigest() == digest
 
 
@@ -131,7 +131,7 @@ def test_what_is_no_map_is_one_line(root: Path, drive: Drive, verb: Verb, tmp_pa
     assert "is not a map" in verb("map", "info", tmp_path).error
     assert "is not a map" in verb("map", "query", tmp_path / "gone", drive.log).error
     record = run_record.read_run_json(root / "map.json")
-    for change, why in (({"format": 99}, "version 99"), ({"library": "../.."}, "no sound library")):
+    for change, why in (({"format": 99}, "version 99"), ({"library": "../.."}, "lacks a valid library")):
         (root / "map.json").write_text(json.dumps({**record, **change}))
         assert why in verb("map", "info", root).error
     (root / "map.json").write_text("{")

@@ -162,7 +162,7 @@ def test_another_library_is_refused_everywhere_and_nothing_is_written(verb: Verb
     verb("map", "remove", a, "strange")
     assert verb("map", "info", a, "--json").json["problems"] == [
         "1 of 1 drives were made with other settings than the last batch had, or by another version of vplog. "
-        "`vplog batch` with their logs makes them anew; the first is /logs/1/one.mcap."
+        "`vplog batch` with their logs computes them again; the first is /logs/1/one.mcap."
     ]
 
 

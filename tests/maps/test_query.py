@@ -212,7 +212,7 @@ def test_a_map_that_cannot_be_written_to_is_searched_all_the_same(made: Map) -> 
     made.store.index.touch()
     parts, warnings = made.update()
     assert len(warnings) == 1
-    assert "stays in memory" in warnings[0]
+    assert "is not stored" in warnings[0]
     view = made.views(1)[0]
     assert told(best_places(parts, made.state, [view], TOP), 0) == made.expected(view)
 

@@ -213,7 +213,7 @@ def in_words(closures: dict[str, Any]) -> list[str]:
         ("not_judged", "are not judged: the truth has a gap there, or is too coarse to tell"),
         (
             "overconfident",
-            "true ones are off by more than they claim (99.9 %): the claim, or the truth between two visits, is off",
+            "true ones are outside 99.9 % of their covariance: it, or the truth between two visits, is wrong",
         ),
         ("by_place", "without a pose, or a truth with orientations, are judged by place"),
         ("directions", f"without metres, {closures.get('directions_true')} of them true by turn and direction"),

@@ -26,7 +26,7 @@ class SiftSettings(Settings):
     """SIFT of one image, strongest features first."""
 
     kind: Literal["sift"] = "sift"
-    """Which extractor."""
+    """Name of the extractor."""
     max_features: int = Field(default=2000, ge=1)
     """Features kept of an image, by response: enough that 400 of them are large enough to describe a place, while
     verification takes the 1000 strongest."""

@@ -199,8 +199,8 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     return odometry_kept(
         graph,
         solution,
-        f"{closures} closures bend it to a chi-square of {chi2:.4g} where its noise allows {bound:.4g}, so some are "
-        "false or the noise is too small.",
+        f"with {closures} closures its chi-square is {chi2:.4g} where its noise allows {bound:.4g}, so some are "
+        "false or the noise is set too small.",
     )
 
 

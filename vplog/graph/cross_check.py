@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 class CrossCheckSettings(Settings):
-    """When the solve of verified closures is not believed on its own."""
+    """When the solve of verified closures is compared with other methods."""
 
     use: bool = True
-    """Whether to ask other methods at all."""
+    """Whether to compare with other methods."""
     rejected_share: float = Field(default=0.1, ge=0, le=1)
-    """Share of the closures that the solve may reject unasked: verification lets few false ones through, and a true one
-    in a hundred is lost by design."""
+    """Share of the closures that the solve may reject without it: verification lets few false ones through, and a true
+    one in a hundred is lost by design."""
     rejected: int = Field(default=3, ge=0)
-    """And so many at least, as a share of few says nothing."""
+    """Least number that it must reject for a comparison, as a share of few means nothing."""
 
 
 def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSettings) -> Solution:
@@ -47,8 +47,7 @@ def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSett
     return odometry_kept(
         graph,
         solution,
-        f"the methods disagree about the {count} verified closures. The solve keeps {accepted}, "
-        f"{' and '.join(findings)}, "
-        "and these bend the odometry further than its noise allows: as a body the closures are false, or its noise is "
-        "too small.",
+        f"robust methods disagree about the {count} verified closures: the solve keeps {accepted}, "
+        f"{' and '.join(findings)}, and each contradicts the odometry's noise: the closures are false as a set, or the "
+        "noise is set too small.",
     )

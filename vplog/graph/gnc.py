@@ -1,4 +1,4 @@
-"""Graduated non-convexity: closures that do not fit the rest lose their weight, odometry keeps its own.
+"""Graduated non-convexity: inconsistent closures are down-weighted, odometry keeps its weight.
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020. Three things are
 added to it, since it starts from a solve with every closure, which false ones can bend beyond return, and ends
@@ -82,18 +82,16 @@ class GncSettings(Settings):
         agreed = agreement(graph, loops, chain)
         gated = far_from_odometry(graph, self.gate_probability, chain)[loops]
         weight[loops] = (agreed.probability > 0.5) & ~gated & self._join(graph, loops, chain)
-        apart = int((weight[loops] == 0).sum() - gated.sum())
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
-        weight, poses, stages = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
+        weight, poses = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
         scrutiny = Scrutiny(
             factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
         )
         state = scrutiny(weight, poses)
-        accepted = int(state.weight[loops].sum())
-        taken = "1 stage" if stages == 1 else f"{stages} stages"
+        accepted, far = int(state.weight[loops].sum()), int(gated.sum())
         found = (
-            f"{accepted} of {len(loops)} closures were kept, {int(gated.sum())} were too far from the odometry. "
-            f"{apart} disagreed with it at first; {taken} and leave-one-out tests decided. "
+            f"{accepted} of {len(loops)} closures were kept; {far} were too far from the odometry, "
+            f"{len(loops) - accepted - far} inconsistent with the others. "
         )
         return solve_weighted(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
 
@@ -114,21 +112,20 @@ class GncSettings(Settings):
                 good[np.searchsorted(loops, accepted)] = True
         return good
 
-    def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats, int]:
-        """Algorithm 1 of the paper over the closures of weight 1: weights 0 or 1, poses, and stages taken."""
+    def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats]:
+        """Algorithm 1 of the paper over the closures of weight 1: weights 0 or 1, and poses."""
         weight = np.array(weight)
         judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
         if len(judged) == 0:
-            return weight, poses, 0
+            return weight, poses
         poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
-        stage = 0
-        for stage in range(1, self.max_stages + 1):  # noqa: B007 (used in the reason)
+        for _ in range(self.max_stages):
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
             poses = descend(factors, weight, poses, self.steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
             mu *= self.growth
-        return np.where(weight > 0.5, 1.0, 0.0), poses, stage
+        return np.where(weight > 0.5, 1.0, 0.0), poses

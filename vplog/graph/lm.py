@@ -48,7 +48,7 @@ def solve_weighted(
 
 def as_solution(graph: PoseGraph, weight: Floats, fit: Fit, found: str) -> Solution:
     """The fit of the weighted edges (E,) as a Solution; its reason is `found` and how the descent ended."""
-    end = "converged" if fit.converged else "stopped at the limit"
+    end = "converged" if fit.converged else "stopped at the step limit"
     return Solution(
         world_from_body=fit.world_from_body,
         weight=weight,

@@ -37,7 +37,7 @@ class PcmSettings(Settings):
     gate_probability: float = Field(default=0.999999, gt=0, lt=1)
     """A closure further from the odometry alone than this quantile (6.2 sigma) is out from the start."""
     most_closures: int = Field(default=3000, ge=1)
-    """Of more closures, those nearest to the odometry are compared: 3000 have 4.5 million pairs, some 20 s."""
+    """Most closures compared, those nearest to the odometry: 3000 have 4.5 million pairs, some 20 s."""
     clique_steps: int = Field(default=100_000, ge=1)
     """Branches of the exact search for the largest set, some seconds; the best one so far is taken after that."""
     max_iterations: int = Field(default=100, ge=1)

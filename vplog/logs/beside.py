@@ -28,7 +28,7 @@ class Beside:
         if choice.odometry_file is not None:
             logged = Odometry(*read_tum(choice.odometry_file, LogError, "--odometry-file"), None)
             self.odometry = without_jumps(logged, choice.odometry_file.name, notes)
-            notes.add(f"{choice.odometry_file.name} carries no covariance; the noise of its motion is a guess.")
+            notes.add(f"{choice.odometry_file.name} carries no covariance; its noise is that of the drift model.")
         self._path = choice.calibration_file
         self._cameras = [] if self._path is None else read_calibrations(self._path)
 

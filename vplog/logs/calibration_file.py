@@ -49,7 +49,7 @@ def read_calibrations(path: Path) -> list[CalibratedCamera]:
     """The cameras of a file, in its order. Raises LogError where it is none of the known kinds."""
     try:
         if path.stat().st_size > _LARGEST:
-            raise LogError(f"{path} is larger than 1 MB, so it is no calibration.")
+            raise LogError(f"{path} is larger than 1 MB, so it is no calibration. {_KINDS}.")
         tree = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(f"Cannot read {path}: {error}. Give a calibration with --calibration.") from None
@@ -75,7 +75,7 @@ def camera_for(cameras: list[CalibratedCamera], topic: str, path: Path) -> Calib
 
 def _cameras(tree: Any) -> list[CalibratedCamera]:
     if not isinstance(tree, dict) or not tree:
-        raise _BadCalibrationError("it is no mapping")
+        raise _BadCalibrationError("its top level is not a mapping of names to values")
     if "camera_matrix" in tree:
         return [CalibratedCamera(_text(tree.get("camera_name")) or "camera", "", _camera_info(tree))]
     if "intrinsics" in tree:
@@ -127,7 +127,7 @@ def _pose(value: Any) -> Floats:
     values = _matrix(value, 16).reshape(4, 4)
     turn = values[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > _ROUNDED or np.linalg.det(turn) < 0:
-        raise _BadCalibrationError("a transform in it is no rotation with a shift")
+        raise _BadCalibrationError("a transform in it is not rigid (a rotation and a translation)")
     u, _, v = np.linalg.svd(turn)  # the nearest rotation: digits were cut
     return geometry.pose(u @ v, values[:3, 3])
 
@@ -155,5 +155,5 @@ def _text(value: Any) -> str:
 
 def _size(value: Any) -> int:
     if not isinstance(value, int | float) or not 0 <= value < 1e6:
-        raise _BadCalibrationError(f"{reprlib.repr(value)[:40]} is no size in px")
+        raise _BadCalibrationError(f"{reprlib.repr(value)[:40]} is not an image size in px")
     return int(value)

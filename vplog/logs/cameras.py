@@ -51,13 +51,13 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
     if is_rectified(name) and calibration.projection[0, 0] > 0:
         matrix, model, distortion = calibration.projection[:, :3], "", np.zeros(0)
     if not ((np.abs(matrix) < _LARGEST_PX).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
-        notes.add(f"The calibration of {name} is not set (K[0] = {matrix[0, 0]:g}); the camera counts as uncalibrated.")
+        notes.add(f"{name} is uncalibrated: its K is not set (K[0] = {matrix[0, 0]:g}). Give one with --calibration.")
         return unknown
     known = _model(model, distortion)
     if known is None:
         notes.add(
             f"The calibration of {name} has {len(distortion)} coefficients of the distortion model {model[:40]!r}, "
-            f"which is none of {', '.join(_COUNTS)}; the camera counts as uncalibrated."
+            f"which is none of {', '.join(_COUNTS)}, so the camera is uncalibrated. Give one with --calibration."
         )
         return unknown
     camera = replace(unknown, matrix=matrix, distortion_model=known[0], distortion=known[1])
@@ -114,7 +114,7 @@ def _fit(camera: Camera, calibration: CalibrationMessage, notes: Notes) -> Camer
     x, y = camera.width / width, camera.height / height
     seen = f"{camera.width} x {camera.height} px, its calibration {width} x {height}"
     if abs(x - y) > _SAME_SHAPE * max(x, y):
-        notes.add(f"The images of {camera.name} have {seen}; the camera counts as uncalibrated.")
+        notes.add(f"{camera.name} is uncalibrated: its images have {seen}. Give another with --calibration.")
         return replace(camera, matrix=None, distortion_model="none", distortion=np.zeros(0))
     notes.add(f"The images of {camera.name} have {seen}; the matrix is scaled to the images.")
     # Pixel centres are whole numbers, so the image starts at -0.5: scaling is about that corner.

@@ -104,11 +104,11 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         pairs = nearest(stamp_ns, other_ns).tolist()
         paired.append([None if pair < 0 else other_places[pair] for pair in pairs])
         if images.channel and (alone := sum(pair < 0 for pair in pairs)):
-            notes.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame's time.")
+            notes.add(f"{alone} of {plural(len(pairs), 'image')} have no {name} image within half a frame period.")
         both = np.flatnonzero(np.array(pairs, np.int64) >= 0)
         late_ns = np.abs(other_ns[np.array(pairs, np.int64)[both]] - stamp_ns[both])
         if name == "right" and len(both) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
-            notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; motion spoils depth.")
+            notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion.")
     odometry, frames = None, []
     if chosen.odometry is not None:
         odometry, frames = found[chosen.odometry].odometry, found[chosen.odometry].frames

@@ -68,7 +68,7 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
     rows = find_jumps(stamp_ns, poses)
     stray = _stray(stamp_ns, poses, rows)
     if stray.any():
-        notes.add(f"{what}: {plural(int(stray.sum()), 'pose')} far off those before and behind left out.")
+        notes.add(f"{what}: {plural(int(stray.sum()), 'pose')} far from those before and after left out.")
         stamp_ns, poses = stamp_ns[~stray], poses[~stray]
         covariance = None if covariance is None else covariance[~stray]
         rows = find_jumps(stamp_ns, poses)
@@ -139,5 +139,5 @@ def _sentence(stamp_ns: Ints, poses: Floats, rows: Ints, what: str) -> str:
     more = f" and {len(rows) - _NAMED} times more" if len(rows) > _NAMED else ""
     return (
         f"{what}: the poses jump by {', '.join(named)}{more} (a relocalisation or a reset?); the motion before is "
-        "continued there, and what follows is moved to it."
+        "extrapolated there, and later poses are shifted to fit."
     )

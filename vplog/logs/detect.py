@@ -97,7 +97,7 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
             kind = _magic(inside)
         if kind not in _READERS:
             raise LogError(
-                _no_log(path) if inside is path else f"{path} holds something else than a log when unpacked."
+                _no_log(path) if inside is path else f"{path} does not hold a log when unpacked. A log is {_KNOWN}."
             )
         if kind == "db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
             inside = copies.enter_context(fetched(inside))
@@ -115,7 +115,7 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
     for path in paths:
         if path.is_dir() or not path.exists():
             what = "a folder; give it by itself" if path.is_dir() else "no file"
-            raise LogError(f"{path} is {what}. A drive in several logs is given as its files.")
+            raise LogError(f"{path} is {what}. Give a drive in several logs as its files.")
         same_name = sum(other.name == path.name for other in paths) > 1
         try:
             container, kind = open_container(path, notes, str(path) if same_name else path.name)
@@ -182,7 +182,7 @@ def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Note
         try:
             container, kind = open_container(file, notes)
             if kind == "ros1":
-                raise LogError(f"{file} is a ROS 1 bag, which no ROS 2 bag holds.")
+                raise LogError(f"{file} is a ROS 1 bag in the folder of a ROS 2 bag. Give it by itself.")
             parts.append(container)
             kinds.add(kind)
         except LogError as error:

@@ -171,8 +171,8 @@ def affine_to_camera(
         )
     if found is not None:
         notes.add(
-            f"The images of {topic} change their size or window; those that are not the first's, {size}, are "
-            "resampled to it."
+            f"The images of {topic} change their size or region of interest; those unlike the first are resampled "
+            f"to its {size}."
         )
     return found
 

@@ -123,7 +123,7 @@ class Calibrations:
         if self.unset and self.found and self.channel:
             notes.add(
                 f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
-                f"{'is' if self.unset == 1 else 'are'} not set (K is zero or NaN); the first that is set is taken."
+                f"{'is' if self.unset == 1 else 'are'} not set (K is zero or NaN); the first that is set is used."
             )
         return self.found or ([self._first] if self._first else [])
 

@@ -113,7 +113,7 @@ class ImageFolder:
         files = of_one_camera(path, sorted(files, key=natural_order), choice.image)
         times = stamps_of([file.stem for file in files])
         if times is None:
-            notes.add(f"The names in {path.name} are not times; its images are taken to be 0.1 s apart.")
+            notes.add(f"The names in {path.name} are not times; its images are assumed to be 0.1 s apart.")
             times = [i * PERIOD_NS for i in range(len(files))]
         notes.account.know(path.name, {path.name: len(files)}, min(times))
         lost = [(time_ns, time_ns) for file, time_ns in zip(files, times, strict=True) if file in damaged]

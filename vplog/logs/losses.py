@@ -19,18 +19,18 @@ Span = tuple[int, int]
 """First and last ns of something, both included."""
 
 REASONS = {
-    "cut": "behind the place where the file is cut off or unreadable to its end",
+    "cut": "after the place where the file is cut off or unreadable to its end",
     "missing_file": "in storage files that are missing or unreadable",
     "damaged_bytes": "in bytes that hold no record",
     "damaged_chunk": "in damaged chunks or pages",
-    "unknown_channel": "of channels that nothing defines",
+    "unknown_channel": "of channels without a definition",
     "packed": "that do not unpack",
     "undecodable": "that cannot be decoded",
     "empty_image": "without image data",
     "undecodable_image": "whose image cannot be decoded",
     "no_stamp": "without a header stamp",
-    "stray_stamp": "with a header stamp far from those beside it",
-    "repeated_stamp": "with the stamp of an earlier one",
+    "stray_stamp": "with a header stamp far from its neighbours'",
+    "repeated_stamp": "with the same stamp as an earlier one",
 }
 """Every reason a message is lost for, as it follows `3 messages`."""
 _MOST_SPANS = 64
@@ -188,7 +188,7 @@ class Account:
         if known:
             what = "no message" if not total else f"{total} message{'s' * (total > 1)}"
         if known and len(known) < len(group):
-            what += " and more that nothing counts,"
+            what += " and more that cannot be counted,"
         named = [f"{loss.topic}{_count(loss)}" for loss in group if loss.topic]
         which = ", ".join(named[:_NAMED]) + _more(len(named) - _NAMED)
         spans = merged([span for loss in group for span in loss.spans_ns])

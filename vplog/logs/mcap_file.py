@@ -132,7 +132,7 @@ class McapFile:
                 lost[topic] = lost.get(topic, 0) + count
         for start, stop in layout.gaps:
             if not any(start <= chunk.start < stop for chunk in layout.missing):
-                detail = f"{name} is damaged near byte {start}; it is read again from byte {stop} on."
+                detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
                 account.add("damaged_bytes", None, (name, start), self._between(start, start_ns, end_ns), detail)
         if layout.unknown_at is not None and (not recorded or sum(lost.values()) < sum(recorded.values())):
             detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
@@ -146,12 +146,12 @@ class McapFile:
             account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)], detail)
         if layout.index_cut_at is not None:
             at = layout.index_cut_at
-            self._notes.add(f"{name} is cut or damaged at byte {at}, behind its messages; none is lost.")
+            self._notes.add(f"{name} is cut or damaged at byte {at}, after its last message; none is lost.")
         whole = layout.cut_at is None and not layout.gaps
         account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
         unexplained = account.settle({name}, recorded, found)
         if unexplained and sum(recorded.values()) > sum(lost.values()):  # else it names other topics
-            detail = f"{name} counts more messages than it holds."
+            detail = f"The statistics of {name} count more messages than it holds."
             account.add("damaged_bytes", unexplained, (name, 0), [(start_ns, end_ns)], detail)
 
     def _between(self, position: int, start_ns: int, end_ns: int) -> list[tuple[int, int]]:

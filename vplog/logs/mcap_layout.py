@@ -115,7 +115,7 @@ def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None
     """Walk the file; `define` gets every schema and channel record outside the chunks. Raises LogError."""
     walk = _Walk(file, length, define)
     if walk.at(0, len(MAGIC)) != MAGIC:
-        raise LogError(f"{name} does not start as an MCAP file does.")
+        raise LogError(f"{name} is not an MCAP file: it does not start with MCAP's magic bytes.")
     walk.check_summary()
     walk.records(len(MAGIC))
     walk.finish()

@@ -113,7 +113,7 @@ class MovingFrames:
             else:
                 still = tree.between(*edge)
                 poses = poses @ (np.eye(4) if still is None else still)
-        notes.add(f"Odometry is {names} of {topic}, which carries no covariance; the noise of its motion is a guess.")
+        notes.add(f"Odometry is {names} of {topic}, which carries no covariance; its noise is that of the drift model.")
         return Odometry(at_ns, poses, None), frames
 
     def _chain(self, tree: FrameTree, topic: str, notes: Notes) -> list[Edge]:
@@ -133,7 +133,7 @@ class MovingFrames:
             if below and moving.intersection(chain[below[0] :]):
                 return chain[below[0] :]
         if chain and chain[0][0] in parents:
-            notes.add(f"{topic}: the transforms above {body} run in a circle without odom, map or world; not odometry.")
+            notes.add(f"{topic}: the transforms above {body} form a loop without odom, map or world; no odometry.")
             return []
         return chain
 

@@ -125,8 +125,8 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
     if commands and (not fit or commands[0].score > fit[0][0].score):
         names = ", ".join(source.topic for source in commands)
         notes.add(
-            f"{names}: by its name where the robot is to be, not where it is, so not taken as odometry; "
-            f"--odometry-topic {commands[0].topic} takes it."
+            f"{names}: a command by its name (where the robot should be), so not used as odometry; --odometry-topic "
+            f"{commands[0].topic} takes it."
         )
     if not fit:
         return None if sources else asked or next(iter(chosen.sources), None)
@@ -145,13 +145,13 @@ def _note_doubts(source: OdometrySource, asked: bool, pictured: bool, notes: Not
         )
     if pictured and any(_SPARSE in what for what in source.evidence) and (source.rate_hz or 1.0) < 1.0:
         notes.add(
-            f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is a guess, "
-            "by a straight line."
+            f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is "
+            "interpolated."
         )
     if not asked and _MAYBE_COMMANDED in source.evidence:
         notes.add(
-            f"{source.topic} is by its name where the robot is to be, but moves {source.frames[-1]}, and no other "
-            "source is better; --odometry-file takes one from a file."
+            f"{source.topic} is a command by its name (where the robot should be), but moves {source.frames[-1]}, "
+            "and no other source is better; --odometry-file takes one from a file."
         )
     if any(map(_TRUTH.search, (source.topic, *source.frames))):
         notes.add(

@@ -45,7 +45,7 @@ def _fetch(path: RemotePath, folder: Path) -> Path:
     room, size = shutil.disk_usage(folder).free - _SPARE, path.stat().st_size
     if size > room:
         raise LogError(
-            f"{path} has {size / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in {folder.parent}. Set TMPDIR."
+            f"{path} has {size / 1e9:.1f} GB, {folder.parent} {room / 1e9:.1f} GB free. Set TMPDIR to a larger disk."
         )
     with path.open("rb") as file, (folder / path.name).open("wb") as out:
         shutil.copyfileobj(file, out, _BLOCK)
@@ -64,13 +64,13 @@ def _unpack(path: Path, folder: Path) -> Path:
                 block = stream.read(_BLOCK)
             except zstandard.ZstdError as error:
                 if not written:
-                    raise LogError(f"{path} cannot be unpacked: {error}.") from None
+                    raise LogError(f"{path} cannot be unpacked: {error}. Is the copy whole?") from None
                 break  # what came before is a log that is cut here
             if not block:
                 break
             written += out.write(block)
             if written > most:
-                raise LogError(f"{path} unpacks to more than {MAX_RATIO} times its size, which no log does.")
+                raise LogError(f"{path} unpacks to more than {MAX_RATIO} times its size, so it is no log.")
             if written > room:
                 raise LogError(
                     f"{path} unpacks to more than the {room / 1e9:.1f} GB that are free in {folder.parent}. "

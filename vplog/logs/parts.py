@@ -39,7 +39,7 @@ def in_order_of_time(parts: list[Part]) -> list[Part]:
     parts = sorted(parts, key=lambda part: (part.contents.start_ns, part.path))
     for a, b in pairwise(parts):
         if a.kind != b.kind:
-            raise LogError(f"{a.path} and {b.path} are of different kinds ({a.kind}, {b.kind}), so not of one drive.")
+            raise LogError(f"{a.path} ({a.kind}) and {b.path} ({b.kind}) are not one drive. Run each by itself.")
         overlap_ns = a.contents.end_ns - b.contents.start_ns
         if overlap_ns > _OVERLAP_NS:
             raise LogError(

@@ -47,7 +47,7 @@ class Pictures:
 
     def image(self, row: int) -> Encoded | Decoded:
         if self._image is None:
-            raise LogError("No image topic is chosen.")
+            raise LogError("No image topic is chosen. Choose one with --image-topic.")
         if self._video is None:
             return Encoded(self._image, self._container.read(self.content.places[row]), self._levels)
         try:
@@ -87,7 +87,7 @@ class Pictures:
                     return message.frame, (width, height)
             except BadMessageError as error:
                 reason = str(error)
-        raise LogError(f"{channel.topic} in {log} has no image that can be decoded: {reason}.")
+        raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another --image-topic.")
 
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""

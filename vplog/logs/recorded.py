@@ -132,7 +132,7 @@ class RecordedLog:
             hint = f" If {depth[0]} is a thermal camera's, take it with --image-topic {depth[0]}." if depth else ""
             raise LogError(f"No camera images in {self._path.name}. Topics: {listed or 'none'}.{hint}")
         if not len(self._content.stamp_ns):
-            raise LogError(f"{self._selection.image.topic} in {self._path.name} has no readable image.")
+            raise LogError(f"No image of {self._selection.image.topic} can be read. Choose another with --image-topic.")
         return self._selection.image
 
     def _frame(self, row: int, camera: Camera) -> RecordedFrame:
@@ -221,7 +221,7 @@ class RecordedLog:
             return None
         try:
             if self._codec(right):
-                raise NoPairError(f"{right.topic} is video; of a pair, only the left images may be")
+                raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
             known = [self._beside_log.camera(channel.topic) for channel in (image, right)]
             calibrations = [camera.calibration if camera else None for camera in known]
             if known[0] is None:

@@ -112,7 +112,7 @@ class Ros1Bag:
             account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)] if end_ns else [], detail)
         if layout.index_cut_at is not None:
             self._notes.add(
-                f"{name} is cut or damaged at byte {layout.index_cut_at}, behind its messages; none is lost."
+                f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message; none is lost."
             )
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         account.know(name, recorded if whole else {}, start_ns)

@@ -87,7 +87,7 @@ def read_layout(file: BinaryIO, length: int, connect: Callable[[dict[bytes, byte
     """Walk the bag; `connect` gets header and data of every connection record outside the chunks. Raises LogError."""
     walk = _Walk(file, length, connect)
     if walk.at(0, len(MAGIC)) != MAGIC:
-        raise LogError(f"{name} does not start as a ROS 1 bag of format 2.0 does.")
+        raise LogError(f"{name} is not a ROS 1 bag of format 2.0: it does not start with its magic bytes.")
     walk.records(len(MAGIC))
     walk.finish()
     return walk.layout

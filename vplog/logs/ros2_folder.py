@@ -100,7 +100,7 @@ class Counted:
         unexplained = account.settle(self._files, known.recorded, found, known.end_ns or None)
         if unexplained:
             more = sum(unexplained.values())
-            self._notes.add(f"metadata.yaml counts {more} more messages than its storage files, which are whole, hold.")
+            self._notes.add(f"metadata.yaml counts {more} messages more than its undamaged storage files hold.")
         elif account.losses:
             for file in self._files:
                 account.know(file, {}, contents.start_ns)
@@ -212,7 +212,7 @@ def _check_depth(text: str) -> None:
     for event in yaml.parse(text, Loader=_LOADER):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
-            raise ValueError(f"it nests more than {_DEEPEST} deep")
+            raise ValueError(f"its YAML has more than {_DEEPEST} nested levels")
 
 
 def _metadata(folder: Path) -> dict:

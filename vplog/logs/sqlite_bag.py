@@ -48,7 +48,7 @@ class SqliteBag:
         except (sqlite3.Error, UnicodeDecodeError) as error:
             if not pending:
                 raise LogError(f"{path} is not a readable ROS 2 bag: {error}.") from None
-            notes.add(f"{log.name} holds messages that were never merged and cannot be read here; they are left out.")
+            notes.add(f"{log.name} (write-ahead log) holds messages that cannot be read here; they are left out.")
             self._db = self._connect("immutable=1")
         self._topics = self._read_topics()
 
@@ -61,7 +61,7 @@ class SqliteBag:
             found = self._db.execute(query).fetchall()
             last = max((row[4] for row in found), default=0)
             if sum(row[1] for row in found) > last:  # rows are numbered from 1: damage made the tree a circle
-                raise sqlite3.DatabaseError("rows come again")
+                raise sqlite3.DatabaseError("rows repeat")
             rows: Iterable[tuple] = [row[:4] for row in found]
         except _DAMAGE:
             rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
@@ -179,7 +179,7 @@ class SqliteBag:
         query = f"SELECT {columns} FROM messages WHERE {chosen}{behind} ORDER BY rowid"  # noqa: S608 - names of ours
         for row in self._db.execute(query, [*(topics or []), *([last] if last else [])]):
             if row[0] <= last:
-                raise _OrderError("the numbers of its rows do not increase")
+                raise _OrderError("its row numbers do not increase")
             last = row[0]
             yield row
 

@@ -199,8 +199,8 @@ def _on_common(stamp_ns: Ints, skew_ns: int, common: Clock | None, topic: str, n
         )
         return stamp_ns
     notes.add(
-        f"{topic}: the header stamps are of another clock than those of most messages, {abs(shift) / 1e9:.3f} s apart "
-        "by the log times; they are shifted to it, and right to the jitter of the log times."
+        f"{topic}: the header stamps come from another clock than most messages', {abs(shift) / 1e9:.3f} s apart by "
+        "the log times; they are shifted to it, to within the jitter of the log times."
     )
     return stamp_ns + shift
 
@@ -228,7 +228,7 @@ def _note_gaps(topic: str, stamp_ns: Ints, notes: Notes) -> None:
         longest = gaps[np.argmax(steps[gaps])]
         at_s = (stamp_ns[longest] - stamp_ns[0]) / 1e9
         notes.add(
-            f"{topic}: {plural(len(gaps), 'gap')}, the longest {steps[longest] / 1e9:.1f} s, {at_s:.1f} s behind its "
+            f"{topic}: {plural(len(gaps), 'gap')}, the longest {steps[longest] / 1e9:.1f} s, {at_s:.1f} s after its "
             "first message."
         )
 

@@ -108,10 +108,10 @@ class PoseTrack:
             return Odometry(stamp_ns, poses, covariance)
         if usable.any():
             bad = plural(int((~usable).sum()), "covariance")
-            notes.add(f"{self.topic}: {bad} that no noise can have (zero, negative or not finite) taken as unknown.")
+            notes.add(f"{self.topic}: {bad} with zero, negative or not finite values taken as unknown.")
             return Odometry(stamp_ns, poses, covariance)
         why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
-        notes.add(f"{self.topic} {why}; the noise of its motion is a guess.")
+        notes.add(f"{self.topic} {why}; its noise is that of the drift model.")
         return Odometry(stamp_ns, poses, None)
 
     def give_places(self) -> None:
@@ -174,7 +174,7 @@ class FixTrack:
         known = np.abs(altitude) < _HIGHEST_M
         if not known.all():
             missing = f"{int((~known).sum())} of {len(known)} fixes have no altitude"
-            notes.add(f"{self.topic}: {missing}; those beside, or 0 m, stand in and do not count.")
+            notes.add(f"{self.topic}: {missing}; neighbouring altitudes, or 0 m, are used without weight.")
             altitude = np.interp(stamp_ns, stamp_ns[known], altitude[known]) if known.any() else np.zeros(len(stamp_ns))
             covariance[~known] = _without_altitude(covariance[~known])
         gps = Gps(stamp_ns, latitude, longitude, altitude, covariance)
@@ -182,8 +182,7 @@ class FixTrack:
         if bool(near.all()):
             return gps
         notes.add(
-            f"{self.topic}: {int((~near).sum())} of {len(near)} fixes left out, which lie further from the others than "
-            "anything moves in the time between."
+            f"{self.topic}: {int((~near).sum())} of {len(near)} fixes left out: nothing moves that far in the time."
         )
         return Gps(stamp_ns[near], latitude[near], longitude[near], altitude[near], covariance[near])
 
@@ -196,7 +195,7 @@ def _no_position(fix: FixMessage) -> str:
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         return "latitude or longitude is not a number"
     if abs(latitude) < _NULL_ISLAND_DEG and abs(longitude) < _NULL_ISLAND_DEG:
-        return "it lies at (0, 0), which drivers write before they know"
+        return "it lies at (0, 0), which drivers write before the first fix"
     if abs(latitude) > 90 and abs(latitude) <= 180 and abs(longitude) <= 90:
         return "the latitude is beyond 90 degrees and the longitude is not; are the two swapped?"
     if abs(latitude) > 90 or abs(longitude) > 360:

@@ -83,7 +83,7 @@ class VideoStream:
         found = self._ready.get(row)
         self._ready = {later: image for later, image in self._ready.items() if later >= row}
         if found is None:
-            raise BadMessageError("no frame comes of its video packet")
+            raise BadMessageError("its video packet decodes to no frame")
         return found
 
     def _advance(self, row: int) -> None:

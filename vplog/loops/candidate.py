@@ -42,9 +42,9 @@ class VerifySettings(Settings):
     calibration: CalibrationSettings = CalibrationSettings()
     """How far a calibrated camera's rotations and stamps are trusted."""
     metric: MetricSettings = MetricSettings()
-    """When a pose is believed, for a calibrated camera."""
+    """When a pose is accepted, for a calibrated camera."""
     both_ways: bool = True
-    """Whether a pose that is believed is looked for again the other way round, the match in the query's landmarks: the
+    """Whether an accepted pose is verified in reverse too, the match in the query's landmarks: the
     two must agree within their joint noise, and make one closure together."""
     epipolar: EpipolarSettings = EpipolarSettings()
     """When two images agree, for an uncalibrated camera."""

@@ -30,7 +30,7 @@ _SINGULAR = 1e12
 
 
 class MetricSettings(Settings):
-    """When a pose between two keyframes is believed, and how much."""
+    """When a pose between two keyframes is accepted, and how certain it is."""
 
     min_inliers: int = Field(default=20, ge=6)
     """Matches that must agree with the pose; RTAB-Map's and ORB-SLAM's usual bound, well above chance."""

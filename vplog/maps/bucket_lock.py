@@ -162,8 +162,8 @@ def _refuse_held(found: bytes, age_s: float, root: RemotePath) -> None:
     if holder.get("host") == _machine() and isinstance(pid, int) and known and _started(pid) != known:
         return
     raise SettingsError(
-        f"Another vplog process is writing to {root} (process {pid} on {str(holder.get('host')).split(' ')[0]}). Wait "
-        f"for it to end; were it killed, its lock ends by itself within {LEASE_S - max(age_s, 0.0):.0f} s."
+        f"Another vplog process is writing to {root} (process {pid} on {str(holder.get('host')).split(' ')[0]}). "
+        f"Wait for it to end; if it was killed, its lock expires within {LEASE_S - max(age_s, 0.0):.0f} s."
     )
 
 

@@ -149,7 +149,7 @@ def cache_in(folder: Path | None, most_gb: float | None = None) -> Cache | None:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         cache.open_folders.mkdir(parents=True, exist_ok=True)
         owned = place.stat().st_uid == os.getuid() and os.access(cache.open_folders, os.W_OK)
-        problem = "it is not yours"
+        problem = "it belongs to another user"
     except OSError as error:
         owned, problem = False, error.strerror or str(error)
     if owned:

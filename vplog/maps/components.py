@@ -152,7 +152,7 @@ def _drive(name: str, run: Path) -> SolvedDrive:
 def _ledger(tie: Tie) -> Closures:
     ledger = tables.read_joins(tie.path).get((tie.later, tie.earlier))
     if ledger is None:
-        raise ResultError(f"{tie.path} is not of {tie.later} in {tie.earlier}. Move it away, and run again.")
+        raise ResultError(f"{tie.path} is not of {tie.later} in {tie.earlier}. Move it out of the map, and run again.")
     return ledger
 
 

@@ -95,7 +95,7 @@ def _kind(store: Store, path: Path) -> pa.DataType:
     for drive in store.drives():
         return tables.descriptors_type(store.file(drive, "descriptors.parquet"))
     if library is None:
-        raise LibraryError(f"{store} has no library yet, and {path} holds places alone. Merge it into another map.")
+        raise LibraryError(f"{store} has no library yet, and {path} holds places alone. Add a drive first: vplog batch")
     pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
     return pipeline.places.load(store.library(library), 1).arrow_type
 

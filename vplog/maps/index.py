@@ -88,7 +88,7 @@ def update_index(
             segment = open_segment(path)
         except (ResultError, OSError) as error:
             path = None
-            warnings += [] if done else [f"The index stays in memory and is made again by every query. {error}"]
+            warnings += [] if done else [f"The index is not stored, so every query builds it again. {error}"]
         parts.append(Part(segment, path, np.array([numbers[one] for one in group], np.int32)))
         done += len(group)
         progress("index", done, sum(map(len, groups)))

@@ -81,7 +81,7 @@ def _describe(store: Store) -> dict[str, Any]:
     if other:
         problems.append(
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
-            f"another version of vplog. `vplog batch` with their logs makes them anew; the first is {other[0]}."
+            f"another version of vplog. `vplog batch` with their logs computes them again; the first is {other[0]}."
         )
     problems += left_out(store)
     problems += _left_behind(store, [*abouts, *store.damaged])
@@ -155,14 +155,14 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
         return None
     if replaced := replaced_since(store.root, known):
         problems.append(
-            f"{', '.join(replaced)} was replaced since, and the joint graphs hold the one before. Solve them anew: "
-            f"vplog map join {store}"
+            f"{', '.join(replaced)} was replaced after the joint graphs were solved. Solve them again: vplog map "
+            f"join {store}"
         )
     gone = sorted({drive for one in found or [] for drive in one["drives"]} - known.keys())
     if gone:
         problems.append(
-            f"{', '.join(gone)} was removed and is still in the joint graphs. Solve the others without: "
-            f"vplog map join {store}"
+            f"{', '.join(gone)} was removed and is still in the joint graphs. Solve them without it: vplog map join "
+            f"{store}"
         )
     return found
 
@@ -178,4 +178,4 @@ def _left_behind(store: Store, drives: list[str]) -> list[str]:
         for path in sorted(root.glob(f"{name}/drive=*"))
         if path.name not in known
     ]
-    return [f"{root}/{name} is of no drive in the map, and is not read: it may be moved away." for name in left]
+    return [f"{root}/{name} belongs to no drive of the map and is not read. Move it out of the map." for name in left]

@@ -40,7 +40,7 @@ def read_joint(root: Path) -> dict[str, Any]:
     )
     check_version(path, record.get("format"), FORMAT)
     if not sound:
-        raise ResultError(f"{path} is damaged. Run `vplog map join {root}` to write it again.")
+        raise ResultError(f"{path} is damaged. Write it again: vplog map join {root}")
     return record
 
 

@@ -57,7 +57,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     except ValueError:
         settings = None
     if not isinstance(settings, dict):
-        raise ResultError(f"{file} does not say its settings. Run `vplog batch` again with its log.")
+        raise ResultError(f"{file} lacks its settings. Run `vplog batch` again with its log.")
     pipeline = Pipeline.read(settings, str(file))
     topics = run_record.read_run_json(record).get("topics")
     made_from = {

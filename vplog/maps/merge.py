@@ -92,12 +92,12 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
         if found != wanted and source.is_file():
             raise LibraryError(
                 f"{original(source)} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their "
-                "places do not compare. Describe the map that it is from anew (vplog map redescribe), and export that."
+                "places do not compare. Describe its map again (vplog map redescribe), and export that."
             )
         if found != wanted:
             raise LibraryError(
                 f"{source} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do not "
-                f"compare. Describe it anew: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
+                f"compare. Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
             )
     return str(wanted)
 
@@ -218,7 +218,7 @@ def _take_file(store: Store, source: Path, there: _There, chosen: Sequence[str])
     done = set(take_places(store, source, wanted))
     lost = [drive for drive in wanted if drive not in done]
     if lost:
-        raise ResultError(f"{source} has no place of {lost[0]}, which its header names.")
+        raise ResultError(f"{source} has no place of {lost[0]}, which its header names; export it again.")
     return fate
 
 

@@ -106,7 +106,7 @@ def index_map(
     """Bring the index of a map up to its drives, which the next query would do; that of a map on an object store in
     the cache. Raises VplogError with one line."""
     if isinstance(root, RemotePath) and cache is None:
-        raise ResultError(f"The index of {root} is kept in a cache alone, and there is none. Name one with --cache.")
+        raise ResultError(f"The index of {root} is stored in a cache only, and there is none. Name one with --cache.")
     with map_store.reading(root, cache) as store:
         _, _, state = open_map(store, threads)
         if not isinstance(state, CodedState):
@@ -135,8 +135,8 @@ def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pip
     folder = store.library(library)
     if not (folder / "library.json").is_file():
         raise LibraryError(
-            f"{store} has lost its library {library}. Copy it back to {folder}, or describe the map anew: "
-            f"vplog map redescribe {store} --library LIB -o MAP"
+            f"{store} has lost its library {library}. Copy it back to {folder}, or describe the map again: vplog "
+            f"map redescribe {store} --library LIB -o MAP"
         )
     return drives, pipeline, pipeline.places.load(folder, threads)
 
@@ -153,7 +153,7 @@ def describe_log(
         keyframes, warnings = select_keyframes(log.name, stamps, odometry, pipeline.keyframes)
         stamps = keyframes.stamp_ns
     else:
-        warnings.append(f"{log.name} has no odometry, so every frame is looked for.")
+        warnings.append(f"{log.name} has no odometry, so every frame is a query.")
     frames = extract_frames(log.frames(stamps), pipeline.features, threads, pipeline.stereo)
 
     def describe(found: Any) -> tuple[int, Any, str]:
@@ -207,9 +207,9 @@ def search(
     if places > EXACT_PLACES:
         single = best_places(parts, state, descriptors, PLACES_A_VIEW, threads, executor, progress)
         numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
-        told.append(f"Sequences were looked for in the {len(numbered)} of {len(drives)} drives most like single views.")
+        told.append(f"Sequences were searched in the {len(numbered)} of {len(drives)} drives most like single views.")
     elif executor is not None:
-        told.append(f"Ray was not used: up to {EXACT_PLACES} places sequences are drawn in every drive, here.")
+        told.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
     return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
 
 
@@ -220,8 +220,8 @@ def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
         return []
     more = f" and {len(short) - 1} more have" if len(short) > 1 else " has"
     return [
-        f"{short[0]}{more} fewer places than the window of {length} views, which hardly finds them. Look for each view "
-        "by itself: --sequence 1"
+        f"{short[0]}{more} fewer places than the window of {length} views, so matches there are missed. Search "
+        "single views: --sequence 1"
     ]
 
 

@@ -144,16 +144,16 @@ def open_segment(path: Path) -> Segment:
                 ends.append(at)
                 at += np.dtype(kind).itemsize * int(np.prod([int(n) for n in shape], dtype=object))
             if at + _CRC_BYTES != size:
-                raise ResultError(f"It has {size} bytes, and its header tells of {at + _CRC_BYTES}.")
+                raise ResultError(f"It has {size} bytes, and its header claims {at + _CRC_BYTES}.")
             whole = np.asarray(np.memmap(stream, np.uint8, "r"))
             if zlib.crc32(whole[:at].data).to_bytes(_CRC_BYTES, "little") != whole[at:].tobytes():
-                raise ResultError("It does not have the checksum that it names.")
+                raise ResultError("Its checksum does not match.")
     except FileNotFoundError:
         raise
     except OSError as error:
         raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
     except ResultError as error:
-        raise ResultError(f"{path} is damaged. {error} Remove it: the next query makes it anew.") from None
+        raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
     ends.append(at)
     parts = [
         whole[a : a + np.dtype(kind).itemsize * int(np.prod(shape))].view(kind).reshape(shape)
@@ -163,7 +163,7 @@ def open_segment(path: Path) -> Segment:
     try:
         check_lists(lists)
     except ResultError as error:
-        raise ResultError(f"{path} is damaged. {error} Remove it: the next query makes it anew.") from None
+        raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
     contents = tuple(Content(one["drive"], one["key"], one["mark"]) for one in header["drives"])
     return Segment(header["library"], contents, np.cumsum([0, *places]), lists)
 

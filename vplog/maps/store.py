@@ -162,7 +162,7 @@ def _sweep(store: Store) -> None:
 def add_library(store: Store, made: Path, digest: str) -> Path:
     """Make a folder in staging the library of this hash; it stays as it is where the map has it."""
     if not HASH.fullmatch(digest):
-        raise LibraryError(f"{made} has no sound hash ({digest[:20]!r}). Build the library anew.")
+        raise LibraryError(f"{made} has no valid hash ({digest[:20]!r}). Build it again: vplog library")
     folder = store.library(digest)
     try:
         folder.parent.mkdir(exist_ok=True)

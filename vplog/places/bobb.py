@@ -54,7 +54,7 @@ class BobbSettings(WeighedMatchSettings):
     """Bag of bounding boxes, improved: J references of 2 + 1 + I bytes each."""
 
     kind: Literal["bobb"] = "bobb"
-    """Which recogniser."""
+    """Name of the recogniser."""
     references: int = Field(default=10, ge=1, le=1000)
     """J: reference images that explain an image. With nine boxes each takes 12 bytes, so ten stay below 128."""
     candidates: int = Field(default=3, ge=1)

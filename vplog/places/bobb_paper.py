@@ -39,7 +39,7 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     """Bag of bounding boxes with the paper's numbers (section IV)."""
 
     kind: Literal["bobb_paper"] = "bobb_paper"
-    """Which recogniser."""
+    """Name of the recogniser."""
     references: int = Field(default=4, ge=1)
     """J: reference images that explain an image."""
     boxes: int = Field(default=4, ge=1)

@@ -44,7 +44,7 @@ class BovfSettings(RelearnedSettings):
     """Bag of visual features: tf-idf, cosine, inverted file."""
 
     kind: Literal["bovf"] = "bovf"
-    """Which recogniser."""
+    """Name of the recogniser."""
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
     words: int = Field(default=16_000, ge=1, le=65_536)

@@ -45,7 +45,7 @@ class FabmapSettings(RelearnedSettings):
     """FAB-MAP 2.0: Chow-Liu tree, one image a place, inverted index, posterior over places and a new one."""
 
     kind: Literal["fabmap"] = "fabmap"
-    """Which recogniser."""
+    """Name of the recogniser."""
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
     words: int = Field(default=11_000, ge=1, le=65_536)

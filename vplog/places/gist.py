@@ -38,7 +38,7 @@ class GistSettings(RelearnedSettings):
     """The spatial envelope of the whole image. It learns nothing: the references only go into the library."""
 
     kind: Literal["gist"] = "gist"
-    """Which recogniser."""
+    """Name of the recogniser."""
     scales: int = Field(default=4, ge=1, le=8)
     """Scales of the Gabor filters."""
     orientations: int = Field(default=8, ge=1, le=32)

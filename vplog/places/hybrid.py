@@ -54,7 +54,7 @@ class HybridSettings(RelearnedSettings):
     """Boxes of BoBB and signs of a few words: 96 + 64 bytes."""
 
     kind: Literal["hybrid"] = "hybrid"
-    """Which recogniser."""
+    """Name of the recogniser."""
     bobb: BobbSettings = BobbSettings(references=8)
     """The boxes. Two references fewer than BoBB alone, so that a place stays within 160 bytes; its least size and its
     patches are the words' own, too."""

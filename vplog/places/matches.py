@@ -42,7 +42,7 @@ class WeighedMatchSettings(Settings):
     root_sift: bool = True
     """Compare the roots of descriptors (Arandjelovic & Zisserman 2012) instead of the descriptors."""
     patch_weight: float = Field(default=2.0, ge=0)
-    """A patch's match weighs this many times a keypoint's: 400 keypoints then have about as much say as the 169
+    """A patch's match weighs this many times a keypoint's: 400 keypoints then weigh about as much as the 169
     patches, on the images of a library among themselves. 0 uses keypoints alone."""
     neighbours: int = Field(default=24, ge=2)
     """Nearest library features looked at for each feature; the last one sets the scale of the others' distances."""

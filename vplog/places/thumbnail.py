@@ -33,7 +33,7 @@ class ThumbnailSettings(RelearnedSettings):
     """SeqSLAM's image comparison. It learns nothing: the references only go into the library."""
 
     kind: Literal["thumbnail"] = "thumbnail"
-    """Which recogniser."""
+    """Name of the recogniser."""
 
     def learn(self, references: Iterable[Reference], threads: int) -> ThumbnailState:
         """Nothing to learn. Raises LibraryError where there is no reference."""

@@ -35,7 +35,7 @@ class VladSettings(RelearnedSettings):
     """Vector of locally aggregated descriptors, whitened by PCA."""
 
     kind: Literal["vlad"] = "vlad"
-    """Which recogniser."""
+    """Name of the recogniser."""
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
     centres: int = Field(default=64, ge=1, le=4096)

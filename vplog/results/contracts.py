@@ -27,8 +27,8 @@ _HEADER = {
 _MAP_HEADER = {
     "vplog.descriptor": "The columns behind the poses, one for each part of a descriptor, as JSON: name, type, and "
     "where the column is bytes the number of its values, which are little endian.",
-    "vplog.drives": "Of every drive by its ID, as JSON, as far as it is known: `inputs`, the sha256 of its log's "
-    "files; `topics`, those that were asked for; `earth`, where on earth its frame is.",
+    "vplog.drives": "For each drive by its ID, as JSON, as far as known: `inputs`, the sha256 of its log's files; "
+    "`topics`, those that were requested; `earth`, where on earth its frame is.",
 }
 
 

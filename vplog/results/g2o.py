@@ -243,7 +243,7 @@ def _information(path: Path, lines: _Lines, upper: Floats, layout: _Layout) -> F
     diagonal = np.diagonal(given, axis1=1, axis2=2)
     bad = np.flatnonzero((diagonal < 0).any(1) | (diagonal <= 0).all(1))
     if len(bad):
-        raise _at(path, lines.line[bad[0]], f"information with {diagonal[bad[0]].min():g} on its diagonal says nothing")
+        raise _at(path, lines.line[bad[0]], f"diagonal of the information has {diagonal[bad[0]].min():g}, not > 0")
     result = np.zeros((len(upper), 6, 6))
     result[:, np.array(layout.axes)[:, None], layout.axes] = given
     return result

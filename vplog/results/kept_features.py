@@ -36,12 +36,12 @@ _FLOATS = pa.list_(pa.field("element", pa.float32(), nullable=False))
 FEATURES = pa.schema(
     [
         _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
-        _column("width", pa.int32(), "px", "Of the image."),
-        _column("height", pa.int32(), "px", "Of the image."),
-        _column("x", _FLOATS, "px", "Of each feature, strongest first; 0 is the centre of the leftmost pixel."),
-        _column("y", _FLOATS, "px", "The same; 0 is the centre of the topmost pixel."),
+        _column("width", pa.int32(), "px", "Width of the image."),
+        _column("height", pa.int32(), "px", "Height of the image."),
+        _column("x", _FLOATS, "px", "Column of each feature, strongest first; 0 is the centre of the left pixel."),
+        _column("y", _FLOATS, "px", "Row of each feature; 0 is the centre of the topmost pixel."),
         _column("size", _FLOATS, "px", "Diameter of the described neighbourhood."),
-        _column("depth", _FLOATS, "m", "Along the camera's z, NaN where unknown."),
+        _column("depth", _FLOATS, "m", "Depth along the camera's z, NaN where unknown."),
         _column("descriptors", pa.binary(), "bytes", "128 bytes of SIFT for each feature, one after the other."),
     ]
 )
@@ -49,7 +49,7 @@ FEATURES = pa.schema(
 HEADER = {
     "vplog.table": "Name of the table.",
     "vplog.made_from": "Hash of all that the features depend on.",
-    "vplog.most_features": "Features of a keyframe at most.",
+    "vplog.most_features": "Most features of a keyframe.",
     VERSION_KEY: VERSION_ABOUT,
 }
 """What the file says of itself."""

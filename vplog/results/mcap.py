@@ -51,9 +51,9 @@ PICTURES, REFERENCE, FIXES, EARTH = "/closures/picture", "/reference/image", "/g
 _CAMERA = "/cam/NAME"
 TOPICS = {
     "/path/optimised": ("foxglove.PosesInFrame", "The keyframes as solved, at the start and the end of the drive."),
-    "/path/odometry": ("foxglove.PosesInFrame", "The odometry, laid on the first solved keyframe."),
-    "/path/optimised_points": ("foxglove.PointCloud", "The positions of the same, green."),
-    "/path/odometry_points": ("foxglove.PointCloud", "The positions of the same, grey."),
+    "/path/odometry": ("foxglove.PosesInFrame", "The odometry, aligned at the first solved keyframe."),
+    "/path/optimised_points": ("foxglove.PointCloud", "Positions of the solved keyframes, green."),
+    "/path/odometry_points": ("foxglove.PointCloud", "Positions of the odometry, grey."),
     "/graph": (
         "foxglove.SceneUpdate",
         "Odometry grey, closures green, amber without metres, red where rejected by the solver.",
@@ -71,7 +71,7 @@ TOPICS = {
     ),
     PICTURES: ("foxglove.CompressedImage", "Some candidates drawn; frame_id is closure_ROW of the ledger."),
     f"{_CAMERA}/image": ("foxglove.CompressedImage", "The keyframe, downsized, at the log's own stamp."),
-    f"{_CAMERA}/calibration": ("foxglove.CameraCalibration", "The camera's, at the size of these images."),
+    f"{_CAMERA}/calibration": ("foxglove.CameraCalibration", "The camera's calibration, at the size of these images."),
     f"{_CAMERA}/annotations": (
         "foxglove.ImageAnnotations",
         "The parts found on the reference, numbered as their boxes.",

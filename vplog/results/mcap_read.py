@@ -118,7 +118,7 @@ def _reading(path: Path) -> Iterator[McapReader]:
         raise ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.") from None
     except (OSError, McapError, DecodeError, ValueError, EOFError, struct.error) as error:
         why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again to write it anew.") from None
+        raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
 
 
 def _gps(fixes: list[LocationFix]) -> Gps:

@@ -36,7 +36,7 @@ LOOP_CLOSURE_FIELDS = (
     ("verdict", "string", "What became of the candidate."),
     ("reason", "string", "The verdict in one sentence."),
     ("residual_before_sigma", "double", "Mahalanobis distance to the odometry, NaN where not in the graph."),
-    ("residual_after_sigma", "double", "The same after the solve."),
+    ("residual_after_sigma", "double", "Mahalanobis distance to the solution, NaN where not in the graph."),
     ("weight", "double", "Weight of the robust solve, 0 to 1, NaN where not in the graph."),
     ("shared_references", "repeated uint32", "References of the library that explain both; empty without boxes."),
     ("shared_overlap", "repeated float", "Of each, the share of a box that the two have in common, 0 to 1."),

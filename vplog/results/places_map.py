@@ -274,7 +274,7 @@ def _opened(path: Path, columns: list[str]) -> Iterator[pq.ParquetFile]:
 
 def _unreadable(path: Path, error: Exception) -> ResultError:
     why = next(iter(str(error).splitlines()), type(error).__name__)
-    return ResultError(f"{path} cannot be read: {why} Write it anew: vplog map export MAP -o FILE.parquet")
+    return ResultError(f"{path} cannot be read: {why} Write it again: vplog map export MAP -o FILE.parquet")
 
 
 def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:

@@ -21,7 +21,7 @@ class PictureSettings(Settings):
     """What result.mcap and report.html show of the camera's images."""
 
     megapixels: float = Field(default=0.15, ge=0, le=100)
-    """Of a keyframe's picture in result.mcap: 0.15 is 450 x 335, some 20 kB. 0 leaves the images out: the stamps are
+    """A keyframe's picture in result.mcap: 0.15 is 450 x 335, some 20 kB. 0 leaves the images out: the stamps are
     those of the log, so a viewer that opens both files shows the log's images instead."""
     quality: int = Field(default=75, ge=1, le=100)
     """JPEG quality of all pictures."""

@@ -51,11 +51,11 @@ def read_run_json(path: Path) -> dict[str, Any]:
             f"Cannot read {path}: {error.strerror or error}. Is {path.parent} the output of `vplog run`?"
         ) from None
     except (ValueError, RecursionError):
-        raise ResultError(f"{path} is not JSON. Run `vplog run` again to write it anew.") from None
+        raise ResultError(f"{path} is not JSON. Run `vplog run` again.") from None
     if not isinstance(record, dict):
-        raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again to write it anew.")
+        raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again.")
     if CHECKSUM in record and record.pop(CHECKSUM) != _sha256(record):
-        raise ResultError(f"{path} is damaged: it does not have the checksum that it names. Copy it back.")
+        raise ResultError(f"{path} is damaged: its checksum does not match. Copy it back from a backup, or run again.")
     if type(version := record.get("format")) is int:
         check_version(path, version, FORMAT, record.get("vplog"))
     return record

@@ -115,7 +115,7 @@ CLOSURES = pa.schema(
         _column(
             "residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True
         ),
-        _column("residual_after", pa.float64(), "sigma", "The same after the solve.", True),
+        _column("residual_after", pa.float64(), "sigma", "Mahalanobis distance to the solution, null if unused.", True),
         _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
     ]
 )
@@ -508,7 +508,7 @@ def _unreadable(path: Path, error: Exception) -> ResultError:
     if isinstance(error, FileNotFoundError):
         return ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.")
     why = next(iter(str(error).splitlines()), type(error).__name__)
-    return ResultError(f"{path} cannot be read: {why} Run `vplog run` again to write it anew.")
+    return ResultError(f"{path} cannot be read: {why} Run `vplog run` again.")
 
 
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:

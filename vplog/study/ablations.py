@@ -38,14 +38,14 @@ DEPARTURES = (
     Departure(
         "boxes of a tenth",
         ("box_columns=6", "box_rows=3"),
-        "Boxes of half the sides tell how far apart they are; smaller ones miss each other at once.",
+        "Boxes of half the sides measure how far apart they are; smaller ones miss each other at once.",
     ),
     Departure("10 neighbours", ("neighbours=10",), "The scale of distances is read off a far neighbour, not a match."),
     Departure("all matches weigh alike", ("reach=100",), "Distances change with light, so a match counts relatively."),
     Departure(
         "no agreement", ("agreement_floor=1",), "Matches of one place move alike from view to view; chance ones do not."
     ),
-    Departure("popular ones count fully", ("popularity=0",), "What explains every view tells none apart."),
+    Departure("popular ones count fully", ("popularity=0",), "What explains every view distinguishes none."),
     Departure("J = 4", ("references=4",), "More references explain more of a view, at twelve bytes each."),
     Departure("2 x 2 windows", ("windows_along=2",), "Nine windows say where in the view a box comes from."),
     Departure("windows of a quarter", ("window_share=0.25",), "A window must hold enough features to be found again."),
