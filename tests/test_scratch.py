@@ -13,8 +13,7 @@ import pytest
 
 from vplog import scratch as scratch_of
 from vplog.errors import ResultError
-from vplog.results.atomic import replacing
-from vplog.scratch import files_in, own_folder, packed, pieces, put_in_place, scratch, unpacked, write_pieces
+from vplog.scratch import files_in, own_folder, packed, pieces, put_in_place, replacing, scratch, unpacked, write_pieces
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -26,8 +26,8 @@ from vplog.places.sequence import SequenceSettings
 from vplog.places.stored import load_references, references_hash
 from vplog.references import PAPER_SIZE, LibrarySettings, choose
 from vplog.results import run_record
-from vplog.results.atomic import replacing
 from vplog.results.staging import staged
+from vplog.scratch import replacing
 from vplog.trials import evaluate_method
 from vplog.walks import Walk, candidate_stops, extract_walk
 

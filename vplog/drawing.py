@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,9 +8,9 @@ from vplog import tum
 from vplog.errors import ResultError
 from vplog.report import gather_tracks
 from vplog.results import geo, poses, tables
-from vplog.results.atomic import replacing
 from vplog.results.rrd import write_rrd
 from vplog.results.run_record import read_single_run
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path

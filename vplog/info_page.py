@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError
 from vplog.info import in_words
-from vplog.results.atomic import replacing
 from vplog.results.html import render
 from vplog.results.previews import jpeg
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path

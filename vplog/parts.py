@@ -29,8 +29,8 @@ from vplog.extracted import Extracted, packed
 from vplog.inputs import files_of
 from vplog.keyframes import select_keyframes
 from vplog.remote import address, located
-from vplog.results.atomic import replacing
 from vplog.results.previews import preview
+from vplog.scratch import replacing
 from vplog.stage_cache import StageCache, finished_parts, inputs_of, key_of
 from vplog.steps import step
 from vplog.urls import shown

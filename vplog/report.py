@@ -11,9 +11,9 @@ from vplog import geodesy, geometry
 from vplog.data import Trajectory
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
-from vplog.results.atomic import replacing
 from vplog.results.report.content import Content
 from vplog.results.report.page import page
+from vplog.scratch import replacing
 from vplog.show import earth_of
 
 if TYPE_CHECKING:

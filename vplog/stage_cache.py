@@ -27,8 +27,8 @@ from vplog.cache_file import (
 )
 from vplog.errors import ResultError
 from vplog.inputs import hash_inputs, look_of
-from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json, read_run_json, write_run_json
+from vplog.scratch import replacing
 from vplog.settings import Settings
 
 if TYPE_CHECKING:

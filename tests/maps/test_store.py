@@ -16,7 +16,7 @@ import pytest
 from vplog.errors import ResultError, SettingsError
 from vplog.maps import local, pairs
 from vplog.maps import store as map_store
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 from .runs import PLACES, make_map, put, seeds, write_run
 

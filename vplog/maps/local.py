@@ -14,8 +14,7 @@ from vplog.errors import ResultError, SettingsError
 from vplog.folders import check_regular, regular_files
 from vplog.maps.damage import complete_record
 from vplog.maps.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
-from vplog.results.atomic import replacing
-from vplog.scratch import made_folder, sync, sync_all
+from vplog.scratch import made_folder, replacing, sync, sync_all
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -21,7 +21,7 @@ from vplog.maps.keys import key_of
 from vplog.maps.layout import folder_name, quoted
 from vplog.maps.seen import CameraTrust, camera_trust, keep_features, opened_drive
 from vplog.results import run_record, tables
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -24,8 +24,8 @@ import numpy as np
 from vplog.errors import ResultError
 from vplog.parquet_bounds import check_file
 from vplog.places.code_lists import MOST_ROWS, CodeLists, check_lists
-from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

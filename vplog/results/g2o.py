@@ -13,7 +13,7 @@ import numpy as np
 from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
 from vplog.errors import GraphError
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path

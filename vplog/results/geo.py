@@ -13,7 +13,7 @@ from vplog import geometry
 from vplog.data import Verdict
 from vplog.geodesy import geodetic
 from vplog.parquet_bounds import write_table
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path

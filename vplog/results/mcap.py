@@ -25,11 +25,11 @@ import vplog
 from vplog import geometry
 from vplog.data import EdgeKind, Verdict
 from vplog.results import foxglove, geo
-from vplog.results.atomic import replacing
 from vplog.results.messages import descriptor_set, loop_closure_class
 from vplog.results.run_record import canonical_json
 from vplog.results.shown import Shown
 from vplog.results.tables import covariance_of
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

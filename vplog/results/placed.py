@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from vplog.parquet_bounds import write_table
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,7 +21,7 @@ from vplog import geometry
 from vplog.errors import ResultError
 from vplog.parquet_bounds import check_size, filled, open_table, read_schema, read_table, table_writer
 from vplog.results import geo, run_record, tables
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

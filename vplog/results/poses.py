@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog import geometry
-from vplog.results.atomic import replacing
+from vplog.scratch import replacing
 from vplog.tum import seconds
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import ResultError
 from vplog.folders import check_regular
 from vplog.parquet_bounds import check_file, check_version
-from vplog.results.atomic import replacing
 from vplog.results.staging import recover
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from vplog.errors import ResultError, SettingsError
 from vplog.parquet_bounds import check_file
-from vplog.results.atomic import replacing
-from vplog.scratch import files_in, made_folder, put_in_place
+from vplog.scratch import files_in, made_folder, put_in_place, replacing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -28,8 +28,8 @@ from vplog.parquet_bounds import (
     table_writer,
     write_table,
 )
-from vplog.results.atomic import replacing
 from vplog.results.run_record import canonical_json
+from vplog.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

@@ -12,10 +12,10 @@ import pytest
 
 from vplog.errors import ResultError
 from vplog.results import tables
-from vplog.results.atomic import replacing
 from vplog.results.g2o import write_g2o
 from vplog.results.mcap import write_mcap
 from vplog.results.run_record import canonical_json, read_run_json, write_run_json
+from vplog.scratch import replacing
 from vplog.tum import write_tum
 
 from .example import METADATA, make_run
