@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import settings
 
-from vplog import cli
+from vplog.cli import main
 from vplog.demo import SMALL, make_drive
-from vplog.execution_value import Execution
+from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline, run
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def verb(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     def call(*arguments: object) -> Said:
         capfd.readouterr()
         with pytest.raises(SystemExit) as stop:
-            cli.main([str(argument) for argument in arguments])
+            main.main([str(argument) for argument in arguments])
         out, err = capfd.readouterr()
         assert isinstance(stop.value.code, int)
         return Said(stop.value.code, out, err)
@@ -98,7 +98,7 @@ def finished(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def joint(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a joint run of three drives, beside their logs. Tests read it and leave it as it is."""
-    from .joined import run_together
+    from tests.joined import run_together
 
     return run_together(drive, tmp_path_factory.mktemp("joint"))
 

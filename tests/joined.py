@@ -8,9 +8,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from vplog.demo import SMALL, make_drive
-from vplog.execution_value import Execution
-from vplog.joint import run_joint
+from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline
+from vplog.sessions.joint_run import run_joint
 
 if TYPE_CHECKING:
     from pathlib import Path

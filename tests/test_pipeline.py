@@ -19,13 +19,13 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
-from vplog import geometry
 from vplog.data import Verdict
-from vplog.evaluation import evaluate
-from vplog.execution_value import Execution
-from vplog.libraries import build_library
+from vplog.execution.execution import Execution
+from vplog.geometry import se3
 from vplog.pipeline import CacheOptions, load_pipeline, pipeline_schema, run
 from vplog.results import tables
+from vplog.run.reference_library import build_library
+from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -154,8 +154,8 @@ def test_trajectory_passes_through_the_keyframes(finished: Path) -> None:
     after = np.clip(np.searchsorted(odometry.stamp_ns, stamps), 1, len(odometry.stamp_ns) - 1)
     share = (stamps - odometry.stamp_ns[after - 1]) / (odometry.stamp_ns[after] - odometry.stamp_ns[after - 1])
     poses = trajectory.world_from_body
-    here = geometry.interpolate(poses[after - 1], poses[after], share)
-    apart = geometry.log(geometry.between(here, world_from_body[inside]))
+    here = se3.interpolate(poses[after - 1], poses[after], share)
+    apart = se3.log(se3.between(here, world_from_body[inside]))
     moved = np.linalg.norm(world_from_body[:, :3, 3] - keyframes.odom_from_body[:, :3, 3], axis=1)
     assert inside.sum() > 40
     assert np.linalg.norm(apart[:, 3:], axis=1).max() < 0.02 < moved.max() / 10

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from pydantic import Field, ValidationError
 
+from vplog.benchmark.recogniser_specs import known_methods, read_method
 from vplog.errors import SettingsError
-from vplog.methods import known_methods, read_method
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.settings import Settings, load_yaml, override
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from vplog.data import Verdict
-from vplog.evaluation import evaluate
-from vplog.execution_value import Execution
+from vplog.execution.execution import Execution
 from vplog.pipeline import Run, load_pipeline, run
+from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,3 +1,3 @@
-from vplog.cli import main
+from vplog.cli.main import main
 
 main()

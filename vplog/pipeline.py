@@ -8,37 +8,38 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import model_validator
 
-from vplog import logs, record
-from vplog.back_end import solve
+from vplog import logs
+from vplog.cache.input_hashes import files_of
+from vplog.cache.steps import Steps
 from vplog.errors import SettingsError, nearest
-from vplog.execution_value import Execution
+from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings
+from vplog.features.stereo_depth import StereoSettings
 from vplog.graph.cross_check import CrossCheckSettings
+from vplog.graph.gps_factors import GpsSettings
 from vplog.graph.joint import JoinSettings
 from vplog.graph.noise import NoiseSettings
 from vplog.graph.refine import RefineSettings
-from vplog.graph.satellites import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
-from vplog.inputs import files_of
-from vplog.keyframes import KeyframeSettings
-from vplog.ledger import verify
-from vplog.libraries import check_library, cover, given_references, learn, own_images, own_references
 from vplog.loops.propose import ProposeSettings
-from vplog.loops.stereo import StereoSettings
 from vplog.loops.verify import VerifySettings
-from vplog.outputs import Run, finish, report, write
-from vplog.parts import decoded, extract, read
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
+from vplog.places.reference_choice import LibrarySettings
 from vplog.places.sequence import SequenceSettings
-from vplog.recognise import describe, find_candidates, name_shared
-from vplog.references import LibrarySettings
 from vplog.results import tables
 from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
-from vplog.run_folder import begun
+from vplog.run import provenance
+from vplog.run.back_end import solve
+from vplog.run.feature_extraction import decoded, extract, read
+from vplog.run.keyframes import KeyframeSettings
+from vplog.run.outputs import Run, finish, report, write
+from vplog.run.place_recognition import describe, find_candidates, name_shared
+from vplog.run.reference_library import check_library, cover, given_references, learn, own_images, own_references
+from vplog.run.run_folder import begun
+from vplog.run.verification import verify
 from vplog.settings import Settings, load_yaml, override
-from vplog.steps import Steps
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -178,5 +179,5 @@ def run(
             log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved
         )
         do(write, folder, result, pipeline, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
-        head = {**record.head(pipeline, path, execution.threads), "topics": topics.model_dump(mode="json")}
+        head = provenance.head(pipeline, path, execution.threads, topics)
         return finish(folder, result, do(report, folder, result, head), do)

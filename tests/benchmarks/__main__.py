@@ -14,26 +14,24 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tests.benchmarks.batch import PARTS, batch
+from tests.benchmarks.discovery import discovery
+from tests.benchmarks.graphs import graphs
+from tests.benchmarks.images import drives
+from tests.benchmarks.large_graphs import large
+from tests.benchmarks.mining import describing, mining
+from tests.benchmarks.reading import LARGE_GB, SMALL_GB, reading
+from tests.benchmarks.scale import scale
+from tests.benchmarks.search import free_memory_gb, growth, search
 from vplog.pipeline import load_pipeline, pipeline_folder
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 
-from .batch import PARTS, batch
-from .discovery import discovery
-from .graphs import graphs
-from .images import drives
-from .large_graphs import large
-from .mining import describing, mining
-from .reading import LARGE_GB, SMALL_GB, reading
-from .scale import scale
-from .search import free_memory_gb, growth, search
-
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tests.benchmarks.measure import Figure
     from vplog.pipeline import Pipeline
-
-    from .measure import Figure
 
 MINING_BARS = {"default": 0.40, "fast": 0.25}
 """Mining on one thread, as a share of SIFT."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .measure import Figure
+from tests.benchmarks.measure import Figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

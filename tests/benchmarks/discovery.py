@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tests.benchmarks.measure import Figure, one_thread, seconds
 from vplog.places import expected_votes, rvp
-
-from .measure import Figure, one_thread, seconds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from tests.benchmarks.images import Images
     from vplog.data import Bytes, Floats, Int32s, Ints
     from vplog.features.sift import SiftSettings
     from vplog.places.bobb import BobbSettings
     from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
-
-    from .images import Images
 
 _TIMES = 200
 """Runs of a fast way that are timed as one: the clock is too coarse for less."""

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import faiss
 import numpy as np
 
-from .measure import Figure, one_thread, seconds, wall
-from .search import BEST, BITS, DRIVE, FLOATS, free_memory_gb
+from tests.benchmarks.measure import Figure, one_thread, seconds, wall
+from tests.benchmarks.search import BEST, BITS, DRIVE, FLOATS, free_memory_gb
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

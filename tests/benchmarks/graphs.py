@@ -17,14 +17,13 @@ import gtsam
 import numpy as np
 from pydantic import TypeAdapter
 
-from vplog import geometry
+from tests.benchmarks.measure import Figure, in_turns, seconds
 from vplog.data import EdgeKind, PoseGraph
+from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_chain
-from vplog.graph.linear import LARGE_POSES
 from vplog.graph.solve import LmSettings, OptimiserSettings
+from vplog.graph.sparse.linear import LARGE_POSES
 from vplog.results.g2o import read_g2o, write_g2o
-
-from .measure import Figure, in_turns, seconds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -118,10 +117,10 @@ def with_groups(graph: PoseGraph, truth: Floats, count: int, size: int, seed: in
             continue
         near = _planar(random.normal(0, 0.3, 1), random.normal(0, 0.3, 1), random.normal(0, np.radians(10), 1))[0]
         rows = np.arange(size)
-        displaced = truth[a] @ near @ geometry.inverse(truth[b])
+        displaced = truth[a] @ near @ se3.inverse(truth[b])
         starts.append(a + rows)
         ends.append(b + rows)
-        measured.append(geometry.between(truth[a + rows], displaced @ truth[b + rows]))
+        measured.append(se3.between(truth[a + rows], displaced @ truth[b + rows]))
     return _added(graph, np.concatenate(starts), np.concatenate(ends), np.concatenate(measured), random)
 
 
@@ -147,13 +146,13 @@ def _anywhere(random: np.random.Generator, count: int, extent: np.ndarray) -> Fl
 
 def _planar(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Floats:
     zero = np.zeros(len(x))
-    return geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), np.stack([x, y, zero], axis=1))
+    return se3.pose(se3.so3_exp(np.stack([zero, zero, yaw], axis=1)), np.stack([x, y, zero], axis=1))
 
 
 def aligned_error(estimate: Floats, truth: Floats) -> float:
     """Root mean square distance of positions in m, after the best rigid alignment."""
-    moved, _ = geometry.umeyama(estimate[:, :3, 3], truth[:, :3, 3])
-    away = geometry.transform(moved, estimate[:, :3, 3]) - truth[:, :3, 3]
+    moved, _ = se3.umeyama(estimate[:, :3, 3], truth[:, :3, 3])
+    away = se3.transform(moved, estimate[:, :3, 3]) - truth[:, :3, 3]
     return float(np.sqrt((away**2).sum(1).mean()))
 
 
@@ -316,7 +315,7 @@ def city(poses: int, seed: int = 0) -> PoseGraph:
         last[cell] = k
     a, b = np.array(pairs).T
     noise = random.normal(size=(len(a), 3)) * [0.03, 0.03, 0.02]
-    measured = geometry.between(true[a], true[b]) @ _planar(*noise.T)
+    measured = se3.between(true[a], true[b]) @ _planar(*noise.T)
     information = np.zeros((len(a), 6, 6))
     information[:, [2, 3, 4], [2, 3, 4]] = [0.02**-2, 0.03**-2, 0.03**-2]
     kind = [EdgeKind.ODOMETRY] * (poses - 1) + [EdgeKind.LOOP] * (len(a) - poses + 1)

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog import geometry
+from tests.benchmarks.graphs import _planar, apart, city, method, spoiled
+from tests.benchmarks.measure import Figure
 from vplog.data import EdgeKind, PoseGraph
+from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain
-from vplog.graph.linear import LARGE_POSES
-
-from .graphs import _planar, apart, city, method, spoiled
-from .measure import Figure
+from vplog.graph.sparse.linear import LARGE_POSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -102,10 +101,10 @@ def drives(poses: int, each: int = 50_000, seed: int = 0) -> PoseGraph:
     a, b = np.concatenate([chain, pairs[0]]).astype(np.int32), np.concatenate([chain + 1, pairs[1]]).astype(np.int32)
     loop = np.arange(len(a)) >= len(chain)
     sigma = np.where(loop[:, None], [np.radians(0.3)] * 3 + [0.05] * 3, [np.radians(0.1)] * 3 + [0.02] * 3)
-    measured = geometry.between(true[a], true[b]) @ geometry.exp(random.normal(size=(len(a), 6)) * sigma)
+    measured = se3.between(true[a], true[b]) @ se3.exp(random.normal(size=(len(a), 6)) * sigma)
     information = np.zeros((len(a), 6, 6))
     information[:, range(6), range(6)] = sigma**-2.0
-    starts = np.repeat(geometry.exp(random.normal(size=(count, 6)) * [0, 0, np.radians(3.0), 5.0, 5.0, 0.0]), each, 0)
+    starts = np.repeat(se3.exp(random.normal(size=(count, 6)) * [0, 0, np.radians(3.0), 5.0, 5.0, 0.0]), each, 0)
     kind = [EdgeKind.ODOMETRY] * len(chain) + [EdgeKind.LOOP] * pairs.shape[1]
     graph = PoseGraph(true @ starts, a, b, measured, information, kind, 3)
     return replace(graph, world_from_body=odometry_chain(graph)[0])

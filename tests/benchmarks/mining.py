@@ -11,20 +11,18 @@ import cv2
 import faiss
 import numpy as np
 
-from vplog.extract import map_in_order, one_thread_each
+from tests.benchmarks.measure import Figure, in_turns, one_thread
+from vplog.features.extraction import map_in_order, one_thread_each
 from vplog.places import matches
-
-from .measure import Figure, in_turns, one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from tests.benchmarks.images import Images
     from vplog.data import Bytes, Features
     from vplog.features.sift import SiftSettings
     from vplog.pipeline import Pipeline
     from vplog.places.bobb import BobbState
-
-    from .images import Images
 
 
 def mining(images: Images, pipeline: Pipeline, name: str, bar: float, rounds: int) -> Figure:

@@ -21,12 +21,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from tests.benchmarks.measure import Figure, in_turns, one_thread
 from vplog import logs
-from vplog.cores import limited
-from vplog.extract import map_in_order, one_thread_each
-from vplog.keyframes import KeyframeSettings, select_keyframes
-
-from .measure import Figure, in_turns, one_thread
+from vplog.execution.cores import limited
+from vplog.features.extraction import map_in_order, one_thread_each
+from vplog.run.keyframes import KeyframeSettings, select_keyframes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

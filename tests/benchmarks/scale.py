@@ -16,22 +16,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tests.benchmarks.faiss_indexes import faiss_indexes
+from tests.benchmarks.measure import Figure, one_thread, seconds, wall
+from tests.benchmarks.search import BEST, DRIVE, LIBRARY, Places, make_places, make_queries, plain_scores
 from vplog.data import Features, Keyframes, Reference
-from vplog.maps.index import update_index
-from vplog.maps.search import best_places
-from vplog.maps.store import Store
+from vplog.maps.search.exact import best_places
+from vplog.maps.search.index import update_index
+from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings, BobbState, Place
 from vplog.results import run_record, tables
-
-from .faiss_indexes import faiss_indexes
-from .measure import Figure, one_thread, seconds, wall
-from .search import BEST, DRIVE, LIBRARY, Places, make_places, make_queries, plain_scores
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from vplog.maps.index import Part
+    from vplog.maps.search.index import Part
 
 PART = 250 * DRIVE
 """Places made at a time."""

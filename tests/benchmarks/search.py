@@ -23,11 +23,10 @@ import faiss
 import numba
 import numpy as np
 
+from tests.benchmarks.measure import Figure, in_turns, one_thread, seconds
 from vplog.places import expected_votes
 from vplog.places.bobb import NOWHERE, Place
 from vplog.places.code_search import CodeIndex
-
-from .measure import Figure, in_turns, one_thread, seconds
 
 if TYPE_CHECKING:
     from vplog.places.bobb import BobbSettings

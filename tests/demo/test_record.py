@@ -24,7 +24,7 @@ from vplog.demo.record import (
 )
 from vplog.demo.scene import make_scene, take_picture
 from vplog.errors import ResultError
-from vplog.geometry import rotation
+from vplog.geometry.se3 import rotation
 
 if TYPE_CHECKING:
     from pathlib import Path

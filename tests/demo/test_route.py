@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from vplog.demo import SMALL, DemoSettings, route
-from vplog.geometry import between, log, transform, umeyama
+from vplog.geometry.se3 import between, log, transform, umeyama
 
 blocks = st.builds(
     DemoSettings,

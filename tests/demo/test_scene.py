@@ -12,7 +12,7 @@ from vplog.demo import DemoSettings, route
 from vplog.demo.render import render
 from vplog.demo.scene import FIRST_LIGHT, LATER_LIGHT, Scene, make_scene, take_picture
 from vplog.demo.world import traffic
-from vplog.geometry import angle, between, inverse, pose, so3_exp, transform
+from vplog.geometry.se3 import angle, between, inverse, pose, so3_exp, transform
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Floats

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tests.graph.drive import ledger
-from vplog import geometry
 from vplog.data import Closures, Keyframes, Trajectory
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -55,7 +55,7 @@ def draw(kind: str, seed: int) -> Drawn:
     keyframes = Keyframes(kind, stamps[rows], odometry.world_from_body[rows])
     closures, right = _closures(kind, poses[rows], rng)
     stop = np.maximum(np.arange(len(rows)) - 30, 0)
-    camera = geometry.pose(LOOKS_ALONG_X, rng.uniform(-0.1, 0.1, 3))
+    camera = se3.pose(LOOKS_ALONG_X, rng.uniform(-0.1, 0.1, 3))
     return Drawn(Trajectory(stamps, poses), odometry, keyframes, closures, right, stop, camera)
 
 
@@ -73,11 +73,11 @@ def _laps(kind: str, rng: np.random.Generator) -> Floats:
     ahead = np.stack([np.interp(at + 1.0, np.arange(len(line)), axis) for axis in line.T], axis=1) - position
     turn = np.zeros((count, 3))
     turn[:, 2] = np.arctan2(ahead[:, 1], ahead[:, 0])
-    poses = geometry.pose(geometry.so3_exp(turn), position)
+    poses = se3.pose(se3.so3_exp(turn), position)
     if kind in ("room", "drone"):  # rolls about the axis it looks along, and nods
         most = np.radians(25.0 if kind == "room" else 8.0)
         roll, nod = (most * np.sin(2 * np.pi * seconds / rng.uniform(3, 5) + rng.uniform(0, 6)) for _ in range(2))
-        poses = poses @ geometry.pose(geometry.so3_exp(np.stack([roll, 0.4 * nod, 0 * nod], axis=1)), np.zeros(3))
+        poses = poses @ se3.pose(se3.so3_exp(np.stack([roll, 0.4 * nod, 0 * nod], axis=1)), np.zeros(3))
     return poses
 
 
@@ -105,13 +105,13 @@ def _even(points: Floats, step_m: float) -> Floats:
 
 def _drifted(poses: Floats, rng: np.random.Generator) -> Floats:
     """Odometry: 2 % too long, noise of 1 % of each step, and a slow turn, from the identity on."""
-    steps = geometry.log(geometry.between(poses[:-1], poses[1:]))
+    steps = se3.log(se3.between(poses[:-1], poses[1:]))
     length = np.linalg.norm(steps[:, 3:], axis=1, keepdims=True)
     steps[:, 3:] = 1.02 * steps[:, 3:] + 0.01 * length * rng.normal(size=(len(steps), 3))
     steps[:, :3] += 1e-4 * rng.normal(size=(len(steps), 3)) + np.array([0.0, 0.0, 2e-5])
     found = np.empty_like(poses)
     found[0] = np.eye(4)
-    for row, step in enumerate(geometry.exp(steps), start=1):
+    for row, step in enumerate(se3.exp(steps), start=1):
         found[row] = found[row - 1] @ step
     return found
 
@@ -126,7 +126,7 @@ def _closures(kind: str, poses: Floats, rng: np.random.Generator) -> tuple[Closu
     draws = rng.normal(size=(60, 6))
     parts = draws.reshape(60, 2, 3)  # no honest outlier: the labels are exact
     draws = (parts * np.minimum(1.0, 3.0 / np.linalg.norm(parts, axis=2, keepdims=True))).reshape(60, 6)
-    measured = geometry.between(poses[match], poses[query]) @ geometry.exp(draws * sigma)
+    measured = se3.between(poses[match], poses[query]) @ se3.exp(draws * sigma)
     information = np.tile(np.diag(1.0 / sigma**2), (60, 1, 1))
     right = rng.random(60) < 0.5
     for row in np.flatnonzero(~right).tolist():
@@ -148,4 +148,4 @@ def _fault(kind: str, rng: np.random.Generator) -> tuple[str, Floats]:
         "far": np.concatenate([np.zeros(3), axis * METRES[kind] * rng.uniform(0.1, 0.5)]),
     }
     name = str(rng.choice(sorted(faults)))
-    return name, geometry.exp(faults[name])
+    return name, se3.exp(faults[name])

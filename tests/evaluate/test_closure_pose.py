@@ -9,11 +9,11 @@ import pytest
 
 from tests.evaluate.drawn import KINDS, Drawn, draw
 from tests.graph.drive import ledger
-from vplog import geometry
 from vplog.data import Trajectory
 from vplog.evaluate.body_truth import BodyTruth, TruthAt, body_truth
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.closures import ClosureScore, Judgement, score_closures
+from vplog.geometry import se3
 
 SEEDS = range(3)
 
@@ -47,7 +47,7 @@ def test_a_truth_of_1_hz_calls_nothing_what_it_is_not(kind: str, seed: int) -> N
 
 
 def poses_between(drive: Drawn, rows: np.ndarray) -> np.ndarray:
-    return geometry.interpolate_at(
+    return se3.interpolate_at(
         drive.truth.stamp_ns, drive.truth.world_from_body, drive.truth.stamp_ns[rows] + 11_000_000
     )
 
@@ -56,7 +56,7 @@ def poses_between(drive: Drawn, rows: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_truth_of_the_camera_is_known_as_such(kind: str, seed: int) -> None:
     drive = draw(kind, seed)
-    other = geometry.exp(np.array([0.3, -2.0, 1.0, 5.0, 6.0, 7.0]))  # and in another world
+    other = se3.exp(np.array([0.3, -2.0, 1.0, 5.0, 6.0, 7.0]))  # and in another world
     truth = Trajectory(drive.truth.stamp_ns, other @ drive.truth.world_from_body @ drive.camera)
     _, found, of_body = judged(drive, truth)
     assert of_body.frame == "camera"
@@ -68,7 +68,7 @@ def test_a_truth_of_the_camera_is_known_as_such(kind: str, seed: int) -> None:
 def test_a_truth_of_another_point_is_estimated(kind: str, seed: int) -> None:
     drive = draw(kind, seed)
     size = {"room": 0.1, "road": 1.5, "drone": 0.5, "aisles": 0.5}[kind]
-    marker = geometry.exp(np.concatenate([np.random.default_rng(seed).normal(size=3), [size, -size / 2, size / 3]]))
+    marker = se3.exp(np.concatenate([np.random.default_rng(seed).normal(size=3), [size, -size / 2, size / 3]]))
     truth = Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ marker)
     _, found, of_body = judged(drive, truth)
     assert of_body.frame == "estimated"
@@ -82,7 +82,7 @@ def test_noise_of_the_truth_makes_no_closure_false(kind: str, seed: int, times: 
     drive = draw(kind, seed)
     metres = times * {"room": 0.005, "road": 0.1, "drone": 0.05, "aisles": 0.02}[kind]
     noise = np.random.default_rng(seed).normal(size=(len(drive.truth.stamp_ns), 6)) * np.repeat([0.005, metres], 3)
-    truth = Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ geometry.exp(noise))
+    truth = Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ se3.exp(noise))
     _, found, of_body = judged(drive, truth)
     assert of_body.frame == "body"
     assert not (found.right & ~drive.right).any()
@@ -119,8 +119,8 @@ def known(poses: np.ndarray, error: float = 0.0) -> TruthAt:
 
 def outcome(error: np.ndarray, sigma: tuple[float, float], metres: float, unsure_m: float = 0.0) -> str:
     """Of a closure that is off by `error` (6,) and claims `sigma` rad and m, on a drive `metres` long."""
-    poses = np.stack([np.eye(4), geometry.exp(np.array([0.1, 0.2, 0.3, 0.4, 0.1, 0.2]))])
-    measured = (geometry.between(poses[0], poses[1]) @ geometry.exp(error))[None]
+    poses = np.stack([np.eye(4), se3.exp(np.array([0.1, 0.2, 0.3, 0.4, 0.1, 0.2]))])
+    measured = (se3.between(poses[0], poses[1]) @ se3.exp(error))[None]
     found = replace(
         ledger(np.array([1]), np.array([0]), measured),
         information=np.diag(1.0 / np.repeat(sigma, 3) ** 2)[None],
@@ -169,18 +169,18 @@ def test_closures_without_metres_are_held_to_their_direction() -> None:
     closures, camera = drive.closures, drive.camera
     at = known(drive.truth.world_from_body[np.searchsorted(drive.truth.stamp_ns, drive.keyframes.stamp_ns)])
     there, here = (at.world_from_body[rows] @ camera for rows in (closures.match, closures.query))
-    true = geometry.between(there, here)
+    true = se3.between(there, here)
     length = np.linalg.norm(true[:, :3, 3], axis=1)
     unit = true.copy()
     unit[:, :3, 3] /= length[:, None]
-    turned = unit @ geometry.exp(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]))
+    turned = unit @ se3.exp(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]))
     reverse = unit.copy()
     reverse[:, :3, 3] *= -1.0
     bounds = replace(pose_bounds(drive.truth.world_from_body[:, :3, 3]), translation_m=0.1 * float(length.min()))
     for measured, right in ((unit, True), (turned, False), (reverse, False)):
         told = replace(
             closures,
-            match_from_query=camera @ measured @ geometry.inverse(camera),
+            match_from_query=camera @ measured @ se3.inverse(camera),
             scale=["none"] * len(closures),
             information=closures.information / 1e12,  # in no metres: a claim that widens nothing
         )

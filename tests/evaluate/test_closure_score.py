@@ -9,14 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vplog import geometry
+from tests.evaluate.data import data
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
 from vplog.errors import TruthError
 from vplog.evaluate.body_truth import BodyTruth
 from vplog.evaluate.closures import ClosureScore, PlaceCriterion, score_closures
 from vplog.evaluate.truth import read_truth
-
-from .data import data
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,8 +27,8 @@ SECOND = 1_000_000_000
 
 def planar(x: Sequence[float], y: Sequence[float], yaw_deg: Sequence[float]) -> Floats:
     yaw = np.radians(np.array(yaw_deg, float))
-    rotation = geometry.so3_exp(yaw[:, None] * [0.0, 0.0, 1.0])
-    return geometry.pose(rotation, np.stack([np.array(x, float), np.array(y, float), 0 * yaw], axis=1))
+    rotation = se3.so3_exp(yaw[:, None] * [0.0, 0.0, 1.0])
+    return se3.pose(rotation, np.stack([np.array(x, float), np.array(y, float), 0 * yaw], axis=1))
 
 
 def ledger(pairs: Sequence[tuple[int, int, float, bool]]) -> Closures:

@@ -9,13 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from vplog import geometry
+from tests.evaluate.data import data
 from vplog.data import Gps, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate.gps import ate_to_gps, local_enu
 from vplog.evaluate.truth import read_truth
-
-from .data import data
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -72,7 +71,7 @@ def straight(count: int, speed_m_s: float) -> Trajectory:
     """East along the equator, ten poses per second."""
     positions: Floats = np.zeros((count, 3))
     positions[:, 1] = speed_m_s * 0.1 * np.arange(count)  # in another frame than east-north-up
-    return Trajectory(100_000_000 * np.arange(count), geometry.pose(np.eye(3), positions))
+    return Trajectory(100_000_000 * np.arange(count), se3.pose(np.eye(3), positions))
 
 
 def test_ate_to_fixes_between_the_poses() -> None:

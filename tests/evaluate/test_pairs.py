@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vplog import geometry
 from vplog.data import Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate import pairs
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -40,7 +40,7 @@ def poses(rng: np.random.Generator, count: int) -> np.ndarray:
     """Headings over the whole circle in a square of 20 m."""
     omega = np.zeros((count, 3))
     omega[:, 2] = rng.uniform(-np.pi, np.pi, count)
-    return geometry.pose(geometry.so3_exp(omega), rng.uniform(0, 20, (count, 3)))
+    return se3.pose(se3.so3_exp(omega), rng.uniform(0, 20, (count, 3)))
 
 
 @settings(max_examples=50, deadline=None)
@@ -72,8 +72,8 @@ def test_by_list(seed: int) -> None:
 def test_by_pose(seed: int, distance_m: float, heading_deg: float) -> None:
     rng = np.random.default_rng(seed)
     query, match = poses(rng, 12), poses(rng, 17)
-    relative = geometry.between(query[:, None], match[None])
-    apart, turned = np.linalg.norm(relative[..., :3, 3], axis=-1), np.degrees(geometry.angle(relative))
+    relative = se3.between(query[:, None], match[None])
+    apart, turned = np.linalg.norm(relative[..., :3, 3], axis=-1), np.degrees(se3.angle(relative))
     found = pairs.pose_pairs(query, match, distance_m, heading_deg)
     check_form(found)
     np.testing.assert_array_equal(table_of(found, 17), (apart <= distance_m) & (turned <= heading_deg))
@@ -89,7 +89,7 @@ def test_the_heading_is_between_the_axes_whatever_the_roll(seed: int, heading_de
     looks, sees = (one[:, :3, :3] @ axis for one, axis in zip((query, match), axes, strict=True))
     apart = np.linalg.norm(query[:, None, :3, 3] - match[None, :, :3, 3], axis=-1)
     np.testing.assert_array_equal(found, (apart <= 20.0) & (np.degrees(np.arccos(looks @ sees.T)) <= heading_deg))
-    rolled = geometry.pose(geometry.so3_exp(rng.uniform(-3, 3, (12, 1)) * axes[0]), np.zeros((12, 3)))
+    rolled = se3.pose(se3.so3_exp(rng.uniform(-3, 3, (12, 1)) * axes[0]), np.zeros((12, 3)))
     np.testing.assert_array_equal(
         found, table_of(pairs.pose_pairs(query @ rolled, match, 20.0, heading_deg, *axes), 17)
     )
@@ -98,8 +98,8 @@ def test_the_heading_is_between_the_axes_whatever_the_roll(seed: int, heading_de
 def test_an_axis_is_that_of_the_mount_or_none_where_a_vehicle_has_no_mount() -> None:
     phase = np.linspace(0.0, 6.0, 50)
     turn = np.stack([0 * phase, 0 * phase, phase + np.pi / 2], axis=1)
-    car = geometry.pose(geometry.so3_exp(turn), np.stack([np.cos(phase), np.sin(phase), 0 * phase], axis=1))
-    forward = geometry.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.ones(3))
+    car = se3.pose(se3.so3_exp(turn), np.stack([np.cos(phase), np.sin(phase), 0 * phase], axis=1))
+    forward = se3.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.ones(3))
     np.testing.assert_array_equal(pairs.optical_axis(forward, car), [1.0, 0.0, 0.0])
     assert pairs.optical_axis(np.eye(4), car) is None  # its z points up
     np.testing.assert_array_equal(pairs.optical_axis(np.eye(4), car @ forward), [0.0, 0.0, 1.0])  # poses of the camera
@@ -110,7 +110,7 @@ def test_an_axis_is_that_of_the_mount_or_none_where_a_vehicle_has_no_mount() -> 
 def test_half_a_turn_allows_every_heading() -> None:
     rng = np.random.default_rng(5)
     query, match = poses(rng, 30), poses(rng, 30)
-    query[0] = match[0] @ geometry.pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    query[0] = match[0] @ se3.pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     assert pairs.pose_pairs(query, match, 100.0, 180.0).count == 900
 
 
@@ -145,9 +145,7 @@ def test_standing_still_takes_no_memory() -> None:
 
 def test_truth_between_poses_and_beyond_them() -> None:
     seconds = np.array([0, 1, 2, 10, 11])
-    steps = geometry.pose(
-        np.broadcast_to(np.eye(3), (5, 3, 3)), np.column_stack([seconds, seconds, seconds]).astype(float)
-    )
+    steps = se3.pose(np.broadcast_to(np.eye(3), (5, 3, 3)), np.column_stack([seconds, seconds, seconds]).astype(float))
     at = np.array([-1, 0, 0.5, 2, 6, 10.25, 11, 12])
     found, known = pairs.poses_at(Trajectory(seconds * 10**9, steps), (at * 1e9).astype(np.int64))
     assert known.tolist() == [False, True, True, True, False, True, True, False]

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 
-from vplog import geometry, logs
+from tests.evaluate.data import data
+from vplog import logs
 from vplog.data import Camera, Gps, Odometry, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice, open_truth
-from vplog.tum import write_tum
-
-from .data import data
+from vplog.geometry import se3
+from vplog.geometry.tum import write_tum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +59,7 @@ def straight(name: str, start_s: float, start_m: float, **more: Any) -> Recorded
     """Ten frames, a second and 2 m apart."""
     stamp_ns = ((start_s + np.arange(10)) * 1e9).astype(np.int64)
     east = np.asarray(start_m + 2.0 * np.arange(10), np.float64)
-    poses = geometry.pose(np.broadcast_to(np.eye(3), (10, 3, 3)), np.column_stack([east, 0 * east, 0 * east]))
+    poses = se3.pose(np.broadcast_to(np.eye(3), (10, 3, 3)), np.column_stack([east, 0 * east, 0 * east]))
     return Recorded(name, stamp_ns, poses=poses, **more)
 
 
@@ -104,7 +104,7 @@ def test_the_defaults_are_6_m_and_45_degrees() -> None:
     query, other = straight("a", 0, 0), straight("b", 100, 6)
     assert found_rows(TruthChoice("poses"), query, other) == near(6.0, 6.0)
     for turn_deg, some in ((44.0, True), (46.0, False)):
-        turned = geometry.pose(geometry.so3_exp(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
+        turned = se3.pose(se3.so3_exp(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
         seen = found_rows(TruthChoice("poses"), query, Recorded("b", other.stamp_ns, cast("Any", other.poses) @ turned))
         assert any(seen) == some
 
@@ -112,9 +112,9 @@ def test_the_defaults_are_6_m_and_45_degrees() -> None:
 def test_a_camera_that_is_rolled_about_its_axis_sees_the_same_place() -> None:
     """The mount is known: it looks along the body's x. Turned by as much about another axis it sees another place."""
     query, other = straight("a", 0, 0), straight("b", 100, 6)
-    looks_along_x = geometry.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+    looks_along_x = se3.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
     for axis, some in ((0, True), (1, False), (2, False)):
-        turned = geometry.pose(geometry.so3_exp(np.radians(120.0) * np.eye(3)[axis]), np.zeros(3))
+        turned = se3.pose(se3.so3_exp(np.radians(120.0) * np.eye(3)[axis]), np.zeros(3))
         rolled = replace(other, poses=cast("Any", other.poses) @ turned, body_from_camera=looks_along_x)
         assert any(found_rows(TruthChoice("poses"), replace(query, body_from_camera=looks_along_x), rolled)) == some
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.graph.drive import ledger
-from vplog import geometry
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
 from vplog.evaluate.body_truth import BodyTruth
 from vplog.evaluate.residuals import score_residuals
+from vplog.geometry import se3
 
 SIGMA = np.repeat([0.003, 0.05], 3)
 LAP = 200
@@ -22,12 +22,12 @@ def drive(claimed: float = 1.0) -> tuple[Keyframes, Closures, BodyTruth]:
     random = np.random.default_rng(0)
     turn = np.linspace(0, 2 * np.pi, LAP, endpoint=False)
     zero = np.zeros(LAP)
-    rotation = geometry.so3_exp(np.stack([zero, zero, turn], axis=1))
-    laps = [geometry.pose(rotation, np.stack([r * np.cos(turn), r * np.sin(turn), zero], axis=1)) for r in (50.0, 50.3)]
+    rotation = se3.so3_exp(np.stack([zero, zero, turn], axis=1))
+    laps = [se3.pose(rotation, np.stack([r * np.cos(turn), r * np.sin(turn), zero], axis=1)) for r in (50.0, 50.3)]
     poses = np.concatenate(laps)
     stamps = np.arange(2 * LAP, dtype=np.int64) * 10**9
     match, query = np.arange(LAP, dtype=np.int32), np.arange(LAP, 2 * LAP, dtype=np.int32)
-    z = geometry.between(poses[match], poses[query]) @ geometry.exp(random.normal(size=(LAP, 6)) * SIGMA)
+    z = se3.between(poses[match], poses[query]) @ se3.exp(random.normal(size=(LAP, 6)) * SIGMA)
     information = np.tile(np.diag(1.0 / (claimed * SIGMA) ** 2), (LAP, 1, 1))
     accepted = replace(ledger(query, match, z), information=information)
     return Keyframes("laps", stamps, poses), accepted, BodyTruth(Trajectory(stamps, poses))

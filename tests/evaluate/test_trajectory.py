@@ -15,13 +15,12 @@ from evo.core.units import Unit
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from vplog import geometry
+from tests.evaluate.data import data
 from vplog.data import Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate.trajectory import associate, at_truth, ate, drift, rpe
 from vplog.evaluate.truth import read_truth
-
-from .data import data
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -32,14 +31,14 @@ NOW_NS = 1_305_031_102_175_304_031
 def walk(seed: int, count: int, period_ns: int = 100_000_000, start_ns: int = NOW_NS, noise: float = 0.0) -> Trajectory:
     """A smooth path in space with jittered stamps, each pose off by `noise` rad and m."""
     rng = np.random.default_rng(seed)
-    steps = geometry.exp(np.tile([0.01, 0.02, 0.05, 0.8, 0.1, 0.05], (count, 1)) * rng.normal(1.0, 0.3, (count, 6)))
+    steps = se3.exp(np.tile([0.01, 0.02, 0.05, 0.8, 0.1, 0.05], (count, 1)) * rng.normal(1.0, 0.3, (count, 6)))
     poses = np.empty((count, 4, 4))
     poses[0] = np.eye(4)
     for row in range(1, count):
         poses[row] = poses[row - 1] @ steps[row]
     jitter = rng.integers(-period_ns // 5, period_ns // 5, count)
     stamps = start_ns + period_ns * np.arange(count) + jitter
-    return Trajectory(stamps, poses @ geometry.exp(noise * rng.normal(size=(count, 6))))
+    return Trajectory(stamps, poses @ se3.exp(noise * rng.normal(size=(count, 6))))
 
 
 def moved(trajectory: Trajectory, a_from_world: Floats) -> Trajectory:
@@ -90,7 +89,7 @@ def assert_agrees_with_evo(estimate: Trajectory, truth: Trajectory) -> None:
 def test_random_walks_agree_with_evo(estimated: int, true: int) -> None:
     shortest = min(estimated, true)
     truth = walk(1, true, 100_000_000 * shortest // true)
-    estimate = moved(walk(1, estimated, 100_000_000 * shortest // estimated, noise=0.1), geometry.exp(np.full(6, 0.7)))
+    estimate = moved(walk(1, estimated, 100_000_000 * shortest // estimated, noise=0.1), se3.exp(np.full(6, 0.7)))
     assert_agrees_with_evo(estimate, truth)
 
 
@@ -152,9 +151,9 @@ def test_association_is_evos(estimate_ms: list[int], truth_ms: list[int]) -> Non
 def test_a_rigid_motion_of_the_estimate_changes_nothing(seed: int, xi: list[float]) -> None:
     truth, estimate = walk(seed, 12), walk(seed, 12, noise=0.05)
     assume(len(associate(estimate, truth)[0]) == 12)
-    before, after = ate(estimate, truth), ate(moved(estimate, geometry.exp(np.array(xi))), truth)
+    before, after = ate(estimate, truth), ate(moved(estimate, se3.exp(np.array(xi))), truth)
     assert after.rmse_m == pytest.approx(before.rmse_m, abs=1e-9)
-    assert ate(moved(truth, geometry.exp(np.array(xi))), truth).max_m == pytest.approx(0, abs=1e-9)
+    assert ate(moved(truth, se3.exp(np.array(xi))), truth).max_m == pytest.approx(0, abs=1e-9)
 
 
 def test_a_straight_drive_is_scored() -> None:
@@ -189,7 +188,7 @@ def test_a_single_pose_has_no_rpe() -> None:
 @pytest.mark.parametrize(("alignment", "name"), [("se3", "SE(3)"), ("sim3", "Sim(3)"), ("origin", "origin")])
 def test_each_alignment_is_evos_and_named(alignment: str, name: str) -> None:
     truth = walk(2, 90)
-    estimate = moved(walk(2, 90, noise=0.1), geometry.exp(np.full(6, 0.7)))
+    estimate = moved(walk(2, 90, noise=0.1), se3.exp(np.full(6, 0.7)))
     poses = estimate.world_from_body.copy()
     poses[:, :3, 3] *= 1.3
     longer = Trajectory(estimate.stamp_ns, poses)
@@ -205,7 +204,7 @@ def along_x(metres: float, count: int = 2001, longer: float = 1.0, turn_deg_per_
     """Straight on, or bent, with a pose every `metres` / (`count` - 1)."""
     step_m = longer * metres / (count - 1)
     step = np.array([0, 0, np.radians(turn_deg_per_100_m) * metres / (count - 1) / 100.0, step_m, 0, 0])
-    poses = geometry.exp(np.arange(count, dtype=np.float64)[:, None] * step)
+    poses = se3.exp(np.arange(count, dtype=np.float64)[:, None] * step)
     return Trajectory(NOW_NS + 50_000_000 * np.arange(count), poses)
 
 
@@ -246,10 +245,10 @@ def devkit(truth: Floats, estimate: Floats) -> tuple[float, float, int]:
 @pytest.mark.parametrize("seed", range(3))
 def test_drift_is_that_of_kittis_kit(seed: int) -> None:
     truth, other = walk(seed, 1200), walk(seed + 10, 1200, noise=0.01)
-    between = geometry.log(geometry.between(other.world_from_body[:-1], other.world_from_body[1:]))
+    between = se3.log(se3.between(other.world_from_body[:-1], other.world_from_body[1:]))
     poses = truth.world_from_body.copy()
-    for row, step in enumerate(geometry.exp(0.01 * between)):  # the truth's steps, each off by a hundredth of another's
-        poses[row + 1] = poses[row] @ geometry.between(*truth.world_from_body[row : row + 2]) @ step
+    for row, step in enumerate(se3.exp(0.01 * between)):  # the truth's steps, each off by a hundredth of another's
+        poses[row + 1] = poses[row] @ se3.between(*truth.world_from_body[row : row + 2]) @ step
     found = drift(Trajectory(truth.stamp_ns, poses), truth)
     metres, degrees, segments = devkit(truth.world_from_body, poses)
     assert found.segments == segments > 100
@@ -266,7 +265,7 @@ def test_a_drive_that_stood_still_has_no_drift() -> None:
 def test_a_truth_of_1_hz_between_the_stamps_is_compared_at_its_own() -> None:
     estimate = along_x(100.0)
     at_ns = estimate.stamp_ns[10:-10:20] + 23_000_000
-    truth = Trajectory(at_ns, geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns))
+    truth = Trajectory(at_ns, se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns))
     with pytest.raises(TruthError):
         ate(estimate, truth)
     compared, interpolated = at_truth(estimate, truth)

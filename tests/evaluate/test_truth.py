@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests.evaluate.data import data
 from vplog.errors import TruthError
 from vplog.evaluate.truth import read_truth
-
-from .data import data
 
 if TYPE_CHECKING:
     from pathlib import Path

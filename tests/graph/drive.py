@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Verdict
+from vplog.geometry import se3
 from vplog.graph.build import build_graph
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ def ring(n: int = 120, loops: int = 20, false: int = 0, seed: int = 0, noise: fl
     turn = np.linspace(0.0, 4.0 * np.pi, n)
     zero = np.zeros(n)
     position = np.stack([20.0 * np.cos(turn), 20.0 * np.sin(turn), 0.3 * turn], axis=1)
-    tilt = geometry.so3_exp(np.stack([0.1 * np.sin(turn), zero, zero], axis=1))
-    true = geometry.pose(geometry.so3_exp(np.stack([zero, zero, turn], axis=1)) @ tilt, position)
-    step = geometry.between(true[:-1], true[1:]) @ geometry.exp(noise * random.normal(size=(n - 1, 6)) * ODOMETRY_SIGMA)
+    tilt = se3.so3_exp(np.stack([0.1 * np.sin(turn), zero, zero], axis=1))
+    true = se3.pose(se3.so3_exp(np.stack([zero, zero, turn], axis=1)) @ tilt, position)
+    step = se3.between(true[:-1], true[1:]) @ se3.exp(noise * random.normal(size=(n - 1, 6)) * ODOMETRY_SIGMA)
     measured = np.empty_like(true)
     measured[0] = true[0]
     for k in range(n - 1):
@@ -45,10 +45,8 @@ def ring(n: int = 120, loops: int = 20, false: int = 0, seed: int = 0, noise: fl
     query = np.concatenate([random.integers(n // 2, n, loops), random.integers(n // 3, n, false)])
     match = np.maximum(query - n // 2, 0)
     match[loops:] = random.integers(0, n // 3 - 5, false)
-    z = geometry.between(true[match], true[query]) @ geometry.exp(
-        noise * random.normal(size=(loops + false, 6)) * CLOSURE_SIGMA
-    )
-    z[loops:] = geometry.exp(random.normal(size=(false, 6)) * np.array([0.1, 0.1, 0.5, 1.0, 1.0, 0.3]))
+    z = se3.between(true[match], true[query]) @ se3.exp(noise * random.normal(size=(loops + false, 6)) * CLOSURE_SIGMA)
+    z[loops:] = se3.exp(random.normal(size=(false, 6)) * np.array([0.1, 0.1, 0.5, 1.0, 1.0, 0.3]))
     stamps = np.arange(n, dtype=np.int64) * 500_000_000 + 1_000_000_000_000
     keyframes = Keyframes("ring", stamps, measured)
     covariance = np.broadcast_to(np.diag(ODOMETRY_SIGMA**2), (n - 1, 6, 6)).copy()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gtsam
 import numpy as np
 
-from vplog import geometry
+from vplog.geometry import se3
 from vplog.graph.build import informed
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def as_array(values: gtsam.Values, dimension: int) -> np.ndarray:
         return np.array([values.atPose3(node).matrix() for node in range(values.size())])
     x, y, yaw = gtsam.utilities.extractPose2(values).T
     zero = np.zeros(len(x))
-    return geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), np.stack([x, y, zero], axis=1))
+    return se3.pose(se3.so3_exp(np.stack([zero, zero, yaw], axis=1)), np.stack([x, y, zero], axis=1))
 
 
 def edge_factors(graph: PoseGraph, weight: np.ndarray | None = None) -> list[Any]:

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vplog import geometry
+from tests.graph.drive import ledger, ring, with_entry, without_loops
 from vplog.data import EdgeKind, Verdict
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.graph.build import build_graph, checked, parts
 from vplog.graph.gnc import GncSettings
-
-from .drive import ledger, ring, with_entry, without_loops
 
 DRIVE = ring(30, 3)
 N = 30
@@ -19,7 +18,7 @@ N = 30
 
 def test_only_accepted_rows_become_loops_in_order() -> None:
     query, match = np.array([10, 12, 20, 25]), np.array([1, 2, 3, 4])
-    rows = ledger(query, match, geometry.between(DRIVE.true[match], DRIVE.true[query]))
+    rows = ledger(query, match, se3.between(DRIVE.true[match], DRIVE.true[query]))
     verdict = [Verdict.ACCEPTED, Verdict.TOO_FEW_INLIERS, Verdict.ACCEPTED, Verdict.POOR_SPREAD]
     # what was rejected has no pose
     rows = replace(rows, verdict=verdict, match_from_query=with_entry(rows.match_from_query, (1,), np.nan))
@@ -36,7 +35,7 @@ def test_only_accepted_rows_become_loops_in_order() -> None:
 def test_closures_that_share_a_keyframe_share_their_information() -> None:
     """Three at query 10, two at match 2: each counts as its share of the busier end; a lone closure counts whole."""
     query, match = np.array([10, 10, 10, 12, 20]), np.array([1, 2, 3, 2, 5])
-    rows = ledger(query, match, geometry.between(DRIVE.true[match], DRIVE.true[query]))
+    rows = ledger(query, match, se3.between(DRIVE.true[match], DRIVE.true[query]))
     graph, _, _ = build_graph(DRIVE.keyframes, np.eye(6) + np.zeros((N - 1, 1, 1)), rows)
     for loop, share in zip(graph.information[N - 1 :], (3, 3, 3, 2, 1), strict=True):
         np.testing.assert_allclose(loop, rows.information[0] / share, rtol=1e-12)

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vplog import geometry
+from tests.graph.drive import ring, without_loops
+from tests.graph.gtsam_graph import edge_factors
 from vplog.data import EdgeKind
-from vplog.graph import descent
+from vplog.geometry import se3
+from vplog.graph import least_squares
 from vplog.graph.consistency import (
     chi2_quantile,
     is_loop,
@@ -20,16 +22,13 @@ from vplog.graph.consistency import (
 )
 from vplog.graph.solve import GncSettings, LmSettings, gated
 
-from .drive import ring, without_loops
-from .gtsam_graph import edge_factors
-
 
 def test_chi2_agrees_with_gtsam() -> None:
     drive = ring(40, 10)
     random = np.random.default_rng(3)
     root = random.normal(size=(len(drive.graph.a), 6, 6))
     graph = replace(drive.graph, information=root @ np.swapaxes(root, 1, 2) + np.eye(6))
-    poses = drive.true @ geometry.exp(random.normal(size=(40, 6)) * 0.5)
+    poses = drive.true @ se3.exp(random.normal(size=(40, 6)) * 0.5)
     values = gtsam.Values()
     for node, pose in enumerate(poses):
         values.insert(node, gtsam.Pose3(pose))
@@ -44,7 +43,7 @@ def test_information_is_in_the_frame_of_b_rotation_first() -> None:
     graph = replace(graph, information=information)
     for axis in range(6):
         poses = np.array(graph.world_from_body)
-        poses[graph.b[-1]] = poses[graph.b[-1]] @ geometry.exp(1e-3 * np.eye(6)[axis])
+        poses[graph.b[-1]] = poses[graph.b[-1]] @ se3.exp(1e-3 * np.eye(6)[axis])
         assert residual_sigma(graph, poses)[-1] == pytest.approx(1e-3 * (axis + 1), rel=1e-5)
 
 
@@ -56,11 +55,11 @@ def test_distance_to_the_odometry_agrees_with_a_walk_along_the_chain() -> None:
         a, b = int(graph.a[edge]), int(graph.b[edge])
         covariance = np.zeros((6, 6))
         for k in range(a, b):
-            moved = geometry.adjoint(geometry.inverse(graph.a_from_b[k]))
+            moved = se3.adjoint(se3.inverse(graph.a_from_b[k]))
             covariance = moved @ covariance @ moved.T + np.linalg.inv(graph.information[k])
         covariance += np.linalg.inv(graph.information[edge])
-        odometry = geometry.between(graph.world_from_body[a], graph.world_from_body[b])
-        error = geometry.log(geometry.between(graph.a_from_b[edge], odometry))
+        odometry = se3.between(graph.world_from_body[a], graph.world_from_body[b])
+        error = se3.log(se3.between(graph.a_from_b[edge], odometry))
         assert result[edge] == pytest.approx(np.sqrt(error @ np.linalg.solve(covariance, error)), rel=1e-6)
 
 
@@ -71,7 +70,7 @@ def test_distance_to_the_odometry_is_chi_square() -> None:
 
 def test_distance_does_not_depend_on_where_the_odometry_starts() -> None:
     graph = ring(50, 8).graph
-    far = geometry.pose(geometry.so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5e5, 5e6, 0.0]))
+    far = se3.pose(se3.so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5e5, 5e6, 0.0]))
     moved = residual_before(replace(graph, world_from_body=far @ graph.world_from_body))
     np.testing.assert_allclose(moved, residual_before(graph), rtol=1e-4)
 
@@ -123,7 +122,7 @@ def test_large_graphs_are_measured_as_small_ones(monkeypatch: pytest.MonkeyPatch
     graph, loops = replace(drive.graph, kind=kind), np.array([62, 59, 66])
     chain, leads = odometry_chain(graph)
     every, some = residual_sigma(graph, drive.true), residual_sigma(graph, drive.true, loops)
-    monkeypatch.setattr(descent, "LARGE_POSES", 10)
+    monkeypatch.setattr(least_squares, "LARGE_POSES", 10)
     found = odometry_chain(graph)
     np.testing.assert_allclose(found[0], chain, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(found[1], leads)

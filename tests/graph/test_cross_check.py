@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests.graph.drive import ring
 from vplog.graph.consistency import is_loop, keep_odometry_if_worse, odometry_chain
 from vplog.graph.cross_check import CrossCheckSettings, cross_checked
 from vplog.graph.solve import GncSettings
-
-from .drive import ring
 
 if TYPE_CHECKING:
     from vplog.data import PoseGraph

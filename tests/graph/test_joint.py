@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vplog import geometry
+from tests.graph import drive as drives
 from vplog.data import EdgeKind, Trajectory
 from vplog.evaluate.trajectory import ate
+from vplog.geometry import se3
 from vplog.graph.joint import Between, Drive, JoinSettings, join
 from vplog.graph.refine import RefineSettings
 from vplog.graph.solve import GncSettings
 
-from . import drive as drives
-
-SHIFT = geometry.exp(np.array([0.1, -0.2, 2.0, 30.0, 10.0, -3.0]))
+SHIFT = se3.exp(np.array([0.1, -0.2, 2.0, 30.0, 10.0, -3.0]))
 CLOSURE = np.diag(1.0 / drives.CLOSURE_SIGMA**2)
 
 
@@ -34,9 +33,9 @@ def between(later: int, earlier: int, true: list[np.ndarray], count: int, seed: 
     random = np.random.default_rng(seed)
     query = np.sort(random.choice(len(true[later]), count, replace=False))
     match = np.array([np.linalg.norm(true[earlier][:, :3, 3] - true[later][q, :3, 3], axis=1).argmin() for q in query])
-    z = geometry.between(true[earlier][match], true[later][query])
-    z = z @ geometry.exp(random.normal(size=(count, 6)) * drives.CLOSURE_SIGMA)
-    z[:false] = z[:false] @ geometry.exp(random.normal(size=(false, 6)) * [0.1, 0.1, 0.5, 4.0, 4.0, 0.3])
+    z = se3.between(true[earlier][match], true[later][query])
+    z = z @ se3.exp(random.normal(size=(count, 6)) * drives.CLOSURE_SIGMA)
+    z[:false] = z[:false] @ se3.exp(random.normal(size=(false, 6)) * [0.1, 0.1, 0.5, 4.0, 4.0, 0.3])
     return Between(
         later, earlier, query, match, z, np.broadcast_to(CLOSURE, (count, 6, 6)).copy(), np.zeros(count, bool)
     )
@@ -102,7 +101,7 @@ def mistold(seed: int, factor: float) -> tuple[Drive, np.ndarray]:
     graph, odometry = first.graph, first.of_odometry
     noise = random.normal(size=(odometry.sum(), 6)) * drives.ODOMETRY_SIGMA * factor
     measured = np.array(graph.a_from_b)
-    measured[odometry] = geometry.between(true[graph.a[odometry]], true[graph.b[odometry]]) @ geometry.exp(noise)
+    measured[odometry] = se3.between(true[graph.a[odometry]], true[graph.b[odometry]]) @ se3.exp(noise)
     return replace(first, graph=replace(graph, a_from_b=measured)), true
 
 
@@ -155,10 +154,10 @@ def looking_alike(true: list[np.ndarray], random: np.random.Generator) -> Betwee
     """Six neighbours of the one drive that see what six of the other see, elsewhere: they agree with each other."""
     tie = between(1, 0, true, 12, 0)
     rows, query, match = np.zeros(6, int), np.arange(20, 26), np.arange(60, 66)
-    wrong = geometry.exp(np.array([0.0, 0.0, 0.3, 2.0, 1.0, 0.0]))
-    z = geometry.between(true[0][match], true[0][np.full(6, 60)]) @ wrong
-    z = z @ geometry.between(true[1][np.full(6, 20)], true[1][query])
-    z = z @ geometry.exp(random.normal(size=(6, 6)) * drives.CLOSURE_SIGMA)
+    wrong = se3.exp(np.array([0.0, 0.0, 0.3, 2.0, 1.0, 0.0]))
+    z = se3.between(true[0][match], true[0][np.full(6, 60)]) @ wrong
+    z = z @ se3.between(true[1][np.full(6, 20)], true[1][query])
+    z = z @ se3.exp(random.normal(size=(6, 6)) * drives.CLOSURE_SIGMA)
     return replace(
         tie, query=query, match=match, match_from_query=z, information=tie.information[rows],
         of_odometry=tie.of_odometry[rows],

@@ -10,16 +10,15 @@ import pytest
 from pydantic import TypeAdapter
 
 from tests.benchmarks.graphs import aligned_error, city, spoiled, with_groups
-from vplog import geometry
+from tests.graph.drive import position_error, ring, without_loops
+from tests.graph.gtsam_graph import as_values, edge_factors
 from vplog.data import EdgeKind, PoseGraph
+from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain, residual_before, residual_sigma
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.lm import LmSettings
 from vplog.graph.solve import OptimiserSettings
-
-from .drive import position_error, ring, without_loops
-from .gtsam_graph import as_values, edge_factors
 
 UNION = get_args(get_args(OptimiserSettings)[0])
 METHODS = [settings() for settings in UNION]
@@ -93,7 +92,7 @@ def test_without_closures_odometry_comes_back(method: Any) -> None:
 @each_method
 def test_far_from_the_origin_the_shape_is_the_same(method: Any) -> None:
     graph, _ = spoiled(CITY, 0.2, 0)
-    utm = geometry.pose(geometry.so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5e5, 5.3e6, 0.0]))
+    utm = se3.pose(se3.so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5e5, 5.3e6, 0.0]))
     moved = method(replace(graph, world_from_body=utm @ graph.world_from_body))
     expected = utm @ method(graph).world_from_body
     np.testing.assert_allclose(moved.world_from_body[:, :2, 3], expected[:, :2, 3], atol=1e-4)
@@ -105,7 +104,7 @@ def test_planar_residuals_agree_with_gtsam() -> None:
     information = np.zeros((len(CITY.a), 6, 6))
     information[:, 2:5, 2:5] = root @ np.swapaxes(root, 1, 2) + np.eye(3)
     graph = replace(CITY, information=information)
-    poses = graph.world_from_body @ geometry.exp(random.normal(size=(300, 6)) * [0, 0, 0.7, 1, 1, 0])
+    poses = graph.world_from_body @ se3.exp(random.normal(size=(300, 6)) * [0, 0, 0.7, 1, 1, 0])
     values = as_values(poses, 2)
     expected = [2.0 * factor.error(values) for factor in edge_factors(graph)]
     np.testing.assert_allclose(residual_sigma(graph, poses) ** 2, expected, rtol=1e-9)
@@ -121,13 +120,13 @@ def test_the_planar_solution_is_the_spatial_one_held_in_the_plane() -> None:
 def test_odometry_may_be_written_either_way_round() -> None:
     graph = ring(40, 6, false=2).graph
     turn = np.arange(len(graph.a)) % 2 == 1
-    moved = geometry.adjoint(graph.a_from_b)  # the noise is told in the frame of the end, which now is the start
+    moved = se3.adjoint(graph.a_from_b)  # the noise is told in the frame of the end, which now is the start
     covariance = moved @ np.linalg.inv(graph.information) @ np.swapaxes(moved, 1, 2)
     mixed = replace(
         graph,
         a=np.where(turn, graph.b, graph.a),
         b=np.where(turn, graph.a, graph.b),
-        a_from_b=np.where(turn[:, None, None], geometry.inverse(graph.a_from_b), graph.a_from_b),
+        a_from_b=np.where(turn[:, None, None], se3.inverse(graph.a_from_b), graph.a_from_b),
         information=np.where(turn[:, None, None], np.linalg.inv(covariance), graph.information),
     )
     true = ~ring(40, 6, false=2).false  # covariances are to first order: what is 300 sigma off differs by a tenth
@@ -140,12 +139,12 @@ def two_robots(seed: int, false: int) -> tuple[PoseGraph, np.ndarray, np.ndarray
     """Two drives of one city that know nothing of each other's start, and closures between them."""
     random = np.random.default_rng(seed)
     first, second = city(120, seed=10), city(120, seed=11)
-    shift = geometry.exp(np.array([0.0, 0.0, 2.0, 30.0, 10.0, 0.0]))
+    shift = se3.exp(np.array([0.0, 0.0, 2.0, 30.0, 10.0, 0.0]))
     true = np.concatenate([LmSettings()(one).world_from_body for one in (first, second)])
     a = random.integers(0, 120, 12 + false)
     b = random.integers(120, 240, 12 + false)
-    measured = geometry.between(true[a], true[b])
-    measured[12:] = measured[12:] @ geometry.exp(random.normal(size=(false, 6)) * [0, 0, 1, 5, 5, 0])
+    measured = se3.between(true[a], true[b])
+    measured[12:] = measured[12:] @ se3.exp(random.normal(size=(false, 6)) * [0, 0, 1, 5, 5, 0])
     graph = PoseGraph(
         np.concatenate([first.world_from_body, shift @ second.world_from_body]),
         np.concatenate([first.a, second.a + 120, a]).astype(np.int32),

@@ -5,15 +5,15 @@ from itertools import accumulate
 import numpy as np
 import pytest
 
-from vplog import geometry
 from vplog.data import Odometry
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.graph.noise import NoiseSettings, edge_covariance
 
 T = 101
 STAMPS = np.arange(T, dtype=np.int64) * 100_000_000
 RANDOM = np.random.default_rng(4)
-STEPS = geometry.exp(RANDOM.normal(size=(T, 6)) * 0.02 + np.array([0, 0, 0.02, 0.5, 0, 0]))
+STEPS = se3.exp(RANDOM.normal(size=(T, 6)) * 0.02 + np.array([0, 0, 0.02, 0.5, 0, 0]))
 POSES = np.array(list(accumulate(STEPS, np.matmul)))
 SMALL = np.diag([1e-4, 1e-4, 2e-4, 1e-2, 2e-2, 1e-2])  # within the model's best and worst
 WIDE = NoiseSettings(best_share=1e-3, worst_share=1e6)
@@ -47,7 +47,7 @@ def test_unknown_covariance_gives_the_model_and_a_warning(covariance: np.ndarray
 def test_model_over_the_whole_drive_is_the_linear_rate() -> None:
     settings = NoiseSettings(floor_m=1e-9, memory_m=1e9)
     result, _, _ = edge_covariance(odometry(None), STAMPS[[0, -1]], settings)
-    metres = np.linalg.norm(geometry.between(POSES[:-1], POSES[1:])[:, :3, 3], axis=1).sum()
+    metres = np.linalg.norm(se3.between(POSES[:-1], POSES[1:])[:, :3, 3], axis=1).sum()
     assert np.sqrt(result[0, 3, 3]) == pytest.approx(settings.drift_per_metre * metres)
 
 
@@ -58,8 +58,8 @@ def test_increments_are_independent_of_how_the_drive_is_cut() -> None:
     whole, _, source = edge_covariance(odometry(logged), STAMPS[[5, 60]], WIDE)
     parts, _, _ = edge_covariance(odometry(logged), cut, WIDE)
     assert source == "increments"
-    poses = geometry.interpolate_at(STAMPS, POSES, cut[1:])
-    moved = geometry.adjoint(geometry.between(poses[-1], poses))
+    poses = se3.interpolate_at(STAMPS, POSES, cut[1:])
+    moved = se3.adjoint(se3.between(poses[-1], poses))
     np.testing.assert_allclose((moved @ parts @ np.swapaxes(moved, 1, 2)).sum(0), whole[0], rtol=0.01, atol=1e-6)
 
 
@@ -67,18 +67,18 @@ def test_increments_agree_with_simulated_errors() -> None:
     random = np.random.default_rng(0)
     logged = np.broadcast_to(SMALL * 0.01, (T, 6, 6))
     expected, _, _ = edge_covariance(odometry(logged), STAMPS[[0, 40]], WIDE)
-    noise = geometry.exp(random.normal(size=(4000, 40, 6)) * np.sqrt(np.diag(SMALL * 0.01)))
+    noise = se3.exp(random.normal(size=(4000, 40, 6)) * np.sqrt(np.diag(SMALL * 0.01)))
     end = np.broadcast_to(np.eye(4), (4000, 4, 4))
     for k in range(40):
-        end = end @ geometry.between(POSES[k], POSES[k + 1]) @ noise[:, k]
-    error = geometry.log(geometry.between(geometry.between(POSES[0], POSES[40]), end))
+        end = end @ se3.between(POSES[k], POSES[k + 1]) @ noise[:, k]
+    error = se3.log(se3.between(se3.between(POSES[0], POSES[40]), end))
     np.testing.assert_allclose(np.cov(error.T), expected[0], atol=0.08 * np.abs(expected).max())
 
 
 def test_growing_covariance_is_taken_apart_into_the_increments() -> None:
     logged = np.zeros((T, 6, 6))
     for k in range(1, T):
-        moved = geometry.adjoint(geometry.between(POSES[k], POSES[k - 1]))
+        moved = se3.adjoint(se3.between(POSES[k], POSES[k - 1]))
         logged[k] = moved @ logged[k - 1] @ moved.T + SMALL
     logged[0] = 1e-9 * np.eye(6)
     result, _, source = edge_covariance(odometry(logged), STAMPS[::10], WIDE)

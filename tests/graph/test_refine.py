@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from tests.graph.drive import CLOSURE_SIGMA, Drive, position_error, ring, without_loops
-from vplog import geometry
 from vplog.data import EdgeKind, Gps, Keyframes, Odometry, PoseGraph
 from vplog.errors import GraphError
-from vplog.geodesy import local_enu
+from vplog.geometry import se3
+from vplog.geometry.geodesy import local_enu
 from vplog.graph.consistency import keep_odometry_if_worse, odometry_chain, residual_sigma
+from vplog.graph.gps_factors import Fixes, GpsSettings, antennas, fixes_on
 from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.lm import LmSettings
 from vplog.graph.refine import Refined, RefineSettings, refine
-from vplog.graph.satellites import Fixes, GpsSettings, antennas, fixes_on
 
 DEGREE_M = 111_195.0
 """m of a degree on a sphere of 6371 km: for making fixes, not for reading them."""
@@ -46,7 +46,7 @@ def satellites(drive: Drive, sigma_m: float = 1.0, antenna_m: tuple[float, float
     n = len(drive.true)
     arm = np.zeros(3) if antenna_m is None else np.array(antenna_m)
     place = drive.true[:, :3, 3] + drive.true[:, :3, :3] @ arm
-    turned = place @ geometry.so3_exp(np.array([[0.0, 0.0, 2.0]]))[0].T
+    turned = place @ se3.so3_exp(np.array([[0.0, 0.0, 2.0]]))[0].T
     noisy = turned + np.random.default_rng(7).normal(size=(n, 3)) * sigma_m
     return Gps(
         drive.keyframes.stamp_ns, 48.0 + noisy[:, 1] / DEGREE_M,
@@ -72,9 +72,7 @@ def seen_from_afar(seed: int = 3) -> Drive:
     loops = np.array([kind == EdgeKind.LOOP for kind in drive.graph.kind])
     a = np.clip(drive.graph.a + random.choice([-9, -7, 7, 9], len(loops)), 0, 239)[loops]
     b = drive.graph.b[loops]
-    a_from_b = geometry.between(drive.true[a], drive.true[b]) @ geometry.exp(
-        random.normal(size=(len(b), 6)) * CLOSURE_SIGMA
-    )
+    a_from_b = se3.between(drive.true[a], drive.true[b]) @ se3.exp(random.normal(size=(len(b), 6)) * CLOSURE_SIGMA)
     graph = drive.graph
     ends, poses = graph.a.copy(), graph.a_from_b.copy()
     ends[loops], poses[loops] = a, a_from_b

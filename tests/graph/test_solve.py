@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from tests.graph.drive import position_error, ring, without_loops
+from tests.graph.gtsam_graph import as_array, weighted
 from vplog.data import EdgeKind, PoseGraph, Solution
 from vplog.graph.consistency import chi2_quantile
 from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings
-
-from .drive import position_error, ring, without_loops
-from .gtsam_graph import as_array, weighted
 
 METHODS = [GncSettings(), LmSettings()]
 

@@ -11,13 +11,12 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.logs.drives import HEIGHT, WIDTH, Drive, ros_messages, write_ros2
+from tests.logs.test_rectification import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT, SIZE, check, drive
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs import TopicChoice
 from vplog.logs.calibration_file import camera_for, read_calibrations
-
-from .drives import HEIGHT, WIDTH, Drive, ros_messages, write_ros2
-from .test_stereo import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT, SIZE, check, drive
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.logs.drives import PERIOD_NS, START_NS, Drive, Written, ros_messages, store, write_ros1, write_ros2
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.select import TopicChoice
-
-from .drives import PERIOD_NS, START_NS, Drive, Written, ros_messages, store, write_ros1, write_ros2
+from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
     from pathlib import Path

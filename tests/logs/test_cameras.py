@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vplog.logs.message_records import CalibrationMessage
-from vplog.logs.ros_messages import decode_ros
-
-from .drives import store
+from tests.logs.drives import store
+from vplog.logs.messages.records import CalibrationMessage
+from vplog.logs.messages.ros import decode_ros
 
 K = np.array([[800.0, 0, 630.5], [0, 810.0, 470.25], [0, 0, 1]])
 

@@ -10,14 +10,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.logs.drives import (
+    LATENCY_NS,
+    START_NS,
+    Drive,
+    foxglove_messages,
+    ros_messages,
+    write_foxglove,
+    write_ros1,
+    write_ros2,
+)
 from vplog import logs
-from vplog.logs.containers import Notes
-from vplog.logs.message_records import PoseMessage
+from vplog.logs.formats.container import Notes
+from vplog.logs.messages.records import PoseMessage
 from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import Stamps, share_clock
 from vplog.logs.tracks import PoseTrack
-
-from .drives import LATENCY_NS, START_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros1, write_ros2
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.logs.drives import START_NS, Drive, ros_messages, write_ros2
 from vplog import logs
 from vplog.logs.clocks import on_one_clock
-from vplog.logs.containers import Notes
+from vplog.logs.formats.container import Notes
 from vplog.logs.stamps import Stamps, share_clock
-
-from .drives import START_NS, Drive, ros_messages, write_ros2
 
 if TYPE_CHECKING:
     from pathlib import Path

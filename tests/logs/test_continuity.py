@@ -8,12 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vplog import geometry
+from tests.logs.drives import START_NS, matrices, matrix
 from vplog.data import Odometry
-from vplog.logs.containers import Notes
+from vplog.geometry import se3
 from vplog.logs.continuity import find_jumps, without_jumps
-
-from .drives import START_NS, matrices, matrix
+from vplog.logs.formats.container import Notes
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -76,7 +75,7 @@ def test_jumps_are_found_and_the_motion_continues(seed: int, times: int, resets:
         way = rng.normal(size=3)
         shift = matrix(way / np.linalg.norm(way) * (200 + 100 * step_m), Rotation.from_rotvec(rng.normal(size=3) / 9))
         behind = shift @ poses[row + 1 :]
-        poses[row + 1 :] = geometry.inverse(poses[row + 1]) @ poses[row + 1 :] if resets else behind
+        poses[row + 1 :] = se3.inverse(poses[row + 1]) @ poses[row + 1 :] if resets else behind
     covariance = np.tile(np.eye(6), (len(true), 1, 1))
     near = np.linalg.norm(poses[rows + 1, :3, 3] - poses[rows, :3, 3], axis=1) < 50 + 50 * step_m
     if near.any():  # a reset close to zero is no jump that could be told
@@ -87,7 +86,7 @@ def test_jumps_are_found_and_the_motion_continues(seed: int, times: int, resets:
     assert np.flatnonzero(np.isnan(odometry.covariance).any((1, 2))).tolist() == (rows + 1).tolist()
     for first, stop in zip([0, *(rows + 1)], [*(rows + 1), len(true)], strict=True):  # every piece is as it was
         part = slice(first, stop)
-        was, now = (geometry.between(poses[first], poses[part]) for poses in (true, odometry.odom_from_body))
+        was, now = (se3.between(poses[first], poses[part]) for poses in (true, odometry.odom_from_body))
         np.testing.assert_allclose(now, was, atol=1e-6)
     assert path_m(odometry.odom_from_body) <= path_m(true) + 3 * times * step_m
     assert (

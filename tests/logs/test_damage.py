@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import zstandard
 
+from tests.logs.drives import Drive, foxglove_messages, ros_messages, write_foxglove, write_raw, write_ros1, write_ros2
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.compression import BadChunkError, unpack
-
-from .drives import Drive, foxglove_messages, ros_messages, write_foxglove, write_raw, write_ros1, write_ros2
+from vplog.logs.formats.compression import BadChunkError, unpack
 
 if TYPE_CHECKING:
     from collections.abc import Callable

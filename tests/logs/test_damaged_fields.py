@@ -13,19 +13,18 @@ import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags import rosbag1, rosbag2
 
+from tests.logs.drives import START_NS, store
+from tests.logs.log_fields import FIELDS
 from vplog.errors import LogError
-from vplog.logs.containers import Notes
 from vplog.logs.detect import open_container
-from vplog.logs.ros2_folder import Counted, read_metadata
-
-from .drives import START_NS, store
-from .log_fields import FIELDS
+from vplog.logs.formats.container import Notes
+from vplog.logs.formats.ros2_folder import Counted, read_metadata
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from .log_fields import Field
+    from tests.logs.log_fields import Field
 
 Messages = Counter[tuple[str, int, bytes]]
 """Topic, log time and bytes of each message."""

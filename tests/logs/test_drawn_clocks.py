@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from vplog.logs.containers import Notes
-from vplog.logs.message_records import PoseMessage
+from tests.logs.drives import START_NS
+from vplog.logs.formats.container import Notes
+from vplog.logs.messages.records import PoseMessage
 from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import Stamps, share_clock
 from vplog.logs.tracks import PoseTrack
-
-from .drives import START_NS
 
 if TYPE_CHECKING:
     from vplog.data import Ints

@@ -10,12 +10,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vplog import geodesy, logs
-from vplog.logs.containers import Notes
-from vplog.logs.message_records import FixMessage
+from tests.logs.drives import (
+    FRAMES,
+    START_NS,
+    Drive,
+    foxglove_messages,
+    ros_messages,
+    write_foxglove,
+    write_ros1,
+    write_ros2,
+)
+from vplog import logs
+from vplog.geometry import geodesy
+from vplog.logs.formats.container import Notes
+from vplog.logs.messages.records import FixMessage
 from vplog.logs.tracks import FixTrack
-
-from .drives import FRAMES, START_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros1, write_ros2
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,16 +15,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType
 from scipy.spatial.transform import Rotation
 
-from vplog import logs
-from vplog.errors import LogError
-from vplog.logs.containers import Channel
-from vplog.logs.image_folder import ImageFolder, stamps_of
-from vplog.logs.message_records import PoseMessage
-from vplog.logs.messages import decode
-from vplog.logs.odometry_message import read_odometry
-from vplog.stages import Log
-
-from .drives import (
+from tests.logs.drives import (
     FRAMES,
     HEIGHT,
     START_NS,
@@ -40,6 +31,14 @@ from .drives import (
     write_ros1,
     write_ros2,
 )
+from vplog import logs
+from vplog.errors import LogError
+from vplog.logs.formats.container import Channel
+from vplog.logs.image_folder import ImageFolder, stamps_of
+from vplog.logs.messages.decode import decode
+from vplog.logs.messages.odometry import read_odometry
+from vplog.logs.messages.records import PoseMessage
+from vplog.stages import Log
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,8 +11,8 @@ from mcap.writer import CompressionType, Writer
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.containers import Channel, Notes
-from vplog.logs.mcap_file import McapFile
+from vplog.logs.formats.container import Channel, Notes
+from vplog.logs.formats.mcap_file import McapFile
 
 if TYPE_CHECKING:
     from pathlib import Path

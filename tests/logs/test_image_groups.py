@@ -13,7 +13,7 @@ import pytest
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.select import TopicChoice
+from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

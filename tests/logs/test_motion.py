@@ -12,12 +12,11 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from scipy.spatial.transform import Rotation, Slerp
 
+from tests.logs.drives import START_NS, Written, matrices, matrix, store, write_foxglove, write_ros1, write_ros2
 from vplog import logs
 from vplog.errors import LogError
+from vplog.geometry.tum import write_tum
 from vplog.logs import TopicChoice
-from vplog.tum import write_tum
-
-from .drives import START_NS, Written, matrices, matrix, store, write_foxglove, write_ros1, write_ros2
 
 if TYPE_CHECKING:
     from pathlib import Path

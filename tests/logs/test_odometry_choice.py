@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.logs.drives import START_NS, Written, matrices, write_ros2
+from tests.logs.test_motion import image, pose_message, tf
 from vplog import logs
-from vplog.info import preflight
 from vplog.logs import TopicChoice
 from vplog.logs.tracks import PoseTrack
-
-from .drives import START_NS, Written, matrices, write_ros2
-from .test_motion import image, pose_message, tf
+from vplog.verbs.info import preflight
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,12 +15,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from rosbags.highlevel import AnyReader
 
+from tests.logs.drives import PERIOD_NS, START_NS, Written, store, write_foxglove, write_ros1, write_ros2
 from vplog import logs
-from vplog.cores import limited
-from vplog.extract import map_in_order
-from vplog.logs.select import TopicChoice
-
-from .drives import PERIOD_NS, START_NS, Written, store, write_foxglove, write_ros1, write_ros2
+from vplog.execution.cores import limited
+from vplog.features.extraction import map_in_order
+from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
     from collections.abc import Callable

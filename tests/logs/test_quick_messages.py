@@ -14,14 +14,13 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vplog.logs.containers import Channel
-from vplog.logs.fix_message import read_fix
-from vplog.logs.image_message import read_image
-from vplog.logs.message_records import BadMessageError
-from vplog.logs.messages import decode_generally, stamp_of
-from vplog.logs.odometry_message import read_poses
-
-from .drives import store
+from tests.logs.drives import store
+from vplog.logs.formats.container import Channel
+from vplog.logs.messages.decode import decode_generally, stamp_of
+from vplog.logs.messages.image_views import read_image
+from vplog.logs.messages.navsatfix import read_fix
+from vplog.logs.messages.odometry import read_poses
+from vplog.logs.messages.records import BadMessageError
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Proto

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tests.benchmarks.reading import growth, repeat_drive, speed, write_drive
+from tests.logs.test_real_logs import data
 from vplog import logs
-
-from .test_real_logs import data
 
 if TYPE_CHECKING:
     from pathlib import Path

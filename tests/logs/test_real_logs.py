@@ -16,10 +16,10 @@ from rosbags import rosbag1
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.containers import Channel, Notes
-from vplog.logs.mcap_file import McapFile
-from vplog.logs.recorded import RecordedLog
-from vplog.logs.ros1_bag import Ros1Bag
+from vplog.logs.formats.container import Channel, Notes
+from vplog.logs.formats.mcap_file import McapFile
+from vplog.logs.formats.ros1_bag import Ros1Bag
+from vplog.logs.recorded_log import RecordedLog
 
 DATA = Path(os.environ.get("VPLOG_DATA", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
 

@@ -12,15 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from tests.logs.drives import LATENCY_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros2
 from vplog import logs
 from vplog.logs.cameras import body_from_camera, camera_of
-from vplog.logs.containers import Notes
-from vplog.logs.message_records import CalibrationMessage, PoseMessage, TransformMessage
+from vplog.logs.formats.container import Notes
+from vplog.logs.messages.records import CalibrationMessage, PoseMessage, TransformMessage
 from vplog.logs.stamps import Stamps, increasing, nearest
+from vplog.logs.static_transforms import FrameTree
 from vplog.logs.tracks import PoseTrack
-from vplog.logs.transforms import FrameTree
-
-from .drives import LATENCY_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros2
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Camera, Features, Keyframes
+from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import drive_of, verify_between
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from vplog.data import Closures, Floats
     from vplog.loops.verify import VerifySettings
 
-BODY_FROM_CAMERA = geometry.pose(
-    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, -0.1, 0.5])
-)
+BODY_FROM_CAMERA = se3.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, -0.1, 0.5]))
 """Body x forward, z up; the camera sits before and above the body's origin."""
 NOISE_PX = 0.5
 
@@ -59,8 +57,8 @@ def view(
 ) -> Features:
     """What `lens` sees at a pose: points with noise, descriptors nearly as stored, and `clutter` of neither."""
     real = lens if lens.matrix is not None else camera()
-    camera_from_world = geometry.inverse(world_from_body @ lens.body_from_camera)
-    seen = geometry.transform(camera_from_world, place.points)
+    camera_from_world = se3.inverse(world_from_body @ lens.body_from_camera)
+    seen = se3.transform(camera_from_world, place.points)
     pixels = undistort.project(real, seen) + rng.normal(0, noise_px, (len(seen), 2))
     inside = ((pixels > 0) & (pixels < [lens.width - 1, lens.height - 1])).all(axis=1) & (seen[:, 2] > 1.0)
     rows = np.flatnonzero(inside)[:most]
@@ -91,7 +89,7 @@ def empty(lens: Camera) -> Features:
 
 
 def pose(x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0) -> Floats:
-    return geometry.pose(geometry.so3_exp(np.array([0.0, pitch, yaw])), np.array([x, y, z]))
+    return se3.pose(se3.so3_exp(np.array([0.0, pitch, yaw])), np.array([x, y, z]))
 
 
 def keyframes(poses: Sequence[Floats]) -> Keyframes:

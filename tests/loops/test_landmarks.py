@@ -5,12 +5,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from vplog import geometry
+from tests.loops.scene import NOISE_PX, Scene, camera, keyframes, pose, scene, view
+from vplog.features.matching import MatchSettings
+from vplog.geometry import se3
 from vplog.loops import landmarks, undistort
 from vplog.loops.landmarks import LandmarkSettings, landmarks_of
-from vplog.loops.matching import MatchSettings
-
-from .scene import NOISE_PX, Scene, camera, keyframes, pose, scene, view
 
 if TYPE_CHECKING:
     from vplog.data import Camera, Features
@@ -20,7 +19,7 @@ EXACT = LandmarkSettings(pixel_sigma=NOISE_PX)
 
 def truth_of(place: Scene, world_from_body: np.ndarray, lens: Camera, features: Features) -> np.ndarray:
     """(M,) true inverse depth of each feature by its descriptor, NaN for clutter."""
-    seen = geometry.transform(geometry.inverse(world_from_body @ lens.body_from_camera), place.points)
+    seen = se3.transform(se3.inverse(world_from_body @ lens.body_from_camera), place.points)
     pixels = undistort.project(lens, seen)
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(features.points[:, None] - pixels[None], axis=2)
@@ -37,7 +36,7 @@ def test_triangulated_depths_are_as_good_as_they_claim(model: tuple[str, list[fl
     poses = [pose(1.5 * i, 0.1 * i, yaw=0.02 * i) for i in range(5)]
     views = [view(place, p, lens, rng) for p in poses]
     # the odometry errs; the window's bundle adjustment has to make up for it
-    noisy = [p @ geometry.exp(np.concatenate([rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3)])) for p in poses]
+    noisy = [p @ se3.exp(np.concatenate([rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3)])) for p in poses]
     found = landmarks_of(2, keyframes(noisy), lens, views.__getitem__, MatchSettings(), EXACT)
     assert not found.from_depth
     assert found.known.sum() > 200
@@ -63,8 +62,8 @@ def test_a_camera_that_stands_still_knows_no_depth(moved: float) -> None:
 def test_a_turn_on_the_spot_knows_no_depth() -> None:
     rng = np.random.default_rng(5)
     lens, place = camera(), scene(rng)
-    swing = geometry.inverse(lens.body_from_camera)
-    poses = [lens.body_from_camera @ geometry.exp(np.array([0, 0.05 * i, 0, 0, 0, 0])) @ swing for i in range(5)]
+    swing = se3.inverse(lens.body_from_camera)
+    poses = [lens.body_from_camera @ se3.exp(np.array([0, 0.05 * i, 0, 0, 0, 0])) @ swing for i in range(5)]
     views = [view(place, p, lens, rng) for p in poses]
     found = landmarks_of(2, keyframes(poses), lens, views.__getitem__, MatchSettings(), EXACT)
     assert found.tracked > 100
@@ -93,7 +92,7 @@ def test_depth_has_the_sensors_noise() -> None:
 
 def test_derivatives_agree_with_differences() -> None:
     rng = np.random.default_rng(7)
-    views = geometry.exp(rng.normal(0, 0.1, (3, 6)))
+    views = se3.exp(rng.normal(0, 0.1, (3, 6)))
     points = np.column_stack([rng.uniform(-0.5, 0.5, (4, 2)), rng.uniform(0.05, 0.5, 4)])
     observed = np.zeros((3, 4, 2))
     residual, by_point, by_view = landmarks._linearise(points, observed, views)
@@ -102,5 +101,5 @@ def test_derivatives_agree_with_differences() -> None:
         moved, _, _ = landmarks._linearise(points + step * np.eye(3)[axis], observed, views)
         np.testing.assert_allclose(by_point[..., axis], (moved - residual) / step, atol=1e-5)
     for axis in range(6):
-        moved, _, _ = landmarks._linearise(points, observed, views @ geometry.exp(step * np.eye(6)[axis]))
+        moved, _, _ = landmarks._linearise(points, observed, views @ se3.exp(step * np.eye(6)[axis]))
         np.testing.assert_allclose(by_view[..., axis], (moved - residual) / step, atol=1e-5)

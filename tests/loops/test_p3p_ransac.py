@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vplog import geometry
+from vplog.geometry import se3
 from vplog.loops import p3p_ransac
 
 
 def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    moved = geometry.transform(pose, points)
+    moved = se3.transform(pose, points)
     return moved[:, :2] / moved[:, 2:]
 
 
@@ -18,7 +18,7 @@ def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 def test_the_pose_is_found_among_wrong_matches(wrong: int) -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform([-3, -3, 2], [3, 3, 10], (60, 3))
-    true = geometry.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
+    true = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
     seen = project(true, points)
     seen[:wrong] = rng.uniform(-0.5, 0.5, (wrong, 2))
     found = p3p_ransac.find_pose(points, seen, 0.005, 500)

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.loops.scene import keyframes, pose
 from vplog.data import Ranking
 from vplog.loops.propose import ProposeSettings, candidate_stops, propose
-
-from .scene import keyframes, pose
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

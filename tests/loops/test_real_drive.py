@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog import geometry
+from tests.loops.scene import proposals, verify
 from vplog.data import Camera, Features, Keyframes, Verdict
+from vplog.geometry import se3
 from vplog.loops.verify import VerifySettings
-
-from .scene import proposals, verify
 
 DATA = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "drives"
 REVISITS, OPPOSITE = [(787, 64), (789, 66), (811, 90)], [(700, 290), (705, 287)]
@@ -27,7 +26,7 @@ def stamp_of(header: object) -> int:
 
 def pose_of(pose: object) -> np.ndarray:
     p, q = pose.position, pose.orientation  # type: ignore[attr-defined]
-    return geometry.pose(geometry.rotation(np.array([q.x, q.y, q.z, q.w])), np.array([p.x, p.y, p.z]))
+    return se3.pose(se3.rotation(np.array([q.x, q.y, q.z, q.w])), np.array([p.x, p.y, p.z]))
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +51,12 @@ def kitti() -> tuple[Keyframes, Camera, np.ndarray, dict[int, bytes]]:
             elif connection.topic.endswith("camera_info") and len(stamps) < 2:
                 matrix = reader.deserialize(raw, connection.msgtype).k.reshape(3, 3)  # type: ignore[attr-defined]
     at = np.array(stamps)
-    forward = geometry.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+    forward = se3.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
     camera = Camera("cam0", matrix, "plumb_bob", np.zeros(5), 1241, 376, forward)
-    driven = geometry.interpolate_at(np.array([s for s, _ in odometry]), np.array([p for _, p in odometry]), at)
+    driven = se3.interpolate_at(np.array([s for s, _ in odometry]), np.array([p for _, p in odometry]), at)
     tum = np.loadtxt(DATA / "kitti00.groundtruth.tum")
-    truth = geometry.pose(geometry.rotation(tum[:, 4:8]), tum[:, 1:4])
-    truth = geometry.interpolate_at(
-        np.round(tum[:, 0] * 1e9).astype(np.int64), truth, np.minimum(at, int(tum[-1, 0] * 1e9))
-    )
+    truth = se3.pose(se3.rotation(tum[:, 4:8]), tum[:, 1:4])
+    truth = se3.interpolate_at(np.round(tum[:, 0] * 1e9).astype(np.int64), truth, np.minimum(at, int(tum[-1, 0] * 1e9)))
     return Keyframes("kitti00", at, driven), camera, truth, images
 
 
@@ -90,11 +87,11 @@ def test_a_real_revisit_is_found_and_the_opposite_direction_is_not(
     assert Verdict.ACCEPTED not in ledger.verdict[3:]
     assert (ledger.reverse_inliers[:3] >= 20).all()
     assert ledger.scale[:3] == ["odometry"] * 3
-    found, true = ledger.match_from_query[:3], geometry.between(truth[ledger.match[:3]], truth[ledger.query[:3]])
-    error = geometry.between(true, found)
+    found, true = ledger.match_from_query[:3], se3.between(truth[ledger.match[:3]], truth[ledger.query[:3]])
+    error = se3.between(true, found)
     # the drive's own truth is a metre and a degree off between the two passes, as two laps of satellite fixes are
     assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 1.5
-    assert np.rad2deg(geometry.angle(error)).max() < 2.5
+    assert np.rad2deg(se3.angle(error)).max() < 2.5
     # a car comes back on the same road, not 0.7 m below it as the truth has it
     slope_m = 0.03 * np.abs(found[:, 0, 3])
     assert (np.abs(found[:, 2, 3]) < 0.05 + slope_m).all()
@@ -112,9 +109,9 @@ def test_neighbouring_revisits_agree_as_closely_as_they_claim(
     ledger = verify(proposals(REVISITS[:2]), frames, camera, seen.__getitem__, settings)
     assert ledger.verdict == [Verdict.ACCEPTED] * 2
     (first, second), (query, match) = ledger.match_from_query, (ledger.query, ledger.match)
-    along = geometry.between(truth[query[1]], truth[query[0]])
-    carried = geometry.between(truth[match[0]], truth[match[1]]) @ second @ along
-    error = geometry.log(geometry.between(carried, first))
-    move = geometry.adjoint(geometry.inverse(along))
+    along = se3.between(truth[query[1]], truth[query[0]])
+    carried = se3.between(truth[match[0]], truth[match[1]]) @ second @ along
+    error = se3.log(se3.between(carried, first))
+    move = se3.adjoint(se3.inverse(along))
     noise = np.linalg.inv(ledger.information)
     assert np.sqrt(error @ np.linalg.inv(noise[0] + move @ noise[1] @ move.T) @ error / 6) < 2.0

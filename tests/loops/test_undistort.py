@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.loops.scene import camera
 from vplog.errors import LogError
 from vplog.loops import undistort
-
-from .scene import camera
 
 LENSES = [
     ("none", []),

@@ -6,14 +6,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from vplog import geometry
+from tests.loops.scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, verify, view
 from vplog.data import Camera, Closures, Features, Keyframes, Verdict
 from vplog.errors import LogError
+from vplog.geometry import se3
 from vplog.loops.landmarks import LandmarkSettings
 from vplog.loops.verify import VerifySettings
 from vplog.loops.verify_metric import MetricSettings
-
-from .scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, verify, view
 
 EXACT = VerifySettings(landmarks=LandmarkSettings(pixel_sigma=NOISE_PX, depth_share=0.0))
 COLUMNS = ("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread", "reverse_inliers")
@@ -41,9 +40,7 @@ def lap_pairs() -> list[tuple[int, int]]:
 
 def sigmas(ledger: Closures, poses: np.ndarray) -> np.ndarray:
     """(C,) Mahalanobis distance to the truth over sqrt(6)."""
-    error = geometry.log(
-        geometry.between(geometry.between(poses[ledger.match], poses[ledger.query]), ledger.match_from_query)
-    )
+    error = se3.log(se3.between(se3.between(poses[ledger.match], poses[ledger.query]), ledger.match_from_query))
     return np.sqrt(np.einsum("ni,nij,nj->n", error, ledger.information, error) / 6)
 
 
@@ -63,9 +60,9 @@ def test_revisits_are_found_with_the_pose_and_the_certainty_they_have(depth: boo
         match_from_query=ledger.match_from_query[rows],
         information=ledger.information[rows],
     )
-    moved = geometry.between(geometry.between(poses[part.match], poses[part.query]), part.match_from_query)
+    moved = se3.between(se3.between(poses[part.match], poses[part.query]), part.match_from_query)
     assert np.median(np.linalg.norm(moved[:, :3, 3], axis=1)) < 0.05
-    assert np.median(geometry.angle(moved)) < 0.003
+    assert np.median(se3.angle(moved)) < 0.003
     assert np.isfinite(part.information).all()
     np.testing.assert_allclose(part.information, np.swapaxes(part.information, 1, 2))
     assert (np.linalg.eigvalsh(part.information) > 0).all()
@@ -105,8 +102,8 @@ def test_both_ways_agree_and_are_together_no_worse_than_one(depth: bool) -> None
     assert (one.reverse_inliers == -1).all()
     assert {s for s, a in zip(both.scale, accepted, strict=True) if a} == {"depth" if depth else "odometry"}
     assert {s for s, a in zip(both.scale, accepted, strict=True) if not a} <= {"none"}
-    true = geometry.between(poses[both.match[accepted]], poses[both.query[accepted]])
-    error = [geometry.log(geometry.between(true, ledger.match_from_query[accepted])) for ledger in (both, one)]
+    true = se3.between(poses[both.match[accepted]], poses[both.query[accepted]])
+    error = [se3.log(se3.between(true, ledger.match_from_query[accepted])) for ledger in (both, one)]
     size = [np.sqrt((e[:, 3:] ** 2).sum(1).mean()) for e in error]
     assert size[0] < 1.1 * size[1]
 
@@ -120,7 +117,7 @@ def test_two_ways_that_disagree_are_inconsistent() -> None:
     wrong = verify(proposals(pairs), keyframes(list(stretched)), lens, seen.__getitem__, sure)
     alone = sure.model_copy(update={"both_ways": False})
     one_way = verify(proposals(pairs), keyframes(list(stretched)), lens, seen.__getitem__, alone)
-    moved = np.linalg.norm(geometry.between(poses[wrong.match], poses[wrong.query])[:, :3, 3], axis=1)
+    moved = np.linalg.norm(se3.between(poses[wrong.match], poses[wrong.query])[:, :3, 3], axis=1)
     far = np.array([v is Verdict.ACCEPTED for v in one_way.verdict]) & (moved > 0.8)
     assert far.sum() >= 4
     for row in np.flatnonzero(far):
@@ -202,8 +199,8 @@ def test_a_map_camera_that_did_not_move_has_no_scale(still: str) -> None:
     rng = np.random.default_rng(12)
     lens, place = camera(), scene(rng)
     swing = 0.04 if still == "turning" else 0.0
-    about = geometry.inverse(lens.body_from_camera)
-    poses = [lens.body_from_camera @ geometry.exp(np.array([0.0, swing * i, 0, 0, 0, 0])) @ about for i in range(5)] + [
+    about = se3.inverse(lens.body_from_camera)
+    poses = [lens.body_from_camera @ se3.exp(np.array([0.0, swing * i, 0, 0, 0, 0])) @ about for i in range(5)] + [
         pose(0.3, 0.4)
     ]
     seen = [view(place, p, lens, rng) for p in poses]

@@ -12,16 +12,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tests.results.example import COUNT, make_run
-from vplog import tum
-from vplog.maps import keys
-from vplog.maps import store as map_store
+from vplog.geometry import tum
+from vplog.maps.storage import drive_ids, map_store
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Floats
-    from vplog.maps.store import Store
+    from vplog.maps.storage.map_store import Store
 
 LIBRARY, OTHER_LIBRARY = "a" * 64, "b" * 64
 PLACES = COUNT
@@ -51,7 +50,7 @@ def write_run(
     run_record.write_run_json(folder / "run.json", {"finished": True, "settings": {"seed": seed}, "gps": gps})
     made_from = {"drive": drive, "inputs": {"log": f"sha256 of {seed}"}, "library": library, "topics": {}}
     log = f"/logs/{seed}/{drive.partition('-')[0]}.mcap"
-    run_record.write_run_json(folder / "drive.json", {**made_from, "key": keys.key_of(made_from), "log": log})
+    run_record.write_run_json(folder / "drive.json", {**made_from, "key": drive_ids.key_of(made_from), "log": log})
     return folder
 
 

@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any
 import pyarrow.dataset as ds
 import pytest
 
+from tests.maps.bucket import serving
+from tests.maps.runs import LIBRARY, PLACES, make_map, put, put_library, seeds
 from vplog.errors import ResultError, SettingsError
-from vplog.maps import bucket_lock, objects, sending
-from vplog.maps import store as map_store
-from vplog.maps.damage import UnreachableError, without_damaged
 from vplog.maps.info import describe_map
-from vplog.remote import located
-
-from .bucket import serving
-from .runs import LIBRARY, PLACES, make_map, put, put_library, seeds
+from vplog.maps.storage import lease_lock, map_store, objects, upload
+from vplog.maps.storage.damage import UnreachableError, without_damaged
+from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -110,8 +108,8 @@ def test_a_writer_stopped_anywhere_leaves_the_old_drive_or_the_new(root: Any, mo
     """Before one of its requests; then nothing more comes from it, not even that it gives the lock back."""
     make_map(root, {"one": 1})
     ticks = count()
-    monkeypatch.setattr(bucket_lock, "_release", lambda _: None)
-    monkeypatch.setattr(bucket_lock, "_started", lambda _: str(next(ticks)))  # every holder's process has ended
+    monkeypatch.setattr(lease_lock, "_release", lambda _: None)
+    monkeypatch.setattr(lease_lock, "_started", lambda _: str(next(ticks)))  # every holder's process has ended
     before = len(names(root))
     # 8 files come first, then the manifest, 5 tables, and away with what was replaced
     for step in (9, 10, 15):
@@ -129,7 +127,7 @@ def test_a_writer_stopped_anywhere_leaves_the_old_drive_or_the_new(root: Any, mo
 
             for name in ("send", "put", "copy", "remove"):
                 patch.setattr(objects, name, stepping(getattr(objects, name)))
-            patch.setattr(sending, "_SENT_AT_ONCE", 1)
+            patch.setattr(upload, "_SENT_AT_ONCE", 1)
             with pytest.raises(ResultError, match="killed"):
                 put(store, "one", 9)
         [found] = same_state(root)["one"]
@@ -158,7 +156,7 @@ def test_what_nobody_names_goes_after_a_day(root: Any, monkeypatch: pytest.Monke
         write_rest(store, "1")
     assert left.exists()
     assert any("two" in name for name in names(root))
-    monkeypatch.setattr(sending, "_LEFT_OVER", -sending._LEFT_OVER)
+    monkeypatch.setattr(upload, "_LEFT_OVER", -upload._LEFT_OVER)
     for _ in range(2):
         with map_store.writing(root) as store:
             assert (store.root / "joint.json").read_text() == "1", "which its manifest names"
@@ -192,7 +190,7 @@ def test_data_sets_of_what_joins_drives_are_as_their_manifest(root: Any) -> None
     with map_store.writing(root) as store:
         write_rest(store, "1", "joint/component=a/poses.parquet")
     with pytest.MonkeyPatch.context() as patch, map_store.writing(root) as store:
-        patch.setattr(sending, "_after_rest", lambda *_: None)
+        patch.setattr(upload, "_after_rest", lambda *_: None)
         shutil.rmtree(store.root / "joint")
         write_rest(store, "2")
     assert objects.get(root / "joint.json") == b"1"
@@ -273,19 +271,19 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (len(entered), len(refused)) == (1, 3)
     assert all("Another vplog process" in text for text in refused)
 
-    monkeypatch.setattr(bucket_lock, "_release", lambda _: None)
+    monkeypatch.setattr(lease_lock, "_release", lambda _: None)
     with map_store.writing(root) as gone:  # it ends without giving its lock back
         pass
-    monkeypatch.setattr(bucket_lock, "_machine", lambda: "another machine")
+    monkeypatch.setattr(lease_lock, "_machine", lambda: "another machine")
     with pytest.raises(SettingsError, match=r"expires within 1\d\d s"), map_store.writing(root):
         pass
-    monkeypatch.setattr(bucket_lock, "LEASE_S", -1.0)
-    monkeypatch.setattr(bucket_lock, "RENEWALS", -20)
+    monkeypatch.setattr(lease_lock, "LEASE_S", -1.0)
+    monkeypatch.setattr(lease_lock, "RENEWALS", -20)
     with map_store.writing(root) as store:
         put(store, "two", 2)
         lock = gone.mirror.lock  # pyright: ignore[reportOptionalMemberAccess]
         assert lock is not None
-        bucket_lock._write(lock, lock.tag)
+        lease_lock._write(lock, lock.tag)
         gone.staging.mkdir(parents=True)
         with pytest.raises(ResultError, match="taken"):
             put(gone, "two", 3)
@@ -295,8 +293,8 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_store_that_decides_nothing(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lock is a name that stays; nothing breaks even where two write the same drive at once."""
-    monkeypatch.setattr(bucket_lock, "LEASE_S", 36_000.0)  # whose renewal would see that the lock is another's
-    monkeypatch.setattr(bucket_lock, "_SETTLE_S", 0.0)
+    monkeypatch.setattr(lease_lock, "LEASE_S", 36_000.0)  # whose renewal would see that the lock is another's
+    monkeypatch.setattr(lease_lock, "_SETTLE_S", 0.0)
     monkeypatch.setattr(objects, "decides", lambda _: False)
     make_map(root, {"one": 1})
     with map_store.writing(root) as store:
@@ -319,7 +317,7 @@ KILLED = """
 import os, signal, sys
 from tests.maps.runs import put
 from vplog.maps import objects, store
-from vplog.remote import located
+from vplog.storage.remote_path import located
 with store.writing(located(sys.argv[1])) as writer:
     put(writer, "one", 2)
     send, sent = objects.send, []
@@ -361,13 +359,13 @@ def test_what_is_no_map_is_one_line(root: Any, verb: Callable[..., Said]) -> Non
         {"generation": "../../.."}, {"files": {"../../up": files["run.json"]}}, {"files": {"/up": files["run.json"]}},
         {"files": {"run.json": {"bytes": "many", "sha256": ""}}}, {"replaces": "../runs"}, {"files": []},
     ):  # fmt: skip
-        sending.put_json(manifest, {**sound, **change})
+        upload.put_json(manifest, {**sound, **change})
         assert "not a manifest" in verb("map", "info", place, "--json").json["damaged"]["one"]
     for about in ({"bytes": 3}, {"sha256": "0" * 64}):
         changed = {**files, "run.json": {**files["run.json"], **about}}
-        sending.put_json(manifest, {**sound, "files": changed})
+        upload.put_json(manifest, {**sound, "files": changed})
         assert "does not have the length and sha256" in verb("map", "info", place, "--json").json["damaged"]["one"]
-    sending.put_json(manifest, sound)
+    upload.put_json(manifest, sound)
     objects.remove(place / "runs" / "drive=one" / sound["generation"])
     assert "has lost files" in verb("map", "info", place, "--json").json["damaged"]["one"]
 

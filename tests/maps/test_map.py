@@ -12,14 +12,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from vplog.maps import store as map_store
-from vplog.maps.keys import drive_names
-from vplog.maps.query import search
+from tests.maps.runs import put_rows
+from vplog.maps.search.query import search
+from vplog.maps.storage import map_store
+from vplog.maps.storage.drive_ids import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
-
-from .runs import put_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,13 +15,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from vplog import geodesy, geometry
+from tests.maps.runs import KIND, LIBRARY, OTHER_LIBRARY, PLACES, make_map, put, put_library
 from vplog.data import Gps
-from vplog.maps import store as map_store
+from vplog.geometry import geodesy, se3
+from vplog.maps.storage import map_store
 from vplog.results import run_record, tables
 from vplog.results.places_map import read_map
-
-from .runs import KIND, LIBRARY, OTHER_LIBRARY, PLACES, make_map, put, put_library
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,13 +29,13 @@ if TYPE_CHECKING:
     from conftest import Said
 
     Verb = Callable[..., Said]
-TURNED = geometry.pose(geometry.so3_exp(np.array([0.0, 0.0, 0.7])), np.array([5.0, -3.0, 2.0]))
+TURNED = se3.pose(se3.so3_exp(np.array([0.0, 0.0, 0.7])), np.array([5.0, -3.0, 2.0]))
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Two drives on earth, the second 3 km east of the first, and one that is nowhere."""
-    far = TURNED @ geometry.pose(np.eye(3), np.array([-3000.0, 0.0, 0.0]))
+    far = TURNED @ se3.pose(np.eye(3), np.array([-3000.0, 0.0, 0.0]))
     with map_store.writing(tmp_path / "map") as store:
         put_library(store)
         put(store, "near", 1, world_from_enu=TURNED)
@@ -85,7 +84,7 @@ def test_geoparquet_says_where_every_place_is(root: Path, verb: Verb, tmp_path: 
     enu = geodesy.local_enu(Gps(np.arange(len(rows)), rows[:, 1], rows[:, 0], rows[:, 2], unknown)).enu_m[1:]
     _, world = tables.read_keyframes(root / "runs" / "drive=near" / "keyframes.parquet")
     near = np.array([drive == "near" for drive, _ in places(out)])
-    np.testing.assert_allclose(geometry.transform(TURNED, enu[near]), world[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(se3.transform(TURNED, enu[near]), world[:, :3, 3], atol=1e-5)
     assert np.all(enu[~near, 0] - enu[near, 0].mean() > 2900)
     query = "select drive, count(*) from read_parquet(?) group by 1 order by 1"
     assert duckdb.execute(query, [str(out)]).fetchall() == [("far", PLACES), ("near", PLACES)]

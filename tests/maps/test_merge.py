@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Any
 import pyarrow.parquet as pq
 import pytest
 
+from tests.maps.runs import LIBRARY, OTHER_LIBRARY, make_map, put, seeds
 from vplog.errors import ResultError
-from vplog.maps import keys
-from vplog.maps import store as map_store
 from vplog.maps.merge import merge_maps
+from vplog.maps.storage import drive_ids, map_store
 from vplog.results import run_record
-
-from .runs import LIBRARY, OTHER_LIBRARY, make_map, put, seeds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,7 +55,9 @@ def test_drives_come_as_they_are_and_those_whose_name_is_taken_get_a_number(verb
     for drive, record in store.drives().items():
         assert set(pq.read_table(store.run(drive) / "keyframes.parquet")["drive"].to_pylist()) == {drive}
         made_from = {name: record[name] for name in ("drive", "inputs", "library", "topics")}
-        assert record["key"] == keys.key_of(made_from), "which is that of a batch, so that it leaves the drive as it is"
+        assert record["key"] == drive_ids.key_of(made_from), (
+            "which is that of a batch, so that it leaves the drive as it is"
+        )
     assert "6 drives" not in verb("map", "info", both).out
     again = verb("map", "merge", b, a, "-o", both, "--json").json
     assert {state for _, _, state in states(again)} == {"there already"}

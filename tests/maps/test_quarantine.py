@@ -11,17 +11,16 @@ import pytest
 
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
+from tests.maps.runs import PLACES, make_map
 from vplog.errors import ResultError
-from vplog.maps import store as map_store
-from vplog.maps.damage import damaged_files, left_out, without_damaged
-from vplog.maps.index import update_index
-from vplog.maps.joint_record import read_joint, write_joint
-from vplog.maps.layout import drive_record
-from vplog.maps.store import Store, folder_name
+from vplog.maps.joining.joint_record import read_joint, write_joint
+from vplog.maps.search.index import update_index
+from vplog.maps.storage import map_store
+from vplog.maps.storage.damage import damaged_files, left_out, without_damaged
+from vplog.maps.storage.layout import drive_record
+from vplog.maps.storage.map_store import Store, folder_name
 from vplog.places.bobb import BobbSettings
 from vplog.results import run_record
-
-from .runs import PLACES, make_map
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.maps.bucket import serving
+from tests.maps.runs import make_map, put, seeds
+from tests.maps.storage.test_map_store import forked
 from vplog.errors import ResultError, VplogError
-from vplog.maps import bucket_lock, objects
-from vplog.maps import store as map_store
 from vplog.maps.remove import remove_drives
-from vplog.remote import located
-
-from .bucket import serving
-from .runs import make_map, put, seeds
-from .test_store import forked
+from vplog.maps.storage import lease_lock, map_store, objects
+from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -181,7 +179,7 @@ def test_a_removal_on_a_store_that_fails_anywhere_takes_all_or_none(
     server: None, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     ticks, outcomes = count(), set[bool]()
-    monkeypatch.setattr(bucket_lock, "_started", lambda _: str(next(ticks)))  # every holder's process has ended
+    monkeypatch.setattr(lease_lock, "_started", lambda _: str(next(ticks)))  # every holder's process has ended
     # the record, the first drive's manifest, its files, its tables, the second's manifest and files; none
     for step in (1, 2, 3, 5, 11, 12, 1000):
         root: Any = located(f"s3://bucket/remove-{how.replace(' ', '-')}-{step}")

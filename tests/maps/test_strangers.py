@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import vplog
+from tests.maps.runs import LIBRARY, make_map
 from vplog.errors import ResultError
-from vplog.folders import check_regular, regular_files
-from vplog.maps.layout import folder_name
+from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
-
-from .runs import LIBRARY, make_map
+from vplog.storage.folders import check_regular, regular_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -212,9 +211,9 @@ def test_files_are_listed_in_order_and_what_goes_away_is_left_out(
 
 
 ALLOWED = {
-    "inputs.py": "logs are the user's own", "remote.py": "own scratch folders, and objects of a store",
-    "study/study.py": "code of the package", "maps/cache.py": "the user's own cache",
-    "run_folder.py": "names of cache files alone",
+    "cache/input_hashes.py": "logs are the user's own",
+    "storage/remote_path.py": "own scratch folders, and objects of a store",
+    "maps/storage/download_cache.py": "the user's own cache", "run/run_folder.py": "names of cache files alone",
 }  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from .pictures import SMALL, reference
+from tests.places.pictures import SMALL, reference
 
 if TYPE_CHECKING:
     from vplog.data import Reference

@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.places.pictures import noisy, nothing, reference
 from vplog.errors import LibraryError
 from vplog.places import expected_votes
 from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, Place, _rarity
 from vplog.places.code_search import CodeIndex
 from vplog.places.matches import WeighedMatchSettings, _itself, _weigh, index_references, large_enough
-
-from .pictures import noisy, nothing, reference
 
 if TYPE_CHECKING:
     from vplog.data import Reference

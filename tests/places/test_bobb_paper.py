@@ -11,13 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.places.literal import all_boxes
+from tests.places.pictures import SMALL, noisy, nothing, reference
 from vplog.data import Features
 from vplog.errors import LibraryError, SettingsError
 from vplog.places import rvp
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState, Place
-
-from .literal import all_boxes
-from .pictures import SMALL, noisy, nothing, reference
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.places.pictures import SMALL, noisy, nothing, reference
 from vplog.data import Reference
 from vplog.places import coverage as cov
-from vplog.references import LEAST_SIZE, LibrarySettings
-
-from .pictures import SMALL, noisy, nothing, reference
+from vplog.places.reference_choice import LEAST_SIZE, LibrarySettings
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Features

@@ -11,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from tests.places.pictures import noisy
 from vplog.errors import LibraryError
 from vplog.places.chow_liu import ChowLiuTree
 from vplog.places.fabmap import FabmapSettings, FabmapState
 from vplog.places.fabmap_model import Model, log_likelihood_table
 from vplog.places.vocabulary import Vocabulary
-
-from .pictures import noisy
 
 if TYPE_CHECKING:
     from vplog.data import Reference

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests.places.pictures import nothing
 from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.places.gist import GistSettings, gabor_filters
-
-from .pictures import nothing
 
 if TYPE_CHECKING:
     from vplog.data import Reference

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.places.pictures import noisy, nothing, reference
 from vplog.errors import LibraryError
 from vplog.places.bobb import BobbSettings, Place
 from vplog.places.dense import thumbnail_of
@@ -17,8 +18,6 @@ from vplog.places.hybrid import Described, HybridIndex, HybridSettings, HybridSt
 from vplog.places.matches import WeighedMatchSettings, patches_of
 from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift
-
-from .pictures import noisy, nothing, reference
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Features, Reference

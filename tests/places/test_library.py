@@ -12,12 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.places.pictures import SMALL, noisy, nothing, reference, texture
 from vplog.errors import LibraryError, SettingsError
 from vplog.places import library as lib
-from vplog.places import stored
+from vplog.places import library_files
 from vplog.places.bobb_paper import PaperBobbSettings
-
-from .pictures import SMALL, noisy, nothing, reference, texture
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -213,7 +212,7 @@ def test_flipped_bytes_are_refused_or_harmless(saved: Path) -> None:
         for at in [*rng.integers(0, len(data), 15), *rng.integers(len(data) - 1500, len(data), 25)]:
             (saved / name).write_bytes(data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :])
             try:
-                stored.load_references(saved)
+                library_files.load_references(saved)
             except LibraryError as error:
                 assert "\n" not in str(error)
                 refused += 1

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.places.pictures import nothing
 from vplog.data import THUMBNAIL_SIDE
 from vplog.errors import LibraryError
 from vplog.places import PlaceSettings
@@ -24,8 +25,6 @@ from vplog.places.hybrid import HybridSettings
 from vplog.places.thumbnail import ThumbnailSettings
 from vplog.places.vlad import VladSettings
 from vplog.stages import BoxState, CodedState
-
-from .pictures import nothing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

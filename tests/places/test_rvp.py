@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.places.literal import Picture, all_boxes, box_sum, cell_sums, dominant_sum, voting_image
+from tests.places.pictures import SMALL, noisy
 from vplog.places import bobb_paper as bobb
 from vplog.places import rvp
 from vplog.places.bobb_paper import PaperBobbSettings
-
-from .literal import Picture, all_boxes, box_sum, cell_sums, dominant_sum, voting_image
-from .pictures import SMALL, noisy
 
 if TYPE_CHECKING:
     from vplog.data import Int32s, Reference

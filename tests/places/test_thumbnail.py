@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tests.places.pictures import nothing
 from vplog.data import THUMBNAIL_SIDE
 from vplog.places.thumbnail import ThumbnailSettings
-
-from .pictures import nothing
 
 if TYPE_CHECKING:
     from vplog.data import Reference

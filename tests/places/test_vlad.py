@@ -8,11 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tests.places.pictures import nothing
 from vplog.errors import LibraryError
 from vplog.places.vlad import VladSettings, Whitening, aggregate
 from vplog.places.vocabulary import learn_vocabulary, root_sift
-
-from .pictures import nothing
 
 if TYPE_CHECKING:
     from vplog.data import Reference

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.places.pictures import reference
 from vplog.errors import LibraryError
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift
-
-from .pictures import reference
 
 
 def _blobs(blobs: int, each: int, seed: int = 0) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
+from vplog.geometry import se3
 from vplog.results.tables import TableMetadata
 
 if TYPE_CHECKING:
@@ -30,17 +30,17 @@ class Run:
 
 
 def random_poses(rng: np.random.Generator, count: int) -> Floats:
-    return geometry.exp(rng.normal(size=(count, 6)) * [1, 1, 1, 20, 20, 20])
+    return se3.exp(rng.normal(size=(count, 6)) * [1, 1, 1, 20, 20, 20])
 
 
 def make_run(seed: int = 0) -> Run:
     rng = np.random.default_rng(seed)
     turn = np.linspace(0.0, 2.0 * np.pi, COUNT)
-    odom = geometry.pose(
-        geometry.so3_exp(turn[:, None] * [0.0, 0.0, 1.0]),
+    odom = se3.pose(
+        se3.so3_exp(turn[:, None] * [0.0, 0.0, 1.0]),
         10.0 * np.stack([np.sin(turn), 1.0 - np.cos(turn), 0.0 * turn], axis=1),
     )
-    world = odom @ geometry.exp(0.03 * rng.normal(size=(COUNT, 6)))
+    world = odom @ se3.exp(0.03 * rng.normal(size=(COUNT, 6)))
     keyframes = Keyframes("a drive", 1_700_000_000_123_456_789 + 100_000_000 * np.arange(COUNT), odom)
     verdict = list(Verdict)
     count = len(verdict)
@@ -77,12 +77,12 @@ def make_run(seed: int = 0) -> Run:
         world_from_body=odom,
         a=np.concatenate([a, match[solved]]),
         b=np.concatenate([a + 1, query[solved]]).astype(np.int32),
-        a_from_b=np.concatenate([geometry.between(odom[a], odom[a + 1]), closures.match_from_query[solved]]),
+        a_from_b=np.concatenate([se3.between(odom[a], odom[a + 1]), closures.match_from_query[solved]]),
         information=square @ square.transpose(0, 2, 1) + np.eye(6),
         kind=[EdgeKind.ODOMETRY] * (COUNT - 1) + [EdgeKind.LOOP] * int(solved.sum()),
     )
     camera_axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    camera = Camera("front", None, "none", np.zeros(0), 640, 480, geometry.pose(camera_axes, np.array([1.0, 0.0, 0.5])))
+    camera = Camera("front", None, "none", np.zeros(0), 640, 480, se3.pose(camera_axes, np.array([1.0, 0.0, 0.5])))
     solution = Solution(world, rng.random(edges), 9.0, 1.0, 5, True, "The steps became small.")
     odometry = Odometry(keyframes.stamp_ns, odom, None)
     return Run(keyframes, graph, solution, closures, Trajectory(keyframes.stamp_ns, world), odometry, camera)

@@ -3,10 +3,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from vplog.parquet_bounds import TABLE_VERSION
 from vplog.pipeline import pipeline_schema
 from vplog.results import messages
 from vplog.results.contracts import table_schemas, write_schemas
+from vplog.storage.parquet_limits import TABLE_VERSION
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 

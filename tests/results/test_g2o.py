@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vplog import geometry
+from tests.results.example import make_run
 from vplog.data import EdgeKind, PoseGraph
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.results import g2o
 from vplog.results.g2o import read_g2o, write_g2o
-
-from .example import make_run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,8 +50,8 @@ def planar(poses: int, loops: int, seed: int) -> PoseGraph:
     information[:, 2:5, 2:5] = root @ np.swapaxes(root, 1, 2) + np.eye(3)
     kind = [EdgeKind.ODOMETRY] * (poses - 1) + [EdgeKind.LOOP] * loops
     some = [
-        geometry.pose(
-            geometry.so3_exp(np.stack([np.zeros(n), np.zeros(n), random.uniform(-np.pi, np.pi, n)], axis=1)),
+        se3.pose(
+            se3.so3_exp(np.stack([np.zeros(n), np.zeros(n), random.uniform(-np.pi, np.pi, n)], axis=1)),
             np.stack([*random.normal(size=(2, n)) * 1e3, np.zeros(n)], axis=1),
         )
         for n in (poses, len(a))
@@ -129,7 +128,7 @@ def test_spatial_information_is_turned_to_rotation_first(tmp_path: Path) -> None
     information = read.information[0]
     np.testing.assert_array_equal(np.diagonal(information), [16, 19, 21, 1, 7, 12])
     assert information[3, 0] == information[0, 3] == 4  # x with the turn about x
-    np.testing.assert_allclose(geometry.quaternion(read.a_from_b[0, :3, :3]), [0, 0, 0.6, 0.8])
+    np.testing.assert_allclose(se3.quaternion(read.a_from_b[0, :3, :3]), [0, 0, 0.6, 0.8])
 
 
 def test_consecutive_ids_are_odometry_once(tmp_path: Path) -> None:

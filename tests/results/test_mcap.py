@@ -15,11 +15,10 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from vplog import geometry
+from tests.results.example import COUNT, METADATA, Run, make_run
 from vplog.data import Closures, EdgeKind, Keyframes, Verdict
+from vplog.geometry import se3
 from vplog.results.mcap import write_mcap
-
-from .example import COUNT, METADATA, Run, make_run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,8 +54,8 @@ def of(messages: list[tuple[str, int, Any]], topic: str) -> list[tuple[int, Any]
 
 
 def matrix(position: Any, quaternion: Any) -> Any:
-    rotation = geometry.rotation(np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w]))
-    return geometry.pose(rotation, np.array([position.x, position.y, position.z]))
+    rotation = se3.rotation(np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w]))
+    return se3.pose(rotation, np.array([position.x, position.y, position.z]))
 
 
 def test_every_record_is_whole_and_in_order_of_time(tmp_path: Path) -> None:
@@ -96,7 +95,7 @@ def test_paths_are_the_poses_in_the_map_frame(tmp_path: Path) -> None:
     poses = np.array([matrix(pose.position, pose.orientation) for pose in odometry[0][1].poses])
     np.testing.assert_allclose(poses[0], world[0], atol=1e-12)
     odom = RUN.keyframes.odom_from_body
-    np.testing.assert_allclose(geometry.between(poses[:1], poses), geometry.between(odom[:1], odom), atol=1e-12)
+    np.testing.assert_allclose(se3.between(poses[:1], poses), se3.between(odom[:1], odom), atol=1e-12)
 
 
 def test_transforms_put_the_body_in_the_map_and_the_camera_on_the_body(tmp_path: Path) -> None:

@@ -11,11 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.results.example import COUNT, METADATA, make_run
 from vplog.errors import ResultError
 from vplog.results import tables
 from vplog.results.places_map import read_map, write_map
-
-from .example import COUNT, METADATA, make_run
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.results.example import COUNT, METADATA, make_run
+from tests.results.test_mcap import decode, of
 from vplog.data import Gps, Verdict
 from vplog.errors import ResultError
 from vplog.results import geo, mcap_read
@@ -24,9 +26,6 @@ from vplog.results.contracts import TOPICS
 from vplog.results.mcap import camera_topic, write_mcap
 from vplog.results.previews import PictureSettings, Previews, jpeg, preview, scaled_size, shrink
 from vplog.results.shown import Earth, Explained, Shown
-
-from .example import COUNT, METADATA, make_run
-from .test_mcap import decode, of
 
 if TYPE_CHECKING:
     from vplog.data import Camera

@@ -10,13 +10,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.results.test_tables import write_all
-from tests.test_flipped_bits import plain, write_tables
-from vplog import parquet_bounds
+from tests.storage.test_flipped_bits import plain, write_tables
 from vplog.errors import NewerError, ResultError
-from vplog.parquet_bounds import VERSION_KEY
-from vplog.places.stored import read_library_record
+from vplog.places.library_files import read_library_record
 from vplog.results import tables
 from vplog.results.run_record import read_finished_run
+from vplog.storage import parquet_limits
+from vplog.storage.parquet_limits import VERSION_KEY
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +67,7 @@ def test_a_newer_vplog_reads_null_where_an_older_one_wrote_no_column(
 ) -> None:
     """And takes a version below its own."""
     path = write_all(tmp_path)[1]
-    monkeypatch.setattr(parquet_bounds, "TABLE_VERSION", 3)
+    monkeypatch.setattr(parquet_limits, "TABLE_VERSION", 3)
     newer = tables.CLOSURES.append(pa.field("mood", pa.string(), True))
     monkeypatch.setattr(tables, "CLOSURES", newer)
     assert tables.read_closure(path, 0)["mood"] is None

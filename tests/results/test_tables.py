@@ -10,12 +10,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from vplog import geometry
+from tests.results.example import COUNT, METADATA, make_run
 from vplog.data import Closures, Verdict
 from vplog.errors import ResultError
+from vplog.geometry import se3
 from vplog.results import tables
-
-from .example import COUNT, METADATA, make_run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -197,7 +196,7 @@ def test_quaternions_are_unit_with_w_not_negative(tmp_path: Path) -> None:
     q = np.stack([table[f"q{axis}"].to_numpy() for axis in "xyzw"], axis=1)
     assert (q[:, 3] >= 0).all()
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-15)
-    np.testing.assert_allclose(geometry.rotation(q), RUN.trajectory.world_from_body[:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(se3.rotation(q), RUN.trajectory.world_from_body[:, :3, :3], atol=1e-12)
 
 
 def test_reading_what_is_not_there_or_not_ours_is_one_line(tmp_path: Path) -> None:

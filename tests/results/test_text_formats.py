@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.results.example import COUNT, make_run, random_poses
 from vplog.data import Trajectory
 from vplog.evaluate.truth import read_truth
+from vplog.geometry.tum import seconds, write_tum
 from vplog.results.g2o import write_g2o
-from vplog.tum import seconds, write_tum
-
-from .example import COUNT, make_run, random_poses
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
 
-from .test_mcap import decode
-from .test_shown import write
+from tests.results.test_mcap import decode
+from tests.results.test_shown import write
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

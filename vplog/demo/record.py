@@ -13,11 +13,11 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from vplog.cores import allowed
 from vplog.demo import route
 from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
 from vplog.errors import ResultError
-from vplog.geometry import quaternion
+from vplog.execution.cores import allowed
+from vplog.geometry.se3 import quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

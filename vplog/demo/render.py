@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from vplog.geometry import inverse, transform
+from vplog.geometry.se3 import inverse, transform
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Camera, Float32s, Floats, Int32s

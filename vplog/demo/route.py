@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.geodesy import geodetic
-from vplog.geometry import between, exp, log, pose, so3_exp
+from vplog.geometry.geodesy import geodetic
+from vplog.geometry.se3 import between, exp, log, pose, so3_exp
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints

@@ -11,7 +11,7 @@ from vplog.data import Camera
 from vplog.demo import route
 from vplog.demo.render import Light, render
 from vplog.demo.world import World, build_world, traffic
-from vplog.geometry import pose
+from vplog.geometry.se3 import pose
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Float32s, Floats, Ints

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Trajectory
 from vplog.evaluate.pairs import around, poses_at
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints
@@ -75,14 +75,14 @@ class BodyTruth:
         left, right, at_ns = left[known], right[known], stamp_ns[known]
         moved = _at(self.odometry, at_ns)
         poses = [
-            truth.world_from_body[row] @ geometry.inverse(_at(self.odometry, truth.stamp_ns[row])) @ moved
+            truth.world_from_body[row] @ se3.inverse(_at(self.odometry, truth.stamp_ns[row])) @ moved
             for row in (left, right)
         ]
         share = (at_ns - truth.stamp_ns[left]) / np.maximum(truth.stamp_ns[right] - truth.stamp_ns[left], 1)
-        apart = geometry.between(poses[0], poses[1])
+        apart = se3.between(poses[0], poses[1])
         found, error = np.full((len(stamp_ns), 4, 4), np.nan), np.zeros((len(stamp_ns), 2))
-        found[known] = geometry.interpolate(poses[0], poses[1], share)
-        sizes = np.stack([geometry.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1)], axis=1)
+        found[known] = se3.interpolate(poses[0], poses[1], share)
+        sizes = np.stack([se3.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1)], axis=1)
         error[known] = np.hypot(np.sqrt(share * (1.0 - share))[:, None] * sizes, self.noise)
         return TruthAt(found, known, error)
 
@@ -97,7 +97,7 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     if len(rows) < 3 or len(odometry.stamp_ns) < 2:
         return BodyTruth(truth)
     true, moved = truth.world_from_body[rows], _at(odometry, truth.stamp_ns[rows])
-    turned = [geometry.angle(geometry.between(poses[:1], poses)).max() for poses in (true, moved)]
+    turned = [se3.angle(se3.between(poses[:1], poses)).max() for poses in (true, moved)]
     if turned[0] < np.radians(0.01) and turned[1] > np.radians(_LEAST_TURN_DEG):
         return BodyTruth(truth, oriented=False)
     frame, truth_from_body = _frame(true, moved, body_from_camera)
@@ -114,8 +114,8 @@ def _noise(truth: Trajectory, odometry: Trajectory) -> tuple[float, float]:
     at = even.at(truth.stamp_ns[1::2])
     if not at.known.any():
         return 0.0, 0.0
-    apart = geometry.between(at.world_from_body[at.known], truth.world_from_body[1::2][at.known])
-    sizes = np.stack([geometry.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1)], axis=1)
+    apart = se3.between(at.world_from_body[at.known], truth.world_from_body[1::2][at.known])
+    sizes = np.stack([se3.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1)], axis=1)
     rad, m = _NOISE_BOUND / np.sqrt(1.5) * np.median(sizes, axis=0)
     return float(rad), float(m)
 
@@ -123,20 +123,20 @@ def _noise(truth: Trajectory, odometry: Trajectory) -> tuple[float, float]:
 def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:
     """Poses at stamps, held at either end."""
     within = np.clip(stamp_ns, trajectory.stamp_ns[0], trajectory.stamp_ns[-1])
-    return geometry.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, within)
+    return se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, within)
 
 
 def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats]:
     """What the truth's poses (T, 4, 4) are of, by those of the odometry: a name, and truth_from_body (4, 4)."""
     step = max(1, len(true) // _MOTION_SHARE)
     first = np.unique(np.linspace(0, len(true) - 1 - step, _MOTIONS).astype(np.int64))
-    a, b = (geometry.between(poses[first], poses[first + step]) for poses in (true, moved))
+    a, b = (se3.between(poses[first], poses[first + step]) for poses in (true, moved))
     shift = np.linalg.norm(b[:, :3, 3], axis=1)
     weight = 1.0 / np.maximum(shift, max(float(shift.mean()), 1e-6))  # turns on the spot tell no share of a shift
     best, least = ("body", np.eye(4)), _BETTER * _disagreement(a, b, np.eye(4), weight)
     others = [("estimated", _hand_eye(a, b, weight))]
     if body_from_camera is not None:
-        others.insert(0, ("camera", geometry.inverse(body_from_camera)))
+        others.insert(0, ("camera", se3.inverse(body_from_camera)))
     for name, truth_from_body in others:
         apart = _disagreement(a, b, truth_from_body, weight)
         if apart < least:
@@ -154,7 +154,7 @@ def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
     lever, rotation, weight = np.zeros(3), np.eye(3), weight[:, None]
     for _ in range(3):  # turn and lever hardly depend on each other
         straight = a[:, :3, 3] + a[:, :3, :3] @ lever - lever
-        across = geometry.so3_log(a[:, :3, :3]).T @ geometry.so3_log(b[:, :3, :3])
+        across = se3.so3_log(a[:, :3, :3]).T @ se3.so3_log(b[:, :3, :3])
         across += (straight * weight).T @ (b[:, :3, 3] * weight)
         u, _, vt = np.linalg.svd(across + _PRIOR * np.linalg.norm(across) * np.eye(3))
         rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
@@ -162,10 +162,10 @@ def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
         rows = np.concatenate([size * (np.eye(3) - a[:, :3, :3]), moved[:, :, None]], axis=2) * weight[:, :, None]
         found = np.linalg.lstsq(rows.reshape(-1, 4), (a[:, :3, 3] * weight).reshape(-1), rcond=_LEAST_SHOWN)[0]
         lever = size * np.asarray(found[:3], np.float64)
-    return geometry.pose(rotation, lever)
+    return se3.pose(rotation, lever)
 
 
 def _disagreement(a: Floats, b: Floats, truth_from_body: Floats, weight: Floats) -> float:
     """Median of what the motions differ by, rad and shares of a shift."""
-    apart = geometry.between(truth_from_body @ b @ geometry.inverse(truth_from_body), a)
-    return float(np.median(np.hypot(geometry.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1) * weight)))
+    apart = se3.between(truth_from_body @ b @ se3.inverse(truth_from_body), a)
+    return float(np.median(np.hypot(se3.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1) * weight)))

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Closures, Floats
@@ -91,18 +91,18 @@ def pose_errors(
     posed &= query.known[closures.query] & match.known[closures.match]
     rows = np.flatnonzero(posed)
     there, here = closures.match[rows], closures.query[rows]
-    true = geometry.between(match.world_from_body[there], query.world_from_body[here])
+    true = se3.between(match.world_from_body[there], query.world_from_body[here])
     measured, claimed = closures.match_from_query[rows], _covariance(closures.information[rows])
     directed = np.array([closures.scale[row] == "none" for row in rows], bool)
     measured[directed] = _at_true_length(measured[directed], true[directed], *cameras)
     claimed[directed] = 0.0
-    apart = geometry.between(true, measured)
+    apart = se3.between(true, measured)
     # a truth that is turned at the match moves the query by as much at its distance
     lever = match.error[there, 0] * np.linalg.norm(true[:, :3, 3], axis=1)
     unsure = np.hypot(query.error[here], match.error[there])
     unsure[:, 1] = np.hypot(unsure[:, 1], lever)
     inside, maybe, honest = (np.ones(len(rows), bool) for _ in range(3))
-    for part, error in enumerate((geometry.so3_log(apart[:, :3, :3]), apart[:, :3, 3])):
+    for part, error in enumerate((se3.so3_log(apart[:, :3, :3]), apart[:, :3, 3])):
         covariance = claimed[:, 3 * part : 3 * part + 3, 3 * part : 3 * part + 3]
         size = np.maximum(np.linalg.norm(error, axis=1), 1e-12)
         left = error * np.maximum(1.0 - unsure[:, part] / size, 0.0)[:, None]
@@ -117,10 +117,10 @@ def pose_errors(
 def _at_true_length(measured: Floats, true: Floats, query_camera: Floats | None, match_camera: Floats | None) -> Floats:
     """Closures (R, 4, 4) whose step from camera to camera is as long as the true one."""
     into, out = (np.eye(4) if camera is None else camera for camera in (query_camera, match_camera))
-    measured, true = (geometry.inverse(out) @ one @ into for one in (measured, true))
+    measured, true = (se3.inverse(out) @ one @ into for one in (measured, true))
     length, wanted = (np.linalg.norm(one[:, :3, 3], axis=1, keepdims=True) for one in (measured, true))
     measured[:, :3, 3] *= wanted / np.maximum(length, 1e-12)
-    return out @ measured @ geometry.inverse(into)
+    return out @ measured @ se3.inverse(into)
 
 
 def _within(error: Floats, covariance: Floats, b: float) -> Bools:

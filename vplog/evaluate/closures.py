@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import TruthError
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes
@@ -253,7 +253,7 @@ def _score(
 def _heading_deg(a: Floats, b: Floats, a_axis: Floats | None, b_axis: Floats | None) -> Floats:
     """(R,) degrees between the optical axes of poses (R, 4, 4), or of their whole rotation."""
     if a_axis is None or b_axis is None:
-        return np.degrees(geometry.angle(geometry.between(a, b)))
+        return np.degrees(se3.angle(se3.between(a, b)))
     return np.degrees(np.arccos(np.clip(((a[:, :3, :3] @ a_axis) * (b[:, :3, :3] @ b_axis)).sum(1), -1.0, 1.0)))
 
 

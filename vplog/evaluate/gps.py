@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geodesy, geometry
 from vplog.errors import TruthError
 from vplog.evaluate.trajectory import Ate, aligned_error
+from vplog.geometry import geodesy, se3
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Gps, Ints, Trajectory
@@ -41,5 +41,5 @@ def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
             f"Only {inside.sum()} of {len(inside)} GPS fixes lie within the drive; 3 are needed. Give a TUM file with "
             "--truth."
         )
-    poses = geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
+    poses = se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
     return aligned_error(poses[:, :3, 3], positions[inside], alignment)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.errors import TruthError
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -188,7 +188,7 @@ def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
     poses[known & (left == right)] = truth.world_from_body[right[known & (left == right)]]
     between = known & (left != right)
     if between.any():
-        poses[between] = geometry.interpolate_at(truth.stamp_ns, truth.world_from_body, at_ns[between])
+        poses[between] = se3.interpolate_at(truth.stamp_ns, truth.world_from_body, at_ns[between])
     return poses, known
 
 

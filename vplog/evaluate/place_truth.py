@@ -13,7 +13,7 @@ from vplog.errors import TruthError
 from vplog.evaluate import pairs
 from vplog.evaluate.gps import local_enu
 from vplog.evaluate.truth import read_truth
-from vplog.urls import shown
+from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Verdict
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Closures, Floats, Ints, Keyframes
@@ -43,11 +43,11 @@ def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) 
     query, match = closures.query[rows], closures.match[rows]
     measured = closures.match_from_query[rows]
     covariance = np.asarray(np.linalg.inv(closures.information[rows]), np.float64)
-    to_truth = _normalised(geometry.between(poses[match], poses[query]), measured, covariance)
+    to_truth = _normalised(se3.between(poses[match], poses[query]), measured, covariance)
     this, following = _neighbours(query.astype(np.int64), match.astype(np.int64))
-    moved = geometry.between(poses[query[following]], poses[query[this]])  # the next query's frame from this one's
-    predicted = geometry.between(poses[match[following]], poses[match[this]]) @ measured[this] @ geometry.inverse(moved)
-    turned = geometry.adjoint(moved)
+    moved = se3.between(poses[query[following]], poses[query[this]])  # the next query's frame from this one's
+    predicted = se3.between(poses[match[following]], poses[match[this]]) @ measured[this] @ se3.inverse(moved)
+    turned = se3.adjoint(moved)
     both = covariance[following] + turned @ covariance[this] @ np.swapaxes(turned, 1, 2)
     to_neighbours = _normalised(predicted, measured[following], both)
     return ResidualScore(len(rows), _median(to_truth), len(this), _median(to_neighbours))
@@ -69,7 +69,7 @@ def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:
 
 
 def _normalised(expected: Floats, measured: Floats, covariance: Floats) -> Floats:
-    error = geometry.log(geometry.between(measured, expected))
+    error = se3.log(se3.between(measured, expected))
     chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
     return np.sqrt(np.maximum(chi2, 0.0) / 6.0)
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Trajectory
 from vplog.errors import TruthError
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -111,7 +111,7 @@ def at_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, bool]
     near, _ = _nearest(_seconds(at_ns), _seconds(estimate.stamp_ns))
     if len(truth.stamp_ns) >= len(estimate.stamp_ns) or 2 * len(near) >= len(at_ns):
         return estimate, False
-    poses = geometry.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns)
+    poses = se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns)
     return Trajectory(at_ns, poses), True
 
 
@@ -141,7 +141,7 @@ def ate(estimate: Trajectory, truth: Trajectory, alignment: str = "se3") -> Ate:
     estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
     if alignment != "origin":
         return aligned_error(estimated[:, :3, 3], true[:, :3, 3], alignment)
-    moved = true[0] @ geometry.inverse(estimated[0]) @ estimated
+    moved = true[0] @ se3.inverse(estimated[0]) @ estimated
     return _ate(moved[:, :3, 3] - true[:, :3, 3], alignment)
 
 
@@ -151,8 +151,8 @@ def aligned_error(estimate: Floats, truth: Floats, alignment: str = "se3") -> At
         raise TruthError(
             f"Only {len(estimate)} poses have a truth; an alignment needs 3. Give a truth that covers the drive."
         )
-    truth_from_estimate, scale = geometry.umeyama(estimate, truth, alignment == "sim3")
-    return _ate(geometry.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)
+    truth_from_estimate, scale = se3.umeyama(estimate, truth, alignment == "sim3")
+    return _ate(se3.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)
 
 
 def _ate(difference: Floats, alignment: str, scale: float = 1.0) -> Ate:
@@ -200,9 +200,9 @@ def rpe(estimate: Trajectory, truth: Trajectory) -> Rpe:
 
 def _relative_errors(estimated: Floats, true: Floats, first: Ints, last: Ints) -> Floats:
     """(S, 2) m and degrees by which the steps from rows `first` to rows `last` (S,) differ."""
-    steps = (geometry.between(poses[first], poses[last]) for poses in (true, estimated))
-    wrong = geometry.between(*steps)
-    return np.stack([np.linalg.norm(wrong[:, :3, 3], axis=1), np.degrees(geometry.angle(wrong))], axis=1)
+    steps = (se3.between(poses[first], poses[last]) for poses in (true, estimated))
+    wrong = se3.between(*steps)
+    return np.stack([np.linalg.norm(wrong[:, :3, 3], axis=1), np.degrees(se3.angle(wrong))], axis=1)
 
 
 def _rms(error: Floats) -> float:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from vplog.data import Trajectory
 from vplog.errors import TruthError
-from vplog.remote import located
-from vplog.tum import read_tum
+from vplog.geometry.tum import read_tum
+from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph, Verdict
 from vplog.errors import GraphError
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes
@@ -50,7 +50,7 @@ def build_graph(
     verdicts = closures.verdict if closures is not None else []
     rows = np.flatnonzero([verdict == Verdict.ACCEPTED for verdict in verdicts])
     a, b = np.arange(n - 1), np.arange(1, n)
-    a_from_b = geometry.between(poses[:-1], poses[1:])
+    a_from_b = se3.between(poses[:-1], poses[1:])
     information = np.linalg.inv(edge_covariances)
     if closures is not None and len(rows):
         match, query = closures.match[rows], closures.query[rows]

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from vplog import geometry
 from vplog.data import EdgeKind
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.descent import Objective
 from vplog.graph.factors import Factors
+from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances
-from vplog.graph.normal import edge_costs
+from vplog.graph.normal_equations import edge_costs
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph, Solution
@@ -86,11 +86,11 @@ class OdometryChain:
         # noise is told in the frame of an edge's b: moved to the later pose where that is a
         back = np.flatnonzero((leads >= 0) & (graph.a[leads] > graph.b[leads]))
         if len(back):
-            turned = geometry.adjoint(graph.a_from_b[leads[back]])[:, axes][:, :, axes]
+            turned = se3.adjoint(graph.a_from_b[leads[back]])[:, axes][:, :, axes]
             step[back] = turned @ step[back] @ np.swapaxes(turned, 1, 2)
         step[leads < 0] = 0.0
         # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
-        moved = geometry.adjoint(geometry.between(poses[:1], poses))[:, axes][:, :, axes]
+        moved = se3.adjoint(se3.between(poses[:1], poses))[:, axes][:, :, axes]
         total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
         part, variance = (
             np.cumsum(leads < 0).astype(np.int64),
@@ -102,7 +102,7 @@ class OdometryChain:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
         a, b = graph.a[loops], graph.b[loops]
         covariance = self.covariance(a, b) + np.linalg.inv(informed(graph)[loops])
-        error = geometry.log(geometry.between(graph.a_from_b[loops], geometry.between(self.poses[a], self.poses[b])))
+        error = se3.log(se3.between(graph.a_from_b[loops], se3.between(self.poses[a], self.poses[b])))
         error = error[:, self.axes]
         chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
         return np.where(self.part[a] == self.part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
@@ -117,7 +117,7 @@ class OdometryChain:
 
     def covariance(self, a: Int32s, b: Int32s) -> Floats:
         """(L, d, d) of a_from_b by odometry, in the frame of b, to first order."""
-        back = geometry.adjoint(geometry.between(self.poses[b], self.poses[:1]))[:, self.axes][:, :, self.axes]
+        back = se3.adjoint(se3.between(self.poses[b], self.poses[:1]))[:, self.axes][:, :, self.axes]
         sign = np.where(a < b, 1.0, -1.0)[:, None, None]  # a loop may be written either way round
         return back @ (sign * (self.total[b] - self.total[a])) @ np.swapaxes(back, 1, 2)
 
@@ -134,7 +134,7 @@ def odometry_chain(graph: PoseGraph) -> tuple[Floats, Ints]:
     leads[np.maximum(graph.a[edges], graph.b[edges])] = edges
     step = graph.a_from_b[leads]
     back = (leads >= 0) & (graph.a[leads] > graph.b[leads])
-    step[back] = geometry.inverse(step[back])
+    step[back] = se3.inverse(step[back])
     poses = np.array(graph.world_from_body)
     _chain(poses, step, leads)
     return poses, leads

@@ -9,7 +9,7 @@ import numpy as np
 
 from vplog.data import EdgeKind
 from vplog.graph.build import parts
-from vplog.graph.elimination import Elimination
+from vplog.graph.sparse.symbolic import Elimination
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints, PoseGraph

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from vplog.graph.agreement import agreement
 from vplog.graph.build import checked
 from vplog.graph.consistency import (
     OdometryChain,
@@ -27,14 +26,15 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
-from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
+from vplog.graph.least_squares import descend
 from vplog.graph.lm import solve_weighted
+from vplog.graph.odometry_mixture import agreement
+from vplog.graph.outlier_test import Scrutiny
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
-from vplog.graph.scrutiny import Scrutiny
-from vplog.graph.workers import Workers
+from vplog.graph.sparse.workers import Workers
 from vplog.settings import Settings
 
 if TYPE_CHECKING:

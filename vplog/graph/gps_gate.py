@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.graph.consistency import is_loop, odometry_chain, odometry_kept
-from vplog.graph.satellites import chi2_of_fixes, world_from_enu
+from vplog.graph.gps_factors import chi2_of_fixes, world_from_enu
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph, Solution
-    from vplog.graph.satellites import Fixes
+    from vplog.graph.gps_factors import Fixes
 
 _ROUNDS = 10
 """Alignments, each weighed by what the one before leaves; a jump of fixes loses its say within a few."""

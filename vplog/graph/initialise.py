@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
-from vplog.graph.descent import anchored
-from vplog.graph.fronts import Blocks
-from vplog.graph.linear import factorised
+from vplog.graph.least_squares import anchored
+from vplog.graph.sparse.frontal import Blocks
+from vplog.graph.sparse.linear import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
@@ -58,7 +58,7 @@ def _chordal(factors: Factors, weight: Floats) -> Floats:
     rotation = left @ turned
     firmness = weight * np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     shift = (rotation[graph.a] @ graph.a_from_b[:, :3, 3:])[:, :, 0]
-    return geometry.pose(rotation, _potentials(factors, weight, firmness, shift))
+    return se3.pose(rotation, _potentials(factors, weight, firmness, shift))
 
 
 def _potentials(factors: Factors, weight: Floats, firmness: Floats, difference: Floats) -> Floats:
@@ -99,7 +99,7 @@ def _lago(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
     yaw = yaw[0] + _potentials(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]
     zero = np.zeros(len(yaw))
-    poses = geometry.pose(geometry.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
+    poses = se3.pose(se3.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
     shift = (poses[graph.a, :2, :2] @ graph.a_from_b[:, :2, 3:])[:, :, 0]
     firmness = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
     poses[:, :2, 3] = _potentials(factors, weight, weight * firmness, shift)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
+from vplog.geometry import se3
 from vplog.graph.build import parts
 from vplog.graph.consistency import KNOWN_TO, is_loop, keep_odometry_if_worse, residual_sigma
 from vplog.graph.refine import RefineSettings, refine
@@ -229,12 +229,12 @@ def _placed(drives: Sequence[Drive], members: Sequence[int], between: Sequence[B
                 continue
             match = drives[one.earlier].graph.world_from_body[one.match]
             query = drives[one.later].graph.world_from_body[one.query]
-            earlier_from_later = match @ one.match_from_query @ geometry.inverse(query)
+            earlier_from_later = match @ one.match_from_query @ se3.inverse(query)
             middle = _middle(earlier_from_later)
             if known[1]:
                 placed[one.later] = placed[one.earlier] @ middle
             else:
-                placed[one.earlier] = placed[one.later] @ geometry.inverse(middle)
+                placed[one.earlier] = placed[one.later] @ se3.inverse(middle)
     return placed
 
 
@@ -242,8 +242,5 @@ def _middle(poses: Floats) -> Floats:
     """The one of the poses (L, 4, 4) with the least sum of distances to the others, a rad counting as 10 m; of many,
     among 500 evenly spread."""
     poses = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 500)).astype(int))]
-    apart = [
-        np.linalg.norm(geometry.log(geometry.between(pose, poses)) * [10, 10, 10, 1, 1, 1], axis=1).sum()
-        for pose in poses
-    ]
+    apart = [np.linalg.norm(se3.log(se3.between(pose, poses)) * [10, 10, 10, 1, 1, 1], axis=1).sum() for pose in poses]
     return poses[int(np.argmin(apart))]

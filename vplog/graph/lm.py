@@ -10,14 +10,14 @@ from pydantic import Field
 from vplog.data import Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.descent import descend
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
+from vplog.graph.least_squares import descend
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
-    from vplog.graph.descent import Fit
+    from vplog.graph.least_squares import Fit
 
 
 class LmSettings(Settings):

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
+from vplog.geometry import se3
 from vplog.graph.build import AXES
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
-    from vplog.graph.descent import Objective
     from vplog.graph.factors import Factors
-    from vplog.graph.linear import BayesTree, Supernodes
+    from vplog.graph.least_squares import Objective
+    from vplog.graph.sparse.linear import BayesTree, Supernodes
 
 
 def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats:
@@ -26,7 +26,7 @@ def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats
     graph = objective.factors.graph
     aa, ab, bb = objective.information(poses).inverse_blocks(graph.a[edges], graph.b[edges])
     axes = AXES[graph.dimension]
-    Ad = geometry.adjoint(geometry.between(poses[graph.b[edges]], poses[graph.a[edges]]))[:, axes][:, :, axes]
+    Ad = se3.adjoint(se3.between(poses[graph.b[edges]], poses[graph.a[edges]]))[:, axes][:, :, axes]
     mixed = Ad @ ab
     return bb - mixed - np.swapaxes(mixed, 1, 2) + Ad @ aa @ np.swapaxes(Ad, 1, 2)
 
@@ -39,7 +39,7 @@ def joint_covariance(factors: Factors, information: Supernodes | BayesTree, pose
     ends = np.stack([graph.a[edges], graph.b[edges]], axis=1)
     nodes = np.unique(ends).astype(np.int64)
     covariance = information.joint_inverse(nodes)
-    Ad = geometry.adjoint(geometry.between(poses[ends[:, 1]], poses[ends[:, 0]]))[:, axes][:, :, axes]
+    Ad = se3.adjoint(se3.between(poses[ends[:, 1]], poses[ends[:, 0]]))[:, axes][:, :, axes]
     jacobian = np.zeros((len(edges) * size, len(covariance)))
     for row, (a, b) in enumerate(np.searchsorted(nodes, ends).tolist()):
         part = slice(row * size, (row + 1) * size)

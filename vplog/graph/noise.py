@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -153,9 +153,9 @@ def _unknown(what: str, settings: NoiseSettings) -> str:
 
 def _drift_model(odometry: Odometry, keys: Ints, settings: NoiseSettings) -> Floats:
     """(N-1, 6, 6) diagonal: rule 1."""
-    step = geometry.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])
+    step = se3.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])
     metres = _travelled(odometry.stamp_ns, np.linalg.norm(step[:, :3, 3], axis=1), keys)
-    radians = _travelled(odometry.stamp_ns, geometry.angle(step), keys)
+    radians = _travelled(odometry.stamp_ns, se3.angle(step), keys)
     reach_m, reach_rad = min(settings.memory_m, metres.sum()), min(settings.memory_rad, radians.sum())
     t = settings.floor_m**2 + settings.drift_per_metre**2 * reach_m * metres
     r = settings.floor_rad**2 + settings.turn_per_metre**2 * reach_m * metres
@@ -189,12 +189,12 @@ def _sum(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     sample = np.searchsorted(stamps, ends, "left")  # the increment that ends at this sample
     share = np.diff(cuts) / (stamps[sample] - stamps[sample - 1])
     edge = np.searchsorted(keys, ends, "left") - 1
-    key_pose = geometry.interpolate_at(stamps, odometry.odom_from_body, keys[1:])
+    key_pose = se3.interpolate_at(stamps, odometry.odom_from_body, keys[1:])
     result = np.zeros((len(keys) - 1, 6, 6))
     for start in range(0, len(ends), _CHUNK):
         part = slice(start, start + _CHUNK)
-        pose = geometry.interpolate_at(stamps, odometry.odom_from_body, ends[part])
-        moved = geometry.adjoint(geometry.between(key_pose[edge[part]], pose))
+        pose = se3.interpolate_at(stamps, odometry.odom_from_body, ends[part])
+        moved = se3.adjoint(se3.between(key_pose[edge[part]], pose))
         noise = moved @ (share[part, None, None] * logged[sample[part]]) @ np.swapaxes(moved, 1, 2)
         first = np.flatnonzero(np.diff(edge[part], prepend=-1))  # edges in order, so each one's pieces are a run
         result[edge[part][first]] += np.add.reduceat(noise, first, axis=0)
@@ -207,10 +207,10 @@ def _difference(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     right = np.clip(np.searchsorted(stamps, keys), 1, len(stamps) - 1)
     share = ((keys - stamps[right - 1]) / (stamps[right] - stamps[right - 1]))[:, None, None]
     at_key = (1 - share) * logged[right - 1] + share * logged[right]
-    poses = geometry.interpolate_at(stamps, odometry.odom_from_body, keys)
-    b_from_a = geometry.between(poses[1:], poses[:-1])
-    moved = geometry.adjoint(b_from_a)
-    turned = geometry.adjoint(geometry.pose(b_from_a[:, :3, :3], np.zeros(3)))
+    poses = se3.interpolate_at(stamps, odometry.odom_from_body, keys)
+    b_from_a = se3.between(poses[1:], poses[:-1])
+    moved = se3.adjoint(b_from_a)
+    turned = se3.adjoint(se3.pose(b_from_a[:, :3, :3], np.zeros(3)))
     exact = at_key[1:] - moved @ at_key[:-1] @ np.swapaxes(moved, 1, 2)
     plain = at_key[1:] - turned @ at_key[:-1] @ np.swapaxes(turned, 1, 2)
     least, most = np.moveaxis(np.linalg.eigvalsh((exact + np.swapaxes(exact, 1, 2)) / 2)[:, [0, -1]], -1, 0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
+from vplog.geometry import se3
 from vplog.graph.build import AXES, checked, informed
 from vplog.graph.clique import largest_clique
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
@@ -91,13 +91,13 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChai
     # written from the earlier to the later pose, so that two that are written either way round compare
     a, b = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
     back = (graph.a[loops] > graph.b[loops])[:, None, None]
-    measured = np.where(back, geometry.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
-    at_a, at_b = (geometry.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
-    displaced = at_a @ measured @ geometry.inverse(at_b)
-    at_end = geometry.adjoint(np.where(back, at_a, at_b))[:, axes][:, :, axes]
+    measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
+    at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
+    displaced = at_a @ measured @ se3.inverse(at_b)
+    at_end = se3.adjoint(np.where(back, at_a, at_b))[:, axes][:, :, axes]
     noise = at_end @ np.linalg.inv(informed(graph)[loops]) @ np.swapaxes(at_end, 1, 2)
     # what happens before the displacement, seen after it: the walk to a, and the noise of a closure written backwards
-    after = geometry.adjoint(geometry.inverse(displaced))[:, axes][:, :, axes]
+    after = se3.adjoint(se3.inverse(displaced))[:, axes][:, :, axes]
     noise = np.where(back, after @ noise @ np.swapaxes(after, 1, 2), noise)
     piece = np.stack([chain.part[a], chain.part[b]], axis=1)
     result = np.ones((len(loops), len(loops)), bool)
@@ -106,7 +106,7 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChai
     one, two = one[alike], two[alike]
     for first in range(0, len(one), _PAIRS):
         this, other = one[first : first + _PAIRS], two[first : first + _PAIRS]
-        error = geometry.log(geometry.between(displaced[this], displaced[other]))[:, axes]
+        error = se3.log(se3.between(displaced[this], displaced[other]))[:, axes]
         noise_a, noise_b = (
             np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None]
             * (chain.total[end[other]] - chain.total[end[this]])

@@ -15,14 +15,14 @@ from pydantic import Field
 
 from vplog.errors import GraphError
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, redundancy, residual_sigma
-from vplog.graph.descent import Objective, minimised
 from vplog.graph.factors import Factors
-from vplog.graph.satellites import Fixes, chi2_of_fixes, inlier_fixes, with_fixes, world_from_enu
+from vplog.graph.gps_factors import Fixes, chi2_of_fixes, inlier_fixes, with_fixes, world_from_enu
+from vplog.graph.least_squares import Objective, minimised
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, PoseGraph, Solution
-    from vplog.graph.satellites import GpsSettings
+    from vplog.graph.gps_factors import GpsSettings
 
 _STEP = 1e-4
 """Of the scale, for differences: far above rounding, far below what any drive tells."""

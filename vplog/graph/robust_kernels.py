@@ -11,9 +11,9 @@ from pydantic import Field
 
 from vplog.graph.build import checked
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.descent import Loss, Objective, minimised
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
+from vplog.graph.least_squares import Loss, Objective, minimised
 from vplog.graph.lm import as_solution
 from vplog.settings import Settings
 

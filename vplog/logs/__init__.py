@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vplog.logs.select import TopicChoice
+from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from vplog import geometry
 from vplog.errors import LogError
-from vplog.logs.message_records import CalibrationMessage
+from vplog.geometry import se3
+from vplog.logs.messages.records import CalibrationMessage
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -88,7 +88,7 @@ def _cameras(tree: Any) -> list[CalibratedCamera]:
     for number, (name, part) in enumerate(chain):
         step = _pose(part["T_cn_cnm1"]) if "T_cn_cnm1" in part else None
         from_first = from_first if number == 0 else (None if step is None or from_first is None else step @ from_first)
-        placed = geometry.inverse(_pose(part["T_cam_imu"])) if "T_cam_imu" in part else None
+        placed = se3.inverse(_pose(part["T_cam_imu"])) if "T_cam_imu" in part else None
         topic = _text(part.get("rostopic"))
         found.append(CalibratedCamera(_text(name), topic, _intrinsics(part), from_first, placed))
     return found
@@ -129,7 +129,7 @@ def _pose(value: Any) -> Floats:
     if np.abs(turn @ turn.T - np.eye(3)).max() > _ROUNDED or np.linalg.det(turn) < 0:
         raise _BadCalibrationError("a transform in it is not rigid (a rotation and a translation)")
     u, _, v = np.linalg.svd(turn)  # the nearest rotation: digits were cut
-    return geometry.pose(u @ v, values[:3, 3])
+    return se3.pose(u @ v, values[:3, 3])
 
 
 def _matrix(value: Any, count: int | None) -> Floats:

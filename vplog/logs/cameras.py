@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Camera
-from vplog.logs.containers import Notes
+from vplog.logs.formats.container import Notes
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.logs.message_records import CalibrationMessage
-    from vplog.logs.transforms import FrameTree
+    from vplog.logs.messages.records import CalibrationMessage
+    from vplog.logs.static_transforms import FrameTree
 
 _MODELS = {
     "plumb_bob": "plumb_bob",

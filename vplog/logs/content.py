@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.containers import Notes, plural
 from vplog.logs.continuity import without_jumps
+from vplog.logs.formats.container import Notes, plural
 from vplog.logs.gather import Calibrations, Gathered, Images
-from vplog.logs.moving import MovingFrames
 from vplog.logs.odometry_sources import choose_odometry, read_sources, weigh_sources
 from vplog.logs.stamps import nearest, share_clock
+from vplog.logs.static_transforms import FrameTree
+from vplog.logs.tf_odometry import MovingFrames
 from vplog.logs.tracks import FixTrack, PoseTrack
-from vplog.logs.transforms import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry, OdometrySource
-    from vplog.logs.containers import Channel, Container, Place
-    from vplog.logs.message_records import CalibrationMessage
-    from vplog.logs.select import Selection
+    from vplog.logs.formats.container import Channel, Container, Place
+    from vplog.logs.messages.records import CalibrationMessage
+    from vplog.logs.topic_selection import Selection
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from vplog import geometry
-from vplog.logs.containers import plural
+from vplog.geometry import se3
+from vplog.logs.formats.container import plural
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints, Odometry
-    from vplog.logs.containers import Notes
+    from vplog.logs.formats.container import Notes
 
 _ACCELERATION_M_S2 = 10.0
 """m/s^2; tyres hold 1 g, and little has more for longer than a moment:"""
@@ -42,8 +42,8 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
     if len(stamp_ns) < _LEAST:
         return np.zeros(0, np.int64)
     seconds = np.diff(stamp_ns) / 1e9
-    step = geometry.between(poses[:-1], poses[1:])
-    turns, way = geometry.so3_log(step[:, :3, :3]), step[:, :3, 3]
+    step = se3.between(poses[:-1], poses[1:])
+    turns, way = se3.so3_log(step[:, :3, :3]), step[:, :3, 3]
     departure_rad, departure_m = (_departure(steps, seconds) for steps in (turns, way))
     usual_s = np.minimum(seconds, max(_GAP_S, float(np.median(seconds)))).mean()  # the mean: stamps of bursts crowd
     least_s = np.maximum(seconds, usual_s)
@@ -124,17 +124,17 @@ def _continued(stamp_ns: Ints, poses: Floats, rows: Ints) -> Floats:
         onward = np.eye(4)
         if row and row - 1 not in rows:
             share = (stamp_ns[row + 1] - stamp_ns[row]) / (stamp_ns[row] - stamp_ns[row - 1])
-            before = geometry.log(geometry.between(poses[row - 1], poses[row])[None])
-            onward = geometry.exp(before * min(share, _TIMES))[0]
-        result[row + 1 : stop] = result[row] @ onward @ geometry.inverse(poses[row + 1]) @ poses[row + 1 : stop]
+            before = se3.log(se3.between(poses[row - 1], poses[row])[None])
+            onward = se3.exp(before * min(share, _TIMES))[0]
+        result[row + 1 : stop] = result[row] @ onward @ se3.inverse(poses[row + 1]) @ poses[row + 1 : stop]
     return result
 
 
 def _sentence(stamp_ns: Ints, poses: Floats, rows: Ints, what: str) -> str:
     named = []
     for row in rows[:_NAMED].tolist():
-        step = geometry.between(poses[row], poses[row + 1])
-        metres, degrees = np.linalg.norm(step[:3, 3]), np.degrees(geometry.angle(step))
+        step = se3.between(poses[row], poses[row + 1])
+        metres, degrees = np.linalg.norm(step[:3, 3]), np.degrees(se3.angle(step))
         named.append(f"{metres:.1f} m and {degrees:.0f} deg at {(stamp_ns[row + 1] - stamp_ns[0]) / 1e9:.1f} s")
     more = f" and {len(rows) - _NAMED} times more" if len(rows) > _NAMED else ""
     return (

@@ -8,23 +8,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs import image_folder, mcap_file, ros1_bag, sqlite_bag
-from vplog.logs.containers import Notes, plural
+from vplog.logs import image_folder
+from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
+from vplog.logs.formats.container import Notes, plural
+from vplog.logs.formats.mcap_file import McapFile
+from vplog.logs.formats.ros1_bag import Ros1Bag
+from vplog.logs.formats.ros2_folder import (
+    Chain,
+    Counted,
+    Metadata,
+    MetadataError,
+    ZstdMessages,
+    read_metadata,
+    split_parts,
+)
+from vplog.logs.formats.sqlite_bag import SqliteBag
+from vplog.logs.formats.zstd_file import fetched, unpacked
 from vplog.logs.image_folder import ImageFolder
-from vplog.logs.mcap_file import McapFile
-from vplog.logs.packed import fetched, unpacked
-from vplog.logs.parts import Part, in_order_of_time
-from vplog.logs.recorded import RecordedLog
-from vplog.logs.ros1_bag import Ros1Bag
-from vplog.logs.ros2_folder import Chain, Counted, Metadata, MetadataError, ZstdMessages, read_metadata, split_parts
-from vplog.logs.sqlite_bag import SqliteBag
-from vplog.remote import RemotePath, located
+from vplog.logs.recorded_log import RecordedLog
+from vplog.logs.split_recording import Part, in_order_of_time
+from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vplog.logs.containers import Container
-    from vplog.logs.select import TopicChoice
+    from vplog.logs.formats.container import Container
+    from vplog.logs.topic_selection import TopicChoice
     from vplog.stages import Log
 
 _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}

@@ -12,19 +12,19 @@ import numpy as np
 from vplog.data import Frame
 from vplog.errors import LogError
 from vplog.logs.cameras import camera_from_image
-from vplog.logs.image_message import read_image
-from vplog.logs.images import depth_m, grey
-from vplog.logs.message_records import BadMessageError, ImageMessage
-from vplog.logs.messages import decode
+from vplog.logs.messages.decode import decode
+from vplog.logs.messages.image_views import read_image
+from vplog.logs.messages.pixels import depth_m, grey
+from vplog.logs.messages.records import BadMessageError, ImageMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from vplog.data import Bytes, Camera, Float32s, Floats
-    from vplog.logs.containers import Channel, Notes, Octets
-    from vplog.logs.images import Levels
-    from vplog.logs.message_records import CalibrationMessage
-    from vplog.logs.stereo import Pair
+    from vplog.logs.formats.container import Channel, Notes, Octets
+    from vplog.logs.messages.pixels import Levels
+    from vplog.logs.messages.records import CalibrationMessage
+    from vplog.logs.rectification import Pair
 
 
 def image_in(channel: Channel, data: Octets) -> ImageMessage:

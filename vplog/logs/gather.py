@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.containers import Message, plural
-from vplog.logs.losses import Runs
-from vplog.logs.message_records import (
+from vplog.logs.formats.container import Message, plural
+from vplog.logs.formats.loss_account import Runs
+from vplog.logs.messages.decode import decode, stamp_of
+from vplog.logs.messages.odometry import read_poses
+from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
     FixMessage,
@@ -18,15 +20,13 @@ from vplog.logs.message_records import (
     PoseMessage,
     TransformMessage,
 )
-from vplog.logs.messages import decode, stamp_of
-from vplog.logs.moving import MovingFrames
-from vplog.logs.odometry_message import read_poses
 from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import NONE, Stamps
+from vplog.logs.tf_odometry import MovingFrames
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.containers import Block, Channel, Notes, Octets, Place
+    from vplog.logs.formats.container import Block, Channel, Notes, Octets, Place
     from vplog.logs.tracks import FixTrack, PoseTrack
 
 _SMALL = 512

@@ -13,12 +13,12 @@ import numpy as np
 
 from vplog.data import Frame, LogInfo, Topic
 from vplog.errors import LogError
-from vplog.logs.beside import Beside
 from vplog.logs.cameras import camera_of
 from vplog.logs.frames import affine_to_camera, warped
 from vplog.logs.image_groups import of_one_camera
-from vplog.logs.images import drive_levels, grey, spread
-from vplog.logs.message_records import BadMessageError, ImageMessage
+from vplog.logs.messages.pixels import drive_levels, grey, spread
+from vplog.logs.messages.records import BadMessageError, ImageMessage
+from vplog.logs.sidecar_files import Beside
 from vplog.logs.stamps import increasing, rate_hz, rows_of
 
 if TYPE_CHECKING:
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Bytes, Camera, Gps, Ints, Odometry
-    from vplog.logs.containers import Notes
-    from vplog.logs.images import Levels
-    from vplog.logs.losses import Account, Loss
-    from vplog.logs.select import TopicChoice
+    from vplog.logs.formats.container import Notes
+    from vplog.logs.formats.loss_account import Account, Loss
+    from vplog.logs.messages.pixels import Levels
+    from vplog.logs.topic_selection import TopicChoice
 
 PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""

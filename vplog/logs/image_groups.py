@@ -6,7 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.image_file import PNG, image_size
+from vplog.storage.image_file import PNG, image_size
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import OdometrySource
-from vplog.logs.containers import Notes, plural
 from vplog.logs.continuity import find_jumps
-from vplog.logs.message_records import short_type
+from vplog.logs.formats.container import Notes, plural
+from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
-from vplog.logs.transforms import FrameTree
+from vplog.logs.static_transforms import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Ints, Odometry
-    from vplog.logs.containers import Channel
+    from vplog.logs.formats.container import Channel
     from vplog.logs.gather import Gathered
-    from vplog.logs.select import Selection
+    from vplog.logs.topic_selection import Selection
 
 _TYPES = {"nav_msgs/Odometry": 1.0, "foxglove.Odometry": 1.0, "geometry_msgs/PoseWithCovarianceStamped": 0.8}
 _OTHER_TYPE = 0.7

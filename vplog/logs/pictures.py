@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.containers import plural
+from vplog.logs.formats.container import plural
 from vplog.logs.frames import Decoded, Encoded, image_in
-from vplog.logs.images import drive_levels, grey, spread
-from vplog.logs.message_records import BadMessageError, ImageMessage
-from vplog.logs.messages import decode
-from vplog.logs.video import VideoStream
+from vplog.logs.messages.decode import decode
+from vplog.logs.messages.pixels import drive_levels, grey, spread
+from vplog.logs.messages.records import BadMessageError, ImageMessage
+from vplog.logs.messages.video import VideoStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from vplog.data import Float32s
-    from vplog.logs.containers import Channel, Container, Notes, Octets, Place
     from vplog.logs.content import Content
-    from vplog.logs.images import Levels
+    from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
+    from vplog.logs.messages.pixels import Levels
 
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Floats, Ints
-    from vplog.logs.containers import Notes
+    from vplog.logs.formats.container import Notes
     from vplog.logs.stamps import Stamps
 
 _TURNS = 3

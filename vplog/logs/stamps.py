@@ -10,8 +10,8 @@ import numpy as np
 
 from vplog.errors import LogError
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS, LATE_NS, LEAST_JUMP_NS, Clock, on_one_clock
-from vplog.logs.containers import Notes, plural
-from vplog.logs.losses import runs_of
+from vplog.logs.formats.container import Notes, plural
+from vplog.logs.formats.loss_account import runs_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Gps, Odometry
-from vplog.geodesy import local_enu
-from vplog.logs.containers import Notes, plural
-from vplog.logs.odometry_message import Poses
+from vplog.geometry import se3
+from vplog.geometry.geodesy import local_enu
+from vplog.logs.formats.container import Notes, plural
+from vplog.logs.messages.odometry import Poses
 from vplog.logs.stamps import Stamps
-from vplog.logs.transforms import are_usable, clean
+from vplog.logs.static_transforms import are_usable, clean
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.logs.message_records import FixMessage, PoseMessage
+    from vplog.logs.messages.records import FixMessage, PoseMessage
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
@@ -101,7 +101,7 @@ class PoseTrack:
         for start in range(0, len(rows), _BLOCK):  # or what is needed on the way would be several times the result
             part = slice(start, start + _BLOCK)
             values = logged[0][rows[part]]
-            poses[part] = geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
+            poses[part] = se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
             covariance[part] = body_covariance(poses[part], logged[1][rows[part]])
         usable = np.isfinite(covariance).all((1, 2))
         if usable.all():

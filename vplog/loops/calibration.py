@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
+from vplog.geometry import se3
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
     later = np.full(count, -1)
     for apart in range(settings.reach, 0, -1):  # from far to near, so that the nearest is kept
         if apart < count:
-            turn = geometry.angle(geometry.between(keyframes.odom_from_body[:-apart], keyframes.odom_from_body[apart:]))
+            turn = se3.angle(se3.between(keyframes.odom_from_body[:-apart], keyframes.odom_from_body[apart:]))
             fits = np.flatnonzero((turn > settings.angle) & (turn < 2.0 * settings.angle))
             later[fits] = fits + apart
     earlier = np.flatnonzero(later >= 0)
@@ -58,7 +58,7 @@ def rotation_share(driven: Floats, observed: Floats, settings: CalibrationSettin
     """
     if len(driven) < 8:  # the median of fewer says little
         return settings.least_share
-    expected, found = geometry.so3_log(driven[:, :3, :3]), geometry.so3_log(observed[:, :3, :3])
+    expected, found = se3.so3_log(driven[:, :3, :3]), se3.so3_log(observed[:, :3, :3])
     ratio = (found * expected).sum(axis=1) / (expected**2).sum(axis=1)
     return float(np.clip(abs(np.median(ratio) - 1.0), settings.least_share, settings.most_share))
 
@@ -69,7 +69,7 @@ def motion_covariance(match_from_query: Floats, share: float) -> Floats:
     It stretches rotation and translation, and what it does across them hangs on the scene: an error as long as the
     share of their length, in any direction.
     """
-    turned, moved = geometry.so3_log(match_from_query[:3, :3]), match_from_query[:3, 3]
+    turned, moved = se3.so3_log(match_from_query[:3, :3]), match_from_query[:3, 3]
     result = np.zeros((6, 6))
     result[:3, :3] = (turned @ turned) * np.eye(3)
     result[3:, 3:] = (moved @ moved) * np.eye(3)
@@ -81,7 +81,7 @@ def body_twists(keyframes: Keyframes) -> Floats:
     count = len(keyframes.stamp_ns)
     before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
     seconds = np.maximum((keyframes.stamp_ns[after] - keyframes.stamp_ns[before]) * 1e-9, 1e-9)
-    motion = geometry.log(geometry.between(keyframes.odom_from_body[before], keyframes.odom_from_body[after]))
+    motion = se3.log(se3.between(keyframes.odom_from_body[before], keyframes.odom_from_body[after]))
     return np.asarray(motion / seconds[:, None], np.float64)
 
 
@@ -90,5 +90,5 @@ def stamp_covariance(match_from_query: Floats, match_twist: Floats, query_twist:
 
     exp(x m) T exp(y q) = T exp(Ad(T^-1) m x + q y) to first order, for stamps wrong by x and y.
     """
-    moved = np.column_stack([geometry.adjoint(geometry.inverse(match_from_query)) @ match_twist, query_twist])
+    moved = np.column_stack([se3.adjoint(se3.inverse(match_from_query)) @ match_twist, query_twist])
     return sigma_s**2 * moved @ moved.T

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
 from vplog.data import Verdict
-from vplog.loops import two_way, undistort, verify_epipolar, verify_metric
+from vplog.features.matching import MatchSettings, first_matches, match_features
+from vplog.geometry import se3
+from vplog.loops import reverse_check, undistort, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
 from vplog.loops.landmarks import Landmarks, LandmarkSettings, inverse_depth, landmarks_of
-from vplog.loops.matching import MatchSettings, first_matches, match_features
 from vplog.loops.verify_epipolar import EpipolarSettings
 from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
@@ -121,7 +121,7 @@ def check_back(
         if row.pairs is None:
             raise ValueError("a row without a pose was to be checked the other way round")
         mine, found = row.pairs
-        there = None if row.pose.match_from_query is None else geometry.inverse(row.pose.match_from_query)
+        there = None if row.pose.match_from_query is None else se3.inverse(row.pose.match_from_query)
         back = _check_metric(earlier, earlier.features(match), found, mine, known, later.stereo, lenient, there)
         if back.landmarks < later.settings.metric.min_inliers:
             result.append(row)
@@ -181,10 +181,10 @@ def _of_both(pose: Pose, back: Pose, share: float) -> Pose:
     apart = replace(pose, verdict=Verdict.INCONSISTENT, match_from_query=None, covariance=None)
     if back.match_from_query is None or back.covariance is None:
         return apart
-    other, covariance = two_way.reversed_pose(back.match_from_query, back.covariance)
+    other, covariance = reverse_check.reversed_pose(back.match_from_query, back.covariance)
     # a wrong calibration bends the two ways differently, as their depths differ
     bent = pose.covariance + motion_covariance(pose.match_from_query, share)
-    if not two_way.agree(pose.match_from_query, bent, other, covariance):
+    if not reverse_check.agree(pose.match_from_query, bent, other, covariance):
         return apart
-    fused, joint = two_way.together(pose.match_from_query, pose.covariance, other, covariance)
+    fused, joint = reverse_check.together(pose.match_from_query, pose.covariance, other, covariance)
     return replace(pose, match_from_query=fused, covariance=joint)

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
-from vplog.loops import matching, undistort
+from vplog.features import matching
+from vplog.geometry import se3
+from vplog.loops import undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -93,10 +94,10 @@ def landmarks_of(
         theirs = features(other)
         mine, found = matching.match_features(own, theirs, match)
         observed[view, mine] = undistort.rays(camera, theirs.points[found])
-    camera_from_body = geometry.inverse(camera.body_from_camera)
+    camera_from_body = se3.inverse(camera.body_from_camera)
     views = (
         camera_from_body
-        @ geometry.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
+        @ se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
         @ camera.body_from_camera
     )
     return from_motion(rays, observed, views, undistort.focal_px(camera), settings)
@@ -201,7 +202,7 @@ def _adjust(
     for v in range(len(views)):
         block, rows = slice(6 * v, 6 * v + 6), by_view[v].reshape(-1, 6)
         view_hessian[block, block] = rows.T @ rows + prior[v]
-        drift = geometry.log(geometry.between(start[v], views[v]))
+        drift = se3.log(se3.between(start[v], views[v]))
         view_gradient[block] = rows.T @ error[v].ravel() + prior[v] @ drift
     # the landmarks are eliminated: Schur complement
     cross = np.moveaxis(by_view_t @ by_point, 0, 1).reshape(len(points), size, 3)
@@ -213,7 +214,7 @@ def _adjust(
     gain_t = np.swapaxes(gain, 1, 2)
     point_step = -(point_covariance @ point_gradient[..., None])[..., 0] - gain_t @ view_step
     covariance = point_covariance + (gain_t.reshape(-1, size) @ view_covariance).reshape(gain_t.shape) @ gain
-    return points + point_step, views @ geometry.exp(view_step.reshape(-1, 6)), covariance
+    return points + point_step, views @ se3.exp(view_step.reshape(-1, 6)), covariance
 
 
 def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
@@ -231,7 +232,7 @@ def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats,
     by_seen[..., :, 2] = -image / depth
     moved = by_seen @ rotation
     by_point = np.concatenate([moved[..., :2], by_seen @ translation[..., None]], axis=-1)
-    by_view = np.concatenate([-moved @ geometry.skew(bearing), moved * points[:, 2, None, None]], axis=-1)
+    by_view = np.concatenate([-moved @ se3.skew(bearing), moved * points[:, 2, None, None]], axis=-1)
     return image - observed, by_point, by_view
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog import geometry
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -39,12 +39,12 @@ def find_pose(points: Floats, rays: Floats, radius: float, rounds: int) -> tuple
     if not found or not (np.isfinite(turn).all() and np.isfinite(moved).all()):
         return None
     rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
-    pose = geometry.pose(rotation, np.asarray(moved, np.float64).ravel())
+    pose = se3.pose(rotation, np.asarray(moved, np.float64).ravel())
     return pose, inliers(pose, points, rays, radius)
 
 
 def inliers(query_from_match: Floats, points: Floats, rays: Floats, radius: float) -> np.ndarray:
     """(K,) bool: the matches in front of the camera and within `radius` of where the pose (4, 4) projects them."""
-    x, y, z = geometry.transform(query_from_match, points).T
+    x, y, z = se3.transform(query_from_match, points).T
     with np.errstate(divide="ignore", invalid="ignore"):
         return (z > 0) & ((x / z - rays[:, 0]) ** 2 + (y / z - rays[:, 1]) ** 2 < radius**2)

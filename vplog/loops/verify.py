@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Closures, Verdict
+from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
 from vplog.loops.candidate import Drive, Row, VerifySettings, check_back, check_queries
@@ -123,7 +123,7 @@ def calibration_share(drive: Drive, threads: int = 1) -> float:
         poses = [row.pose for (row,) in turns]
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
-    driven = geometry.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
+    driven = se3.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
     observed = np.array(
         [_of_body(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
     )
@@ -139,14 +139,14 @@ def calibration_share(drive: Drive, threads: int = 1) -> float:
 
 def _of_body(match_from_query: Floats, query: Camera, match: Camera) -> Floats:
     """The pose of the query's camera in the match's as that of the bodies."""
-    return match.body_from_camera @ match_from_query @ geometry.inverse(query.body_from_camera)
+    return match.body_from_camera @ match_from_query @ se3.inverse(query.body_from_camera)
 
 
 def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive, share: float) -> Closures:
     """The columns of the ledger; poses and their information moved from the cameras to the bodies."""
     count, camera = len(rows), later.camera
     pose, information = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
-    body_from_camera = geometry.adjoint(camera.body_from_camera)
+    body_from_camera = se3.adjoint(camera.body_from_camera)
     twists = [body_twists(drive.keyframes) for drive in (earlier, later)]
     stamp_sigma_s = later.settings.calibration.stamp_sigma_s
     for at, row in enumerate(rows):

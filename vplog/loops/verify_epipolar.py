@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Verdict
-from vplog.loops import chance
+from vplog.loops import a_contrario
 from vplog.loops.verify_metric import Pose
 from vplog.settings import Settings
 
@@ -58,5 +58,5 @@ def agreeing(
     agrees = np.zeros(len(query), bool) if mask is None else np.asarray(mask).ravel().astype(bool)
     # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
     share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)
-    alarms = chance.log10_false_alarms(len(query), int(agrees.sum()), _SAMPLE, _MODELS, share)
+    alarms = a_contrario.log10_false_alarms(len(query), int(agrees.sum()), _SAMPLE, _MODELS, share)
     return agrees, alarms > settings.log10_false_alarms

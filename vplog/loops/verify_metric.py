@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog import geometry
 from vplog.data import Verdict
-from vplog.loops import chance, p3p_ransac, pose_fit, undistort
+from vplog.geometry import se3
+from vplog.loops import a_contrario, p3p_ransac, pose_refinement, undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -99,26 +99,26 @@ def solve(
     cloud, near = bearing / points[:, 2:], settings.ransac_px / focal_px
     inlier = np.zeros(len(rows), bool)
     if start is not None:
-        inlier = p3p_ransac.inliers(geometry.inverse(start), cloud, seen, near)
+        inlier = p3p_ransac.inliers(se3.inverse(start), cloud, seen, near)
     if start is None or inlier.sum() < settings.min_inliers:
         found = p3p_ransac.find_pose(cloud, seen, near, settings.ransac_rounds)
         if found is None:
             return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
-        start, inlier = geometry.inverse(found[0]), found[1]
+        start, inlier = se3.inverse(found[0]), found[1]
     covariance = landmarks.covariance[rows]
     match_from_query, hessian, excess = start, np.eye(6), 1.0
     for _ in range(_ROUNDS):  # the pose decides who agrees, those decide the pose; it settles in two or three
         if inlier.sum() < _SAMPLE + 1:
             break
         chosen = (points[inlier], covariance[inlier], seen[inlier], seen_rho[0][inlier], seen_rho[1][inlier])
-        match_from_query, hessian, excess = pose_fit.fit(match_from_query, *chosen, sigma)
-        distance, error = pose_fit.agreement(match_from_query, points, covariance, seen, sigma)
+        match_from_query, hessian, excess = pose_refinement.fit(match_from_query, *chosen, sigma)
+        distance, error = pose_refinement.agreement(match_from_query, points, covariance, seen, sigma)
         before, inlier = inlier, (distance < _CHI2_2) & (error < settings.max_error_px / focal_px)
         if np.array_equal(inlier, before):
             break
     count = int(inlier.sum())
     radius = settings.max_error_px
-    alarms = chance.log10_false_alarms(len(rows), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
+    alarms = a_contrario.log10_false_alarms(len(rows), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
     if (
         not np.isfinite(match_from_query).all()
         or count < max(settings.min_inliers, settings.min_share * len(rows))

@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps import store as map_store
-from vplog.maps.damage import left_out, without_damaged
-from vplog.maps.earth import earth_as_plain, earth_of_run, inside
-from vplog.remote import local_copy
+from vplog.maps.geo_bounds import earth_as_plain, earth_of_run, inside
+from vplog.maps.storage import map_store
+from vplog.maps.storage.damage import left_out, without_damaged
 from vplog.results import tables
 from vplog.results.geo import on_earth
 from vplog.results.places_map import about_run, names_of, read_places, write_map, write_places
 from vplog.results.run_record import read_single_run
+from vplog.storage.remote_path import local_copy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from vplog.data import Floats
-    from vplog.maps.earth import Box
-    from vplog.maps.store import Store
+    from vplog.maps.geo_bounds import Box
+    from vplog.maps.storage.map_store import Store
     from vplog.results.places_map import DrivePlaces
     from vplog.results.shown import Earth
 

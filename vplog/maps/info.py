@@ -8,23 +8,22 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
-from vplog.folders import regular_files
-from vplog.maps import keys
-from vplog.maps import store as map_store
-from vplog.maps.damage import damaged_files, left_out, without_damaged
-from vplog.maps.earth import bounds_of, is_finite
-from vplog.maps.imports import ALONE
-from vplog.maps.joint_record import components_in, replaced_since
-from vplog.maps.store import other_library
-from vplog.parquet_bounds import open_table
-from vplog.places.stored import read_library_record
+from vplog.maps.geo_bounds import bounds_of, is_finite
+from vplog.maps.import_places import ALONE
+from vplog.maps.joining.joint_record import components_in, replaced_since
+from vplog.maps.storage import drive_ids, map_store
+from vplog.maps.storage.damage import damaged_files, left_out, without_damaged
+from vplog.maps.storage.map_store import other_library
+from vplog.places.library_files import read_library_record
 from vplog.results import run_record
+from vplog.storage.folders import regular_files
+from vplog.storage.parquet_limits import open_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from vplog.maps.store import Store
+    from vplog.maps.storage.map_store import Store
 
 _READ_AT_ONCE = 16
 """Drives: on an object store each is a request that takes some 20 to 50 ms."""
@@ -68,7 +67,7 @@ def _damaged_table(path: Path) -> list[str]:
 
 def _describe(store: Store) -> dict[str, Any]:
     head, problems, abouts = store.head(), list[str](), store.drives()
-    now, other = (keys.key_of(head.settings), keys.code_hash()), []
+    now, other = (drive_ids.key_of(head.settings), drive_ids.code_hash()), []
     for drive, about in abouts.items():
         if about["library"] != head.library:
             problems.append(other_library(store, drive, about["library"], head.library))

@@ -9,21 +9,20 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError
-from vplog.maps import keys
-from vplog.maps import store as map_store
-from vplog.maps.damage import DamagedDriveError, damaged_files, left_out
-from vplog.maps.imports import ALONE, drives_of_file, library_of_file, take_places
-from vplog.maps.layout import folder_name
-from vplog.maps.pairs import KEPT
-from vplog.remote import local_copy, original
+from vplog.maps.import_places import ALONE, drives_of_file, library_of_file, take_places
+from vplog.maps.joining.drive_pairs import KEPT
+from vplog.maps.storage import drive_ids, map_store
+from vplog.maps.storage.damage import DamagedDriveError, damaged_files, left_out
+from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive
+from vplog.storage.remote_path import local_copy, original
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from vplog.maps.store import Store
+    from vplog.maps.storage.map_store import Store
 
     Progress = Callable[[str, int, int], None]
 
@@ -148,7 +147,7 @@ class _There:
         return drive, drive in self._alone
 
     def free_name(self, drive: str, log: str) -> str:
-        return keys.free_name(drive, log, self._names)
+        return drive_ids.free_name(drive, log, self._names)
 
 
 def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any] | None:
@@ -178,8 +177,8 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
 
     other.read(drive, copied, ())
     if taken != drive:
-        keys.name_keyframes(made / "keyframes.parquet", taken)
-    run_record.write_run_json(made / "drive.json", record if taken == drive else keys.renamed(record, taken))
+        drive_ids.name_keyframes(made / "keyframes.parquet", taken)
+    run_record.write_run_json(made / "drive.json", record if taken == drive else drive_ids.renamed(record, taken))
     _link_kept(other, drive, store, taken)
     map_store.publish(store, taken, made)
     other.forget(drive)

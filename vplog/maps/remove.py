@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps import store as map_store
-from vplog.maps.joint_record import components_in
+from vplog.maps.joining.joint_record import components_in
+from vplog.maps.storage import map_store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

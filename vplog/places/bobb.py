@@ -25,14 +25,14 @@ from pydantic import Field, model_validator
 
 from vplog.data import Boxes
 from vplog.errors import LibraryError
-from vplog.places import expected_votes, stored
+from vplog.places import expected_votes, library_files
 from vplog.places.code_lists import BLOCK, CodeLists, build_lists
 from vplog.places.code_search import CodeIndex
 from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
 from vplog.places.once import Once
 from vplog.places.relearn import relearn
-from vplog.places.shared import list_shared
+from vplog.places.shared_references import list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -188,7 +188,7 @@ class BobbState:
 
     def __post_init__(self) -> None:
         s = self.settings
-        object.__setattr__(self, "hash", stored.references_hash(self.matcher.references, s))
+        object.__setattr__(self, "hash", library_files.references_hash(self.matcher.references, s))
         object.__setattr__(self, "_windows", expected_votes.even_windows(s.windows_along, s.window_share))
         object.__setattr__(self, "_along_x", expected_votes.box_sums(s.columns, s.patches_x, s.box_columns))
         object.__setattr__(self, "_along_y", expected_votes.box_sums(s.rows, s.patches_y, s.box_rows))
@@ -368,4 +368,4 @@ class BobbState:
         )
 
     def save(self, folder: Path) -> None:
-        stored.save_references(self.matcher.references, self.settings, folder)
+        library_files.save_references(self.matcher.references, self.settings, folder)

@@ -19,11 +19,11 @@ from pydantic import Field, PositiveFloat, model_validator
 from vplog.data import Boxes
 from vplog.errors import LibraryError
 from vplog.places import library as lib
-from vplog.places import rvp, stored
+from vplog.places import library_files, rvp
 from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.relearn import RelearnedSettings
 from vplog.places.search import BoxIndex
-from vplog.places.shared import list_shared
+from vplog.places.shared_references import list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -154,7 +154,7 @@ class PaperBobbState:
         corners = rng.uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
         object.__setattr__(self, "_windows", np.concatenate([corners, corners + s.window_share], axis=-1))
         object.__setattr__(self, "_shapes", rvp.box_shapes(s.grid, s.max_box_share, s.aspects))
-        object.__setattr__(self, "hash", stored.references_hash(self.library.references, s))
+        object.__setattr__(self, "hash", library_files.references_hash(self.library.references, s))
 
     _windows: Floats = None  # pyright: ignore[reportAssignmentType]
     _shapes: Int32s = None  # pyright: ignore[reportAssignmentType]
@@ -277,7 +277,7 @@ class PaperBobbState:
         return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
 
     def save(self, folder: Path) -> None:
-        stored.save_references(self.library.references, self.settings, folder)
+        library_files.save_references(self.library.references, self.settings, folder)
 
 
 def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:

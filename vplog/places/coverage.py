@@ -22,7 +22,7 @@ import numba
 import numpy as np
 
 from vplog.places.library import WordSettings, hnsw, l1_distance
-from vplog.references import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
+from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

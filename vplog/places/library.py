@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.stored import strongest
+from vplog.places.library_files import strongest
 from vplog.settings import Settings
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError
-from vplog.places import stored
+from vplog.places import library_files
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -36,15 +36,15 @@ class ReferencesState:
 
     @cached_property
     def _hash(self) -> str:
-        return stored.references_hash(self.references, self.settings)
+        return library_files.references_hash(self.references, self.settings)
 
     def save(self, folder: Path) -> None:
-        stored.save_references(self.references, self.settings, folder)
+        library_files.save_references(self.references, self.settings, folder)
 
 
 def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:
     """The references, with their strongest features alone where a number is given. Raises LibraryError for none."""
-    kept = [reference if features is None else stored.strongest(reference, features) for reference in references]
+    kept = [reference if features is None else library_files.strongest(reference, features) for reference in references]
     if not kept:
         raise LibraryError("A library needs at least one reference image; none was given.")
     return kept
@@ -56,9 +56,9 @@ def relearn(settings: Any, folder: Path, threads: int, learn: Callable[..., Any]
 
     Raises LibraryError where the folder is damaged or gives another hash.
     """
-    record = stored.read_library_record(folder)
+    record = library_files.read_library_record(folder)
     made = settings.read(record["settings"], f"{folder}/library.json")
-    state = (learn or settings.learn)(made, stored.load_references(folder, threads), threads)
+    state = (learn or settings.learn)(made, library_files.load_references(folder, threads), threads)
     if state.hash != record["hash"]:
         raise LibraryError(
             f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.parquet_bounds import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.results import kept_features, messages, placed, places_map, tables
 from vplog.results.layouts import layouts
 from vplog.results.mcap import TOPICS
-from vplog.scratch import replacing
+from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path

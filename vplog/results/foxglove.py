@@ -20,7 +20,7 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from vplog import geometry
+from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,7 +52,7 @@ _DISTORTION = {"plumb_bob": "plumb_bob", "rational_polynomial": "rational_polyno
 
 def parts(poses: Floats) -> list[Part]:
     """The parts of poses (R, 4, 4), all at once: row by row, numpy takes most of the time of a large file."""
-    return list(zip(poses[:, :3, 3].tolist(), geometry.quaternion(poses[:, :3, :3]).tolist(), strict=True))
+    return list(zip(poses[:, :3, 3].tolist(), se3.quaternion(poses[:, :3, :3]).tolist(), strict=True))
 
 
 def path(stamp_ns: int, poses: list[Part]) -> PosesInFrame:

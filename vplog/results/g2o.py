@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import EdgeKind, PoseGraph
 from vplog.errors import GraphError
-from vplog.scratch import replacing
+from vplog.geometry import se3
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -226,12 +226,12 @@ def _poses(path: Path, lines: _Lines, numbers: Floats) -> Floats:
     if planar:
         zero = np.zeros(len(numbers))
         turn = np.stack([zero, zero, numbers[:, 2]], axis=1)
-        return geometry.pose(geometry.so3_exp(turn), np.stack([numbers[:, 0], numbers[:, 1], zero], axis=1))
+        return se3.pose(se3.so3_exp(turn), np.stack([numbers[:, 0], numbers[:, 1], zero], axis=1))
     length = np.linalg.norm(numbers[:, 3:], axis=1)
     off = np.flatnonzero(np.abs(length - 1) > _QUATERNION_OFF)
     if len(off):
         raise _at(path, lines.line[off[0]], f"the quaternion has length {length[off[0]]:.3g}, not 1")
-    return geometry.pose(geometry.rotation(numbers[:, 3:]), numbers[:, :3])
+    return se3.pose(se3.rotation(numbers[:, 3:]), numbers[:, :3])
 
 
 def _information(path: Path, lines: _Lines, upper: Floats, layout: _Layout) -> Floats:
@@ -288,7 +288,7 @@ def _place(poses: Floats, given: np.ndarray, a: Int32s, b: Int32s, a_from_b: Flo
             forward = a[edge] == node
             to = int(b[edge] if forward else a[edge])
             if not given[to]:
-                poses[to] = poses[node] @ (a_from_b[edge] if forward else geometry.inverse(a_from_b[edge]))
+                poses[to] = poses[node] @ (a_from_b[edge] if forward else se3.inverse(a_from_b[edge]))
                 given[to] = True
                 offer(to)
         if not given[start]:
@@ -323,5 +323,5 @@ def _rows(poses: Floats, dimension: int) -> list[str]:
     if dimension == 2:
         values = np.concatenate([poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])[:, None]], axis=1)
     else:
-        values = np.concatenate([poses[:, :3, 3], geometry.quaternion(poses[:, :3, :3])], axis=1)
+        values = np.concatenate([poses[:, :3, 3], se3.quaternion(poses[:, :3, :3])], axis=1)
     return [" ".join(map(repr, row)) for row in values.tolist()]

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from vplog import geometry
 from vplog.data import Verdict
-from vplog.geodesy import geodetic
-from vplog.parquet_bounds import write_table
-from vplog.scratch import replacing
+from vplog.geometry import se3
+from vplog.geometry.geodesy import geodetic
+from vplog.storage.parquet_limits import write_table
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,7 +29,7 @@ _POINT_Z = struct.pack("<BI", 1, 1001)
 
 def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
     """(T, 3) longitude and latitude in degrees and altitude in m of poses (T, 4, 4)."""
-    enu = geometry.transform(earth.enu_from_world, world_from_body[:, :3, 3])
+    enu = se3.transform(earth.enu_from_world, world_from_body[:, :3, 3])
     return geodetic(enu, earth.origin)[:, [1, 0, 2]]
 
 

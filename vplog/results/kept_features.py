@@ -14,8 +14,8 @@ import pyarrow as pa
 
 from vplog.data import Features
 from vplog.errors import ResultError
-from vplog.parquet_bounds import VERSION_ABOUT, VERSION_KEY, check_columns, open_table, table_writer
-from vplog.scratch import replacing
+from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY, check_columns, open_table, table_writer
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Callable

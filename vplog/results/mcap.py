@@ -22,14 +22,14 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.writer import CompressionType, Writer
 
 import vplog
-from vplog import geometry
 from vplog.data import EdgeKind, Verdict
+from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
 from vplog.results.run_record import canonical_json
 from vplog.results.shown import Shown
 from vplog.results.tables import covariance_of
-from vplog.scratch import replacing
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -131,7 +131,7 @@ def _solved(
     first_row = np.searchsorted(closures.query[rows], np.arange(len(keyframes.stamp_ns) + 1))
     for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
         if node == 0:
-            drifted = world_from_body[0] @ geometry.inverse(keyframes.odom_from_body[0]) @ keyframes.odom_from_body
+            drifted = world_from_body[0] @ se3.inverse(keyframes.odom_from_body[0]) @ keyframes.odom_from_body
             yield stamp_ns, "/path/optimised", foxglove.path(stamp_ns, bodies)
             yield stamp_ns, "/path/odometry", foxglove.path(stamp_ns, foxglove.parts(drifted))
             # the same positions as points: rerun reads the paths, but draws point clouds
@@ -281,6 +281,6 @@ def _loop_closure(
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
     """Width and height in px."""
-    from vplog.image_file import image_size
+    from vplog.storage.image_file import image_size
 
     return image_size(data) or (0, 0)

@@ -17,9 +17,9 @@ from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from vplog import geometry
 from vplog.data import Gps
 from vplog.errors import ResultError
+from vplog.geometry import se3
 from vplog.results.foxglove import CAMERA
 from vplog.results.mcap import FIXES, PICTURES
 
@@ -105,7 +105,7 @@ def read_camera_pose(path: Path) -> Floats | None:
             for one in FrameTransforms.FromString(message.data).transforms:
                 if one.child_frame_id == CAMERA:
                     q, t = one.rotation, one.translation
-                    return geometry.pose(geometry.rotation(np.array([q.x, q.y, q.z, q.w])), np.array([t.x, t.y, t.z]))
+                    return se3.pose(se3.rotation(np.array([q.x, q.y, q.z, q.w])), np.array([t.x, t.y, t.z]))
     return None
 
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.parquet_bounds import write_table
-from vplog.scratch import replacing
+from vplog.storage.parquet_limits import write_table
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,11 +17,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vplog import geometry
 from vplog.errors import ResultError
-from vplog.parquet_bounds import check_size, filled, open_table, read_schema, read_table, table_writer
+from vplog.geometry import se3
 from vplog.results import geo, run_record, tables
-from vplog.scratch import replacing
+from vplog.storage.parquet_limits import check_size, filled, open_table, read_schema, read_table, table_writer
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -167,7 +167,7 @@ def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
     """The columns of a drive's places."""
     number = names.index(part.drive)
     drive = pa.DictionaryArray.from_arrays(pa.array([number] * len(part.keyframe), pa.int32()), pa.array(names))
-    quaternions = geometry.quaternion(part.world_from_body[:, :3, :3])
+    quaternions = se3.quaternion(part.world_from_body[:, :3, :3])
     where = np.ascontiguousarray(np.concatenate([part.world_from_body[:, :3, 3], quaternions], axis=1).T)
     packed = [_packed(one) for one in _values(part.descriptors)]
     return [drive, pa.array(part.keyframe), pa.array(part.stamp_ns), *map(pa.array, where), *packed]
@@ -293,7 +293,7 @@ def _places_of(tables_of_drive: list[pa.Table], path: Path, parts: list[Any], ki
     columns = iter([_unpacked(table[name].combine_chunks(), part) for name, part in parts])
     values = {name: table[name].to_numpy() for name in PLACE.names if name != "drive"}
     moved = np.stack([values[f"world_{name}"] for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")], 1)
-    poses = geometry.pose(geometry.rotation(moved[:, 3:]), moved[:, :3])
+    poses = se3.pose(se3.rotation(moved[:, 3:]), moved[:, :3])
     drive = table["drive"][0].as_py()
     return DrivePlaces(drive, path, values["keyframe"], values["stamp_ns"], poses, _joined(kind, columns), {})
 

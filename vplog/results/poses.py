@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog import geometry
-from vplog.scratch import replacing
-from vplog.tum import seconds
+from vplog.geometry import se3
+from vplog.geometry.tum import seconds
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,7 +35,7 @@ def write_kitti(path: Path, trajectory: Trajectory) -> Path:
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
     """`timestamp [ns], position, quaternion w x y z` with commas, the first eight columns of EuRoC's ground truth."""
     poses = trajectory.world_from_body
-    q = geometry.quaternion(poses[:, :3, :3])[:, [3, 0, 1, 2]]
+    q = se3.quaternion(poses[:, :3, :3])[:, [3, 0, 1, 2]]
     values = np.concatenate([poses[:, :3, 3], q], axis=1)
     names = "p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
     with replacing(path) as stream:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.image_file import decode_image
 from vplog.settings import Settings
+from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
     from collections.abc import Callable

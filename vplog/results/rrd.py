@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog import geometry
 from vplog.data import Verdict
 from vplog.errors import ResultError
+from vplog.geometry import se3
 from vplog.results.geo import on_earth
 from vplog.results.mcap_read import read_camera_pose, read_images
-from vplog.scratch import put_in_place
+from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,7 +73,7 @@ def _log(
     if earth is not None:
         where = on_earth(earth, after.world_from_body)[:, [1, 0]]
         recording.log("earth/optimised", rr.GeoLineStrings(lat_lon=[where], colors=[_BLUE]), static=True)
-    quaternions = geometry.quaternion(world_from_body[:, :3, :3])
+    quaternions = se3.quaternion(world_from_body[:, :3, :3])
     recording.send_columns(
         "map/body",
         indexes=[rr.TimeColumn("stamp", timestamp=keyframes.stamp_ns.astype("datetime64[ns]"))],

@@ -10,10 +10,10 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
-from vplog.folders import check_regular
-from vplog.parquet_bounds import check_file, check_version
 from vplog.results.staging import recover
-from vplog.scratch import replacing
+from vplog.storage.folders import check_regular
+from vplog.storage.parquet_limits import check_file, check_version
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -16,8 +16,8 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, TextIO
 
 from vplog.errors import ResultError, SettingsError
-from vplog.parquet_bounds import check_file
-from vplog.scratch import files_in, made_folder, put_in_place, replacing
+from vplog.storage.parquet_limits import check_file
+from vplog.storage.scratch import files_in, made_folder, put_in_place, replacing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

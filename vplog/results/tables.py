@@ -16,10 +16,11 @@ import numpy as np
 import pyarrow as pa
 
 import vplog
-from vplog import geometry
 from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.errors import ResultError
-from vplog.parquet_bounds import (
+from vplog.geometry import se3
+from vplog.results.run_record import canonical_json
+from vplog.storage.parquet_limits import (
     check_columns,
     filled,
     open_table,
@@ -28,8 +29,7 @@ from vplog.parquet_bounds import (
     table_writer,
     write_table,
 )
-from vplog.results.run_record import canonical_json
-from vplog.scratch import replacing
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -513,14 +513,14 @@ def _unreadable(path: Path, error: Exception) -> ResultError:
 
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
     names = [f"{prefix}{name}" for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
-    values = np.concatenate([poses[:, :3, 3], geometry.quaternion(poses[:, :3, :3])], axis=1)
+    values = np.concatenate([poses[:, :3, 3], se3.quaternion(poses[:, :3, :3])], axis=1)
     return dict(zip(names, np.ascontiguousarray(values.T), strict=True))
 
 
 def _poses(table: pa.Table, prefix: str) -> Floats:
     """(R, 4, 4), all NaN where the row holds none."""
     values = np.stack([_values(table, f"{prefix}{name}") for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")], 1)
-    poses = geometry.pose(geometry.rotation(values[:, 3:]), values[:, :3])
+    poses = se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
     poses[~np.isfinite(poses).all((1, 2))] = np.nan
     return poses
 

@@ -1,0 +1,527 @@
+"""Drives into a map: the same bytes for any number of jobs and after any kill, and nothing done twice."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import random
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from vplog.batch import batch
+from vplog.batch.batch import run_batch
+from vplog.batch.engine import LocalEngine, computed
+from vplog.batch.worker import Outcome, Task
+from vplog.demo import SMALL, make_drive
+from vplog.demo.record import IMAGE
+from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.execution.process_pool import OwnProcesses, ProcessExpired
+from vplog.logs import TopicChoice
+from vplog.maps.storage import map_store
+from vplog.maps.storage.drive_ids import drive_names
+from vplog.pipeline import load_pipeline
+from vplog.run.reference_library import build_library
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conftest import Said
+
+TINY = SMALL.model_copy(update={"laps": 1.2, "frame_rate_hz": 1.5, "width": 320, "height": 180})
+"""About 25 frames."""
+QUICK = (
+    "features.max_features=300", "library.size=10", "library.seed=1", "pictures.closures=0", "pictures.megapixels=0",
+    "propose.per_query=1", "propose.gap_keyframes=15", "propose.gap_steps=15",
+)  # fmt: skip
+OPTIONS = [option for one in QUICK for option in ("--set", one)]
+
+
+def files(root: Path) -> dict[str, tuple[int, str]]:
+    """Inode and sha256 of every file that is not hidden, by name."""
+    return {
+        str(path.relative_to(root)): (path.stat().st_ino, hashlib.sha256(path.read_bytes()).hexdigest())
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+def tables(root: Path) -> dict[str, str]:
+    return {name: digest for name, (_, digest) in files(root).items() if name.endswith(".parquet")}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two drives of one name, in folders of their own."""
+    folder = tmp_path_factory.mktemp("logs")
+    return [
+        make_drive(folder / name, TINY.model_copy(update={"seed": SMALL.seed + number}), 1).log
+        for number, name in enumerate("ab")
+    ]
+
+
+@pytest.fixture(scope="module")
+def whole(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of both at once, one after the other."""
+    root = tmp_path_factory.mktemp("whole") / "map"
+    told = run_batch(logs, root, load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "computed"), ("drive-2", "computed")]
+    return root
+
+
+def test_duckdb_reads_every_table_by_drive(whole: Path) -> None:
+    for name in map_store.TABLES:
+        counted = f"select drive, count(*) from '{whole}/{name}/*/*.parquet' group by 1 order by 1"  # noqa: S608
+        rows = duckdb.execute(counted).fetchall()
+        assert [drive for drive, _ in rows] == ["drive", "drive-2"], name
+        assert all(count > 0 for _, count in rows)
+    own = duckdb.execute(
+        f"select distinct drive from read_parquet('{whole}/keyframes/*/*.parquet', hive_partitioning = false)"  # noqa: S608
+    ).fetchall()
+    assert sorted(own) == [("drive",), ("drive-2",)]
+    assert (whole / "closures/drive=drive/closures.parquet").samefile(whole / "runs/drive=drive/closures.parquet")
+
+
+def test_a_map_grows_by_its_new_drives_alone(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With two jobs, the library given, one drive after the other and a bad one between: the bytes of one batch."""
+    monkeypatch.setattr("vplog.batch.batch._FREE_BYTES", 0)  # however full the disk is
+    [library] = (whole / "libraries").iterdir()
+    root, bad = tmp_path / "map", tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+    verb("batch", logs[0], "-o", root, "--library", library, "--threads", 2, *OPTIONS)
+    before = files(root)
+    said = verb("batch", *logs, bad, tmp_path / "gone.bag", "-o", root, "--jobs", 2, "--threads", 2, "--json", *OPTIONS)
+    assert said.code == 1
+    assert "2 of 4 drives failed" in said.err
+    told = json.loads(said.out)
+    assert [one["state"] for one in told["drives"]] == ["unchanged", "computed", "failed", "failed"]
+    assert tables(root) == tables(whole)
+
+    after = files(root)
+    new = {name for name in after if after[name] != before.get(name)}
+    assert {name for name in new if not name.startswith("joint")} - {"failures.json"} == {
+        name for name in after if "drive=drive-2/" in name
+    }
+    assert set(before) <= set(after)
+    failures = json.loads((root / "failures.json").read_text())
+    assert list(failures) == ["bad", "gone"]
+    assert "which no log does" in failures["bad"]["error"]
+
+    assert verb("batch", *logs, "-o", root, "--json", *OPTIONS).json["failed"] == 0  # the bad ones are not given
+    assert files(root) == after
+
+
+def test_what_is_missing_or_changed_is_done_again(
+    whole: Path, logs: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = load_pipeline("default", QUICK)
+    before = files(whole)
+    asked: list[str] = []
+
+    def refuse(_: LocalEngine, task: Task, cores: int) -> Future[Outcome]:
+        asked.append(task.drive)
+        future: Future[Outcome] = Future()
+        future.set_result(Outcome("not now"))
+        return future
+
+    monkeypatch.setattr(LocalEngine, "start", refuse)
+    (whole / "edges" / "drive=drive" / "edges.parquet").unlink()
+    assert run_batch(logs, whole, pipeline)["failed"] == 0
+    assert asked == []
+    assert tables(whole) == {name: digest for name, (_, digest) in before.items() if name.endswith(".parquet")}
+
+    assert run_batch(logs[::-1], whole, pipeline)["failed"] == 0, "in another order they keep their names"
+    changed = load_pipeline("default", [*QUICK, "propose.per_query=2"])
+    told = run_batch(logs[:1], whole, changed)
+    assert [(one["state"], one["error"]) for one in told["drives"]] == [("failed", "not now")]
+    assert asked == ["drive"]
+    monkeypatch.setattr("vplog.maps.storage.drive_ids.code_hash", lambda: "other code")
+    assert run_batch(logs, whole, pipeline)["failed"] == 2
+    assert asked[1:] == ["drive", "drive-2"]
+    assert {**files(whole), "map.json": 0, "failures.json": 0}.keys() == {
+        **before,
+        "map.json": 0,
+        "failures.json": 0,
+    }.keys()
+    monkeypatch.undo()
+    assert run_batch(logs, whole, pipeline)["failed"] == 0
+    assert json.loads((whole / "failures.json").read_text()) == {}
+
+
+@pytest.mark.parametrize("damage", ["flip", "gone", "record", "report"])
+def test_a_damaged_drive_is_computed_again_and_stops_no_other(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    """By the batch that has its log; another one names it and leaves it out."""
+    root, pipeline = tmp_path / "map", load_pipeline("default", QUICK)
+    shutil.copytree(whole, root, copy_function=shutil.copyfile)
+    run = root / "runs" / "drive=drive-2"
+    name = {"flip": "edges.parquet", "gone": "edges.parquet", "record": "drive.json", "report": "report.html"}[damage]
+    data = bytearray((run / name).read_bytes())
+    (run / name).unlink()
+    if damage != "gone":
+        data[len(data) // 3] ^= 4 if damage != "record" else 128
+        (run / name).write_bytes(data)
+    asked: list[str] = []
+
+    def refuse(_: LocalEngine, task: Task, cores: int) -> Future[Outcome]:
+        asked.append(task.drive)
+        future: Future[Outcome] = Future()
+        future.set_result(Outcome("not now"))
+        return future
+
+    monkeypatch.setattr(LocalEngine, "start", refuse)
+    told = run_batch(logs[:1], root, pipeline)
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged")]
+    said = [*told["warnings"], *(told["joined"] or {}).get("warnings", [])]
+    if damage in ("gone", "record"):  # the other damages are found by who reads the file
+        assert sum("drive-2 is damaged and left out" in line for line in said) == 1
+    told = run_batch(logs, root, pipeline, join=False)
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged"), ("drive-2", "failed")]
+    assert asked == ["drive-2"]
+    assert any("drive-2 is damaged and left out" in line for line in told["warnings"])
+
+
+def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp_path: Path) -> None:
+    pipeline = load_pipeline("default", QUICK)
+    before = files(whole)
+    other = tmp_path / "other"
+    build_library(logs[:1], other, pipeline)
+    with pytest.raises(LibraryError, match="cannot be compared"):
+        run_batch(logs, whole, pipeline, other)
+    with pytest.raises(LibraryError, match=r"places\.references"):
+        run_batch(logs, whole, load_pipeline("default", [*QUICK, "places.references=5"]))
+    with map_store.writing(whole), pytest.raises(SettingsError, match="Another vplog process"):
+        run_batch(logs, whole, pipeline)
+    with pytest.raises(SettingsError, match="given twice"):
+        run_batch([logs[0], logs[0]], whole, pipeline)
+    (tmp_path / "thesis.txt").write_text("not a map")
+    with pytest.raises(SettingsError, match=r"thesis.txt|other"):
+        run_batch(logs, tmp_path, pipeline)
+    assert files(whole) == before
+
+
+def test_a_killed_batch_leaves_finished_drives_and_goes_on(whole: Path, logs: list[Path], tmp_path: Path) -> None:
+    """Killed while the first drive runs, then once it is in; what is there is whole, and the end is the same."""
+    root, reference = tmp_path / "map", tables(whole)
+    command = [sys.executable, "-m", "vplog", "batch", *map(str, logs), "-o", str(root), "--threads", "1", *OPTIONS]
+    for until in (root / ".staging", root / "runs" / "drive=drive"):
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as batch:
+            while batch.poll() is None and not until.exists():
+                time.sleep(0.02)
+            time.sleep(random.Random(until.name).uniform(0, 1))
+            os.kill(batch.pid, signal.SIGKILL)
+        finished = {folder.name for folder in root.glob("runs/*")}
+        for name, digest in tables(root).items():
+            assert ".staging" in name or digest == reference[name]
+            assert ".staging" in name or "libraries" in name or name.split("/")[1] in finished
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert tables(root) == reference
+    assert not (root / ".staging").exists()
+
+
+@dataclass
+class Fated:
+    """An engine whose drives end as they are told to, one outcome or error for each attempt."""
+
+    fates: dict[str, list[Outcome | Exception]]
+    begun: list[str] = field(default_factory=list)
+    cores: int = 4
+    widest: int = 4
+
+    def at_once(self, threads: int) -> int:
+        return self.cores // threads
+
+    def helpers(self, threads: int) -> Executor | None:
+        return None
+
+    @property
+    def executor(self) -> Executor | None:
+        return None
+
+    def start(self, task: Task) -> Future[Outcome]:
+        self.begun.append(task.drive)
+        future: Future[Outcome] = Future()
+        fate = self.fates[task.drive].pop(0)
+        future.set_exception(fate) if isinstance(fate, Exception) else future.set_result(fate)
+        return future
+
+    def take(self, task: Task, outcome: Outcome) -> None:
+        if outcome.worker == "gone":
+            raise BrokenExecutor("What it gave back was lost.")
+
+
+def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path: Path) -> None:
+    died, bad, good = BrokenExecutor("Its worker was killed."), Outcome("No such topic."), Outcome(worker="here")
+    engine = Fated({
+        "unlucky": [died, Outcome("Out of memory.", may_pass=True), good],
+        "bad": [bad],
+        "good": [good],
+        "lost": [Outcome(worker="gone"), good],
+        "hopeless": [died, died, died],
+        "odd": [ValueError("what\nis this")],
+    })  # fmt: skip
+    topics, pipeline = TopicChoice(), load_pipeline("default")
+    tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
+    ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in computed(engine, tasks, 2, 2)}
+    assert ended == {
+        "unlucky": ("", 3),
+        "bad": ("No such topic.", 1),
+        "good": ("", 1),
+        "lost": ("", 2),
+        "hopeless": ("Its worker was killed.", 3),
+        "odd": ("Internal error: ValueError: what is this.", 1),
+    }
+    assert set(engine.begun[:6]) == set(engine.fates), "each has its turn before one is tried again"
+
+
+def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    with OwnProcesses(2) as processes:
+        dying, living = processes.submit(signal.raise_signal, signal.SIGKILL), processes.submit(os.getpid)
+        with pytest.raises(ProcessExpired):
+            dying.result()
+        assert living.result() != processes.submit(os.getpid).result() != os.getpid()
+        outcome = computed_by(monkeypatch, processes, signal.raise_signal, signal.SIGKILL)
+        assert outcome.error.startswith("Its process was killed")
+    slept: list[Future[None]] = []
+    with pytest.raises(KeyboardInterrupt), OwnProcesses(1) as processes:
+        slept += [processes.submit(time.sleep, 600) for _ in range(3)]
+        raise KeyboardInterrupt
+    assert not multiprocessing.active_children()
+
+
+def computed_by(
+    monkeypatch: pytest.MonkeyPatch, processes: OwnProcesses, function: Callable[..., Any], *args: Any
+) -> Outcome:
+    """How a batch takes a task of this function for its drive."""
+    engine = LocalEngine(processes, 1)
+    monkeypatch.setattr(engine, "start", lambda _: processes.submit(function, *args))
+    task = Task("drive", "log", Path(), Path(), load_pipeline("default"), TopicChoice(), 1, {})
+    [(_, outcome, _)] = computed(engine, [task], 1, 0)
+    return outcome
+
+
+def test_processes_that_are_begun_are_those_of_the_first_tasks_or_end() -> None:
+    with OwnProcesses(1) as processes:
+        processes.begin()
+        [ahead] = multiprocessing.active_children()
+        assert processes.submit(os.getpid).result() == ahead.pid
+        assert processes.submit(os.getpid).result() != ahead.pid
+    assert not multiprocessing.active_children()
+    with OwnProcesses(1) as processes:
+        processes.begin()
+        [ahead] = multiprocessing.active_children()
+        os.kill(ahead.pid or 0, signal.SIGKILL)
+        ahead.join()
+        with suppress(BrokenExecutor, ProcessExpired):
+            processes.submit(os.getpid).result()
+        assert processes.submit(os.getpid).result() != os.getpid(), "others take its place"
+
+
+def test_a_map_goes_on_with_its_own_settings(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = Path(shutil.copytree(whole, tmp_path / "map"))
+    told = verb("batch", *logs, "-o", root, "--json").json
+    assert [one["state"] for one in told["drives"]] == ["unchanged", "unchanged"]
+    assert told["warnings"] == []
+    failing: Future[Outcome] = Future()
+    failing.set_result(Outcome("not now"))
+    monkeypatch.setattr(LocalEngine, "start", lambda *_: failing)
+    said = verb("batch", logs[0], "-o", root, "--set", "propose.per_query=2", "--json", "--no-join")
+    assert said.code == 1
+    assert json.loads((root / "map.json").read_text())["settings"]["propose"]["per_query"] == 2
+    assert json.loads((root / "map.json").read_text())["settings"]["features"]["max_features"] == 300
+    assert f"the first is {logs[1]}" in json.loads(said.out)["warnings"][0]
+
+
+def test_a_log_that_cannot_be_asked_for_stops_no_other(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, closed = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "closed.mcap"
+    is_dir = Path.is_dir
+
+    def refused(path: Path) -> bool:
+        if path == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", refused)
+    told = run_batch([closed, *logs], root, load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [
+        ("closed", "failed"), ("drive", "unchanged"), ("drive-2", "unchanged"),
+    ]  # fmt: skip
+    assert str(closed) in told["drives"][0]["error"]
+
+
+def test_a_log_without_a_sound_image_stops_no_library(logs: list[Path], tmp_path: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    with logs[0].open("rb") as source, bad.open("wb") as target:
+        writer, known = Writer(target), dict[int, int]()
+        writer.start("ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in known:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                known[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            image = channel.topic == IMAGE
+            data = message.data[:60] + bytes(len(message.data) - 60) if image else message.data
+            writer.add_message(known[channel.id], message.log_time, data, message.publish_time)
+        writer.finish()
+    told = run_batch([bad, logs[0]], tmp_path / "map", load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("bad", "failed"), (logs[0].stem, "computed")]
+
+
+def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path], tmp_path: Path) -> None:
+    """Joins and other libraries read it again. Nothing else of the drive changes."""
+    root = Path(shutil.copytree(whole, tmp_path / "map"))
+    moved = Path(shutil.copy2(logs[0], tmp_path / logs[0].name))
+    before = tables(root)
+    cut, again = tmp_path / "cut.mcap", tmp_path / "again.mcap"
+    for bad in (cut, again):
+        bad.write_bytes(logs[0].read_bytes()[:200])
+    told = run_batch([moved, logs[0], cut, again], root, load_pipeline("default", QUICK), join=False)
+    assert (told["failed"], len(told["warnings"])) == (2, 1)
+    told["drives"] = told["drives"][:2]
+    # the path decides which is the known one, so the copy is another drive
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive-3", "computed"), ("drive", "unchanged")]
+    assert "the same recording, byte for byte" in told["warnings"][0]
+    told = run_batch([moved], Path(shutil.copytree(whole, tmp_path / "other")), load_pipeline("default", QUICK))
+    assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged")]
+    with map_store.reading(tmp_path / "other") as store:
+        assert store.drives()["drive"]["log"] == str(moved)
+    assert tables(tmp_path / "other") == before
+
+
+def test_a_join_that_fails_takes_no_fates_along(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Callable[..., Said]
+) -> None:
+    root, bad = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+
+    def full(*_: object) -> None:
+        raise ResultError("The disk is full.")
+
+    monkeypatch.setattr(batch, "join_drives", full)
+    said = verb("batch", *logs, "-o", root, *OPTIONS)
+    assert (said.code, said.out.count("unchanged")) == (1, 2)
+    assert said.err.splitlines()[-1] == (
+        f"vplog: error: The drives are in {root}, but not joined: The disk is full. Then join them: "
+        f"vplog map join {root}"
+    )
+    said = verb("batch", *logs, bad, "-o", root, *OPTIONS)
+    assert said.code == 1
+    assert "bad: failed, 0.0 s: " in said.err
+    assert "1 of 3 drives failed" in said.err
+    assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
+    monkeypatch.setattr("vplog.maps.storage.drive_ids.code_hash", lambda: "other code")
+    found = run_batch([bad], root, load_pipeline("default", QUICK), join=False)
+    assert "Another version of vplog or its packages made 2 of the drives" in found["warnings"][0]
+
+
+def test_what_was_found_stays_known_after_ctrl_c(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, bad = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "computed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_batch([bad, *logs], root, load_pipeline("default", QUICK))
+    assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
+
+
+def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, verb: Callable[..., Said]) -> None:
+    said = verb("batch", *logs, "-o", tmp_path / "map", "--odometry-file", tmp_path / "poses.tum")
+    assert "2 logs are given. Give each log by itself" in said.error
+
+
+@pytest.mark.parametrize(
+    ("bad", "closed", "code"),
+    [(False, "| true", 0), (True, "2>&1 | true", 1), (True, "2>/dev/full", 1)],
+)
+def test_the_exit_status_is_that_of_the_batch(
+    whole: Path, logs: list[Path], tmp_path: Path, bad: bool, closed: str, code: int
+) -> None:
+    """Whoever reads what it prints, or does not."""
+    root, given = shutil.copytree(whole, tmp_path / "map"), [*logs, *([tmp_path / "gone.bag"] if bad else [])]
+    options = [*OPTIONS, "--no-join", "--threads", "1"]
+    command = shlex.join([sys.executable, "-m", "vplog", "batch", *map(str, given), "-o", str(root), *options])
+    done = subprocess.run(
+        ["bash", "-c", f"{command} {closed}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True, text=True, check=False, env=os.environ | {"PYTHONUNBUFFERED": ""},
+    )  # fmt: skip
+    assert (done.returncode, "Exception ignored" in done.stderr) == (code, False), done.stderr
+    assert "Internal error" not in done.stderr
+    failures = Path(root, "failures.json")
+    assert bool(failures.exists() and json.loads(failures.read_text())) == bad
+
+
+def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "monday").mkdir()
+    monkeypatch.chdir(tmp_path / "monday")
+    found = (batch._name(Path()), batch._name(Path("../monday")), batch._place(Path("../monday")))
+    assert found == ("monday", "monday", str(tmp_path / "monday"))
+    (tmp_path / "far" / "below").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("far/below")
+    assert batch._place(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
+    assert (batch._place(Path("../link")), batch._name(Path("../link"))) == (str(tmp_path / "link"), "link")
+
+
+def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    with map_store.writing(tmp_path / "map") as store:
+        store.write_failures({"run": {"log": str(tmp_path / "a" / "run.mcap"), "error": "bad"}})
+    known = {drive: {"log": told["log"], "inputs": None} for drive, told in store.failures().items()}
+    names = [str(tmp_path / folder / "run.mcap") for folder in "ba"]
+    assert drive_names(["run", "run"], names, known, [{"run.mcap": "1"}, {"run.mcap": "2"}]) == ["run-2", "run"]
+
+
+def test_engines_that_are_not_there_are_said(logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = load_pipeline("default", QUICK)
+    with pytest.raises(SettingsError, match="Engines: local, ray"):
+        run_batch(logs, tmp_path / "map", pipeline, engine="slurm")
+    with pytest.raises(SettingsError, match="Add --engine ray"):
+        run_batch(logs, tmp_path / "map", pipeline, address="10.0.0.1:6379")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SettingsError, match=r"pip install 'vplog\[ray\]'"):
+        run_batch(logs, tmp_path / "map", pipeline, engine="ray")
+
+
+def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:
+    at = {name: tmp_path / name for name in ("short", "gone", "long", "same")}
+    for name, size in (("short", 10), ("long", 30), ("same", 10)):
+        at[name].write_bytes(bytes(size))
+    logs = {name: str(path) for name, path in at.items()}
+    like = Task("", "", tmp_path, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
+    wanted: list[dict[str, Any]] = [{"drive": name} for name in at]
+    with map_store.writing(tmp_path / "map") as store:
+        found = batch._tasks(store, wanted, like, logs, longest_first=True)
+        assert [task.drive for task in found] == ["long", "short", "same", "gone"]
+        assert [task.in_parts for task in found] == [True, False, False, False], "longer than all others together"
+        assert [task.in_parts for task in batch._tasks(store, wanted[:2], like, logs, True)] == [True, False]
+        at["same"].write_bytes(bytes(20))
+        assert not any(task.in_parts for task in batch._tasks(store, wanted, like, logs, True))
+        assert batch._tasks(store, wanted[1:2], like, logs, True)[0].in_parts, "it has all machines for itself"

@@ -1,0 +1,272 @@
+"""Both linear solvers do what dense matrices do, and which of them is taken decides nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+from tests.benchmarks.graphs import city, spoiled
+from tests.benchmarks.large_graphs import drives
+from tests.graph.drive import ring
+from tests.graph.gtsam_graph import as_values, weighted
+from vplog.data import EdgeKind
+from vplog.errors import GraphError
+from vplog.execution.cores import limited
+from vplog.geometry import se3
+from vplog.graph import normal_equations as normal
+from vplog.graph.consistency import is_loop, residual_sigma
+from vplog.graph.factors import Factors
+from vplog.graph.gnc import GncSettings
+from vplog.graph.least_squares import Objective, descend
+from vplog.graph.leave_one_out import cost_together, tension
+from vplog.graph.lm import LmSettings
+from vplog.graph.marginals import edge_covariances
+from vplog.graph.normal_equations import normal_equations
+from vplog.graph.solve import OptimiserSettings
+from vplog.graph.sparse import dense_front, frontal_inversion, linear
+from vplog.graph.sparse.cholesky import Cholesky
+from vplog.graph.sparse.frontal import Blocks
+from vplog.graph.sparse.linear import BayesTree, Supernodes
+from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
+from vplog.graph.sparse.symbolic import Elimination
+
+if TYPE_CHECKING:
+    from vplog.data import PoseGraph
+
+GRAPHS = {"planar": city(400, seed=1), "spatial": ring(80, loops=10).graph, "drives": drives(600, each=300, seed=2)}
+EXACT = {2: 1e-4, 3: 1e-7}
+"""GTSAM loses digits of a planar edge's derivative where its residual turns by less than a milliradian."""
+each_graph = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS)
+
+
+def random_matrix(nodes: int, chords: int, size: int, seed: int) -> tuple[Blocks, np.ndarray]:
+    """A positive definite matrix of a chain with chords, some of them twice, in blocks and dense (n d, n d)."""
+    random = np.random.default_rng(seed)
+    a = np.concatenate([np.arange(nodes - 1), random.integers(0, nodes, chords)])
+    b = np.concatenate([np.arange(1, nodes), random.integers(0, nodes, chords)])
+    ends = np.stack([a, b])[:, a != b].astype(np.int32)
+    a, b = np.repeat(ends, random.integers(1, 3, ends.shape[1]), axis=1)
+    by_a, by_b = random.normal(size=(2, len(a), size, size))
+    diagonal = np.tile(0.1 * np.eye(size), (nodes, 1, 1))
+    np.add.at(diagonal, a, np.swapaxes(by_a, 1, 2) @ by_a)
+    np.add.at(diagonal, b, np.swapaxes(by_b, 1, 2) @ by_b)
+    other = np.swapaxes(by_a, 1, 2) @ by_b
+    return Blocks(diagonal, a, b, other), whole_of(Blocks(diagonal, a, b, other))
+
+
+def whole_of(matrix: Blocks) -> np.ndarray:
+    nodes, size, _ = matrix.diagonal.shape
+    whole = np.zeros((nodes, nodes, size, size))
+    whole[range(nodes), range(nodes)] = matrix.diagonal
+    np.add.at(whole, (matrix.a, matrix.b), matrix.other)
+    np.add.at(whole, (matrix.b, matrix.a), np.swapaxes(matrix.other, 1, 2))
+    return whole.transpose(0, 2, 1, 3).reshape(nodes * size, -1)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "chords", "size"), [(1, 0, 3), (2, 0, 6), (40, 5, 1), (40, 30, 3), (300, 200, 3), (120, 150, 6)]
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords: int, size: int, seed: int) -> None:
+    matrix, whole = random_matrix(nodes, chords, size, seed)
+    random = np.random.default_rng(seed)
+    shape = Elimination.of(nodes, matrix.a, matrix.b)
+    assert sorted(shape.place.tolist()) == list(range(nodes))
+    factor = Cholesky.of(shape, matrix)
+    right = random.normal(size=(nodes, size, 2))
+    np.testing.assert_allclose(whole @ factor.solve(right).reshape(-1, 2), right.reshape(-1, 2), atol=1e-9)
+    inverse = np.linalg.inv(whole).reshape(nodes, size, nodes, size).transpose(0, 2, 1, 3)
+    largest = 1e-10 * np.abs(inverse).max()
+    some = random.permutation(len(matrix.a))[: len(matrix.a) // 2]
+    a, b = matrix.a[some], matrix.b[some]
+    for found, expected in zip(
+        inverse_blocks(factor, a, b), (inverse[a, a], inverse[a, b], inverse[b, b]), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=largest)
+    few = random.permutation(nodes)[:5]
+    expected = inverse[few][:, few].transpose(0, 2, 1, 3).reshape(len(few) * size, -1)
+    np.testing.assert_allclose(joint_inverse(factor, few), expected, rtol=0, atol=largest)
+    assert Cholesky.of(shape, matrix).values.tobytes() == factor.values.tobytes()
+
+
+def test_all_supernodes_are_in_one_run_or_above_all_of_them() -> None:
+    matrix, _ = random_matrix(400, 150, 3, 0)
+    shape = Elimination.of(400, matrix.a, matrix.b)
+    subtrees = shape.subtrees
+    runs = [list(range(*run)) for run in subtrees.runs]
+    assert sorted([node for run in runs for node in run] + subtrees.top) == list(range(len(shape.parent)))
+    for run, roots, after in zip(runs, subtrees.roots, subtrees.after, strict=True):
+        leaving = [node for node in run if shape.parent[node] not in run]
+        assert leaving == roots.tolist()
+        assert set(shape.parent[leaving].tolist()) <= {*subtrees.top, -1}
+        rows = np.concatenate([shape.rows[shape.start[node] : shape.start[node + 1]] for node in run])
+        np.testing.assert_array_equal(np.unique(rows[rows >= shape.first[run[-1] + 1]]), after)
+    for node, children in zip(subtrees.top, subtrees.children, strict=True):
+        np.testing.assert_array_equal(np.flatnonzero(shape.parent == node), children)
+
+
+def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (dense_front, frontal_inversion):
+        monkeypatch.setattr(module, "SHARED", 40)  # so that fronts of this size are shared
+    monkeypatch.setattr(normal, "_LEAST_SHARE", 16)
+    # closures all over it, so that its fronts are large
+    random, graph, more = np.random.default_rng(0), GRAPHS["drives"], 400
+    a, b = random.integers(0, 599, more), random.integers(1, 300, more)
+    like = random.integers(0, len(graph.a), more)
+    graph = replace(
+        graph,
+        a=np.concatenate([graph.a, a]).astype(np.int32),
+        b=np.concatenate([graph.b, (a + b) % 600]).astype(np.int32),
+        a_from_b=np.concatenate([graph.a_from_b, graph.a_from_b[like]]),
+        information=np.concatenate([graph.information, graph.information[like]]),
+        kind=graph.kind + [EdgeKind.LOOP] * more,
+    )
+    poses, weight = se3.between(graph.world_from_body[:1], graph.world_from_body), np.ones(len(graph.a))
+
+    def found() -> bytes:
+        matrix, gradient, error = normal_equations(graph, weight, poses)
+        matrix.diagonal[0] += 1e6 * np.eye(6)
+        factor = Cholesky.of(Elimination.of(len(poses), graph.a, graph.b), matrix)
+        assert np.diff(factor.shape.first).max() * 6 > 40
+        arrays = (matrix.diagonal, matrix.other, gradient, factor.values, factor.solve(gradient[:, :, None]))
+        return (
+            b"".join(one.tobytes() for one in (*arrays, *inverse_blocks(factor, graph.a, graph.b)))
+            + str(error).encode()
+        )
+
+    with limited(1):
+        alone = found()
+    for threads in (2, 5):
+        with limited(threads):
+            assert found() == alone
+
+
+def test_matrices_of_several_parts_are_solved() -> None:
+    matrix, _ = random_matrix(120, 40, 3, 0)
+    inside = (matrix.a // 30 == matrix.b // 30) & (matrix.a >= 30)  # 30 nodes alone, and three parts
+    parts = Blocks(matrix.diagonal, matrix.a[inside], matrix.b[inside], matrix.other[inside])
+    factor = Cholesky.of(Elimination.of(120, parts.a, parts.b), parts)
+    right = np.random.default_rng(0).normal(size=(120, 3, 1))
+    np.testing.assert_allclose(whole_of(parts) @ factor.solve(right).reshape(-1, 1), right.reshape(-1, 1), atol=1e-9)
+    inverse = np.linalg.inv(whole_of(parts)).reshape(120, 3, 120, 3).transpose(0, 2, 1, 3)
+    some = slice(0, None, 7)
+    _, found, _ = inverse_blocks(factor, parts.a[some], parts.b[some])
+    np.testing.assert_allclose(found, inverse[parts.a[some], parts.b[some]], atol=1e-10 * np.abs(inverse).max())
+
+
+@pytest.mark.parametrize("wrong", [-1.0, 0.0, np.nan])
+def test_a_matrix_that_is_not_positive_definite_is_refused(wrong: float) -> None:
+    matrix, _ = random_matrix(30, 5, 3, 0)
+    diagonal = matrix.diagonal.copy()
+    diagonal[17] *= wrong
+    with pytest.raises(GraphError, match="does not constrain"):
+        Cholesky.of(Elimination.of(30, matrix.a, matrix.b), matrix._replace(diagonal=diagonal))
+
+
+@each_graph
+def test_normal_equations_are_those_of_gtsam(graph: PoseGraph) -> None:
+    random = np.random.default_rng(0)
+    size, axes = (3, [2, 3, 4]) if graph.dimension == 2 else (6, list(range(6)))
+    twist = np.zeros((len(graph.world_from_body), 6))
+    twist[:, axes] = 0.2 * random.normal(size=(len(twist), size))
+    poses = se3.between(graph.world_from_body[:1], graph.world_from_body @ se3.exp(twist))
+    weight = random.uniform(0.1, 1.0, len(graph.a))
+    weight[3] = 0.0
+    matrix, gradient, error = normal_equations(graph, weight, poses)
+    assert error == pytest.approx(0.5 * (weight * residual_sigma(graph, poses) ** 2).sum(), rel=1e-12)
+    # weights of 0 leave no factor, and the gauge is on the first pose alone
+    linearised = weighted(graph, np.maximum(weight, 1e-30)).linearize(as_values(poses, graph.dimension))
+    expected, right = linearised.hessian()
+    order = [2, 0, 1] if graph.dimension == 2 else axes
+    expected = expected.reshape(-1, size, len(poses), size)[:, order][:, :, :, order].reshape(len(poses) * size, -1)
+    whole, right = whole_of(matrix), right.reshape(-1, size)[:, order]
+    np.testing.assert_allclose(
+        whole[size:, size:], expected[size:, size:], rtol=0, atol=EXACT[graph.dimension] * np.abs(whole).max()
+    )
+    np.testing.assert_allclose(gradient[1:], -right[1:], rtol=0, atol=EXACT[graph.dimension] * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize(("nodes", "chords", "size", "columns"), [(40, 30, 1, 3), (60, 40, 3, 2), (30, 20, 6, 1)])
+def test_both_linear_solvers_agree(nodes: int, chords: int, size: int, columns: int) -> None:
+    matrix, _ = random_matrix(nodes, chords, size, 0)
+    random = np.random.default_rng(1)
+    ours, gtsams = Supernodes.of(Elimination.of(nodes, matrix.a, matrix.b), matrix), BayesTree(matrix)
+    right = random.normal(size=(nodes, size, columns))
+    np.testing.assert_allclose(gtsams.solve(right), ours.solve(right), rtol=1e-7, atol=1e-9)
+    for one, other in zip(
+        gtsams.inverse_blocks(matrix.a, matrix.b), ours.inverse_blocks(matrix.a, matrix.b), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+    few = np.sort(random.permutation(nodes)[:4])
+    np.testing.assert_allclose(gtsams.joint_inverse(few), ours.joint_inverse(few), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, np.nan])
+def test_gtsam_refuses_what_is_not_positive_definite(wrong: float) -> None:
+    matrix, _ = random_matrix(30, 5, 3, 0)
+    diagonal = matrix.diagonal.copy()
+    diagonal[17] *= wrong
+    tree = BayesTree(matrix._replace(diagonal=diagonal))
+    with pytest.raises(GraphError, match="does not constrain"):
+        tree.solve(np.ones((30, 3, 1)))
+    with pytest.raises(GraphError, match="does not constrain"):
+        tree.inverse_blocks(matrix.a, matrix.b)
+
+
+@pytest.mark.parametrize("kind", ["lm", "gnc", "pcm", "dcs", "cauchy", "geman_mcclure"])
+@pytest.mark.parametrize("share", [0.0, 0.3])
+@each_graph
+def test_the_linear_solver_decides_nothing(
+    graph: PoseGraph, share: float, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same graph just below and just above the size from which supernodes are taken."""
+    graph, _ = spoiled(graph, share, 0)
+    method = TypeAdapter(OptimiserSettings).validate_python({"kind": kind})
+    monkeypatch.setattr(linear, "LARGE_POSES", len(graph.world_from_body) + 1)
+    below = method(graph)
+    monkeypatch.setattr(linear, "LARGE_POSES", len(graph.world_from_body))
+    above = method(graph)
+    assert above.iterations == below.iterations
+    assert above.reason == below.reason
+    np.testing.assert_allclose(above.weight, below.weight, atol=1e-6)
+    np.testing.assert_array_equal(above.weight > 0.5, below.weight > 0.5)
+    assert above.error_after == pytest.approx(below.error_after, rel=1e-6)
+    np.testing.assert_allclose(above.world_from_body, below.world_from_body, atol=1e-4)
+    assert method(graph).world_from_body.tobytes() == above.world_from_body.tobytes()
+
+
+@each_graph
+def test_the_linear_solver_changes_no_covariance(graph: PoseGraph, monkeypatch: pytest.MonkeyPatch) -> None:
+    poses, loops = LmSettings()(graph).world_from_body, np.flatnonzero(is_loop(graph))
+    factors, weight = Factors.of(graph), np.ones(len(graph.a))
+    objective = Objective(factors, weight)
+
+    def found() -> tuple[np.ndarray, float, np.ndarray]:
+        together = cost_together(factors, weight, poses, objective.information(poses), loops[:3])
+        return (
+            edge_covariances(objective, poses, loops),
+            together,
+            tension(factors, weight, poses, loops).cost,
+        )
+
+    covariance, together, cost = found()
+    monkeypatch.setattr(linear, "LARGE_POSES", 10)
+    ours, our_together, our_cost = found()
+    np.testing.assert_allclose(ours, covariance, rtol=1e-5, atol=1e-7 * np.abs(covariance).max())
+    assert our_together == pytest.approx(together, rel=1e-5)
+    np.testing.assert_allclose(our_cost, cost, rtol=1e-4, atol=1e-6)
+
+
+def test_drives_that_only_closures_join_are_solved_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linear, "LARGE_POSES", 10)
+    graph = GRAPHS["drives"]
+    solution = GncSettings()(graph)
+    assert solution.weight[is_loop(graph)].mean() > 0.9
+    apart = np.setdiff1d(np.arange(len(graph.a)), np.flatnonzero(is_loop(graph) & (graph.a < 300) & (graph.b >= 300)))
+    weight = np.where(np.isin(np.arange(len(graph.a)), apart), 1.0, 0.0)
+    alone = descend(Factors.of(graph), weight, graph.world_from_body, 20, 1e-6)
+    np.testing.assert_allclose(alone.world_from_body[300], graph.world_from_body[300], atol=1e-6)

@@ -1,0 +1,119 @@
+"""Chunks by other threads and from the cache, and messages found where they lie, are those of plain reading."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.logs.drives import Drive, foxglove_messages, ros_messages, write_foxglove, write_ros2
+from vplog.logs.formats import chunk_cache as chunks_module
+from vplog.logs.formats.chunk_cache import Chunks
+from vplog.logs.formats.compression import BadChunkError
+from vplog.logs.formats.container import Channel, Message, Notes, in_blocks
+from vplog.logs.formats.mcap_file import McapFile
+from vplog.logs.formats.mcap_walk import Walk
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CHANNELS = {i: Channel(f"/{i}", "sensor_msgs/msg/Image", "cdr") for i in range(3)}
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks_module, "_ALONE_S", 0.0)
+    size, lost, loaded = 2**20, [], []
+
+    def load(number: int) -> bytes:
+        loaded.append(number)
+        if number % 3 == 0:
+            raise BadChunkError("broken")
+        return bytes([number]) * size
+
+    chunks = Chunks(
+        load, lambda number, _: lost.append(number), lambda _: size, lambda number: number % 2 == 0, threads
+    )
+    for _ in range(2):
+        expected = [(n, None if n == 5 else b"" if n % 3 == 0 else bytes([n]) * size) for n in range(9)]
+        assert list(chunks.in_turn(range(9), lambda number: number == 5)) == expected
+    assert sorted(loaded) == sorted([*range(5), *range(6, 9), 1, 3, 7])  # even ones were kept
+    assert lost == [0, 3, 6, 3]
+    some = chunks.in_turn(range(100, 200))
+    next(some)
+    some.close()
+    assert loaded[-1] == 100  # who looks for one does not load those behind it
+
+
+def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks_module, "MOST_BYTES", 1000)
+    kept = chunks_module._Kept()
+    for number in range(50):
+        kept.put((number % 2, number), bytes(90))
+    assert kept._bytes == 90 * len(kept._chunks) <= 1000
+    assert kept.get((1, 49)) == bytes(90)
+    assert kept.get((0, 0)) is None
+    kept.forget(1)
+    assert kept._bytes == 90 * len(kept._chunks)
+    kept.put((0, 1), bytes(5000))  # larger than all that may be kept, and still there for who goes on with it
+    assert kept.get((0, 1)) == bytes(5000)
+
+
+records = st.lists(
+    st.tuples(st.sampled_from([1, 4, 5, 5, 5, 15]), st.integers(0, 3), st.sampled_from([0, 9, 500, 5000]))
+)
+
+
+@given(records, st.integers(0, 60), st.sets(st.integers(0, 2)))
+def test_messages_are_found_in_place_as_in_the_whole(
+    found: list[tuple[int, int, int]], cut: int, used: set[int]
+) -> None:
+    """Messages, some on channels that are not known, between other records; `cut` bytes are missing at the end."""
+    data = b""
+    for i, (opcode, channel, size) in enumerate(found):
+        body = struct.pack("<HIQQ", channel, i, 10 * i, i) if opcode == 5 else b""
+        body += bytes([i % 251]) * size
+        data += struct.pack("<BQ", opcode, len(body)) + body
+    data = data[: max(len(data) - cut, 0)]
+    wanted = {CHANNELS[i] for i in used}
+    for brief in ((), wanted):
+        defined: list[list] = [[], []]
+        walks = [
+            Walk(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief) for to in defined
+        ]
+        whole = walks[0].whole(data)
+        there = walks[1].in_place(lambda start, length: data[start : start + length])
+        assert defined[0] == defined[1]
+        assert walks[0].__dict__.keys() == walks[1].__dict__.keys()
+        for name in ("position", "unknown", "last_ns", "seen"):
+            assert getattr(walks[0], name) == getattr(walks[1], name)
+        assert (whole.channels, whole.log_ns, whole.places) == (there.channels, there.log_ns, there.places)
+        for a, b in zip(whole.messages(), there.messages(), strict=True):
+            least = 16 if brief and len(a.data) >= 4096 - 22 else len(a.data)
+            assert bytes(a.data[:least]) == bytes(b.data[:least])
+            assert bytes(a.data) == data[a.place[1] : a.place[2]]
+
+
+@given(st.lists(st.sampled_from([0, 5, 300, 5000])))
+def test_blocks_hold_the_messages(sizes: list[int]) -> None:
+    messages = [Message(CHANNELS[i % 3], i, bytes([i % 251]) * size, (i,)) for i, size in enumerate(sizes)]
+    assert [message for block in in_blocks(iter(messages)) for message in block.messages()] == messages
+
+
+@pytest.mark.parametrize("ros", [False, True])
+def test_messages_read_again_are_those_read_first(ros: bool, tmp_path: Path) -> None:
+    """From chunks that are packed, and from plain ones in the file."""
+    if ros:
+        path = write_ros2(tmp_path / "drive", ros_messages(Drive(), 2)) / "drive.mcap"
+    else:
+        path = write_foxglove(tmp_path / "drive.mcap", foxglove_messages(Drive()), "protobuf", chunk_size=4096)
+    file = McapFile(path, Notes())
+    counts = file.contents().counts
+    found = [(message, bytes(message.data)) for message in file.messages(counts)]
+    assert len(found) == sum(counts.values())
+    assert all(file.read(message.place) == data for message, data in found)
+    stamped = [m for block in file.blocks(counts, list(counts)) for m in block.messages()]
+    assert [(m.channel, m.log_ns, m.place) for m in stamped] == [(m.channel, m.log_ns, m.place) for m, _ in found]

@@ -1,0 +1,62 @@
+"""The solve of a drive as a whole: what the log claims of its odometry decides little, what closures agree on much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.graph.drive import ODOMETRY_SIGMA, ledger, position_error, ring
+from vplog.data import Odometry, Verdict
+from vplog.execution.execution import Execution
+from vplog.graph.consistency import is_loop
+from vplog.pipeline import Pipeline
+from vplog.run.back_end import solve
+
+if TYPE_CHECKING:
+    from tests.graph.drive import Drive
+    from vplog.run.back_end import Solved
+
+
+def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
+    """The drive with a constant covariance so many times its true one, its closures moved aside."""
+    loops = is_loop(drive.graph)
+    measured = drive.graph.a_from_b[loops].copy()
+    measured[:, 0, 3] += aside_m
+    closures = ledger(drive.graph.b[loops], drive.graph.a[loops], measured)
+    count = len(drive.odometry.stamp_ns)
+    odometry = Odometry(
+        drive.odometry.stamp_ns,
+        drive.odometry.odom_from_body,
+        np.tile(np.diag(claimed * ODOMETRY_SIGMA**2), (count, 1, 1)),
+    )
+    return solve(odometry, drive.keyframes, closures, None, Pipeline(), execution=Execution())
+
+
+@pytest.mark.parametrize("claimed", [1e-6, 1 / 64, 1.0, 64.0])
+def test_the_covariance_that_the_log_claims_decides_little(claimed: float) -> None:
+    drive = ring(240, 60, seed=4, noise=1.0)
+    honest, found = solved(drive, 1.0), solved(drive, claimed)
+    kept = [one.closures.verdict.count(Verdict.ACCEPTED) for one in (honest, found)]
+    assert abs(kept[0] - kept[1]) <= 0.1 * kept[0]
+    errors = [position_error(one.refined.solution.world_from_body, drive.true) for one in (honest, found)]
+    assert errors[1] < 1.1 * errors[0] + 0.02
+
+
+def test_a_covariance_that_closures_contradict_gives_way_to_the_drift_model() -> None:
+    drive = ring(240, 60, seed=4)
+    rough = replace(drive, odometry=replace(drive.odometry))
+    found = solved(rough, 1e-6)
+    told = " ".join(found.warnings)
+    assert "is implausible" in told
+    assert found.closures.verdict.count(Verdict.ACCEPTED) >= 50
+
+
+def test_poisoned_closures_end_with_the_odometry_and_say_so() -> None:
+    drive = ring(240, 60, seed=4)
+    found = solved(drive, 1.0, aside_m=30.0)
+    assert found.closures.verdict.count(Verdict.ACCEPTED) == 0
+    assert found.refined.solution.reason.startswith("Odometry was kept: ")
+    np.testing.assert_allclose(found.trajectory.world_from_body, drive.odometry.odom_from_body, atol=1e-9)

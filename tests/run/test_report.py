@@ -1,0 +1,357 @@
+"""The report: all it tells is in it, nothing from outside runs in it, a real browser shows it without a complaint."""
+
+from __future__ import annotations
+
+import dataclasses
+import html.parser
+import json
+import re
+import shutil
+import subprocess
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from vplog.data import Closures, Verdict
+from vplog.evaluate.body_truth import BodyTruth
+from vplog.evaluate.closures import score_closures
+from vplog.evaluate.truth import read_truth
+from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.results import mcap_read, tables
+from vplog.results.report.content import Judged
+from vplog.results.report.page import page as write_page
+from vplog.run.report import gather
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+
+    Verb = Callable[..., Said]
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+HOSTILE = "</script><script>document.title='owned';console.error('owned')</script><img src=x onerror=alert(1)>"
+
+
+class Page(html.parser.HTMLParser):
+    """Tags, and where anything is fetched from."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.sources: list[str] = []
+        self.ids: list[str] = []
+        self.scripts = 0
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "link", "img", "path", "input", "br", "!doctype"):
+            self.open.append(tag)
+        self.scripts += tag == "script"
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "action")]
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+        assert not [name for name, _ in attrs if name.startswith("on")]
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag != "path":
+            assert self.open.pop() == tag
+
+
+def ledger(text: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="ledger">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+@pytest.fixture(scope="session")
+def page(finished: Path) -> str:
+    return (finished / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_page_is_whole_and_fetches_nothing(page: str) -> None:
+    read = Page(page)
+    assert not read.open
+    assert len(set(read.ids)) == len(read.ids)
+    for source in read.sources:
+        assert source.startswith(("data:", "#")), source[:80]
+        assert not source.startswith("#") or source[1:] in read.ids
+    assert "://" not in re.sub(r'src="data:[^"]*"', "", page)
+    assert len(page) < 10e6
+
+
+def test_the_table_has_every_candidate(page: str, finished: Path) -> None:
+    closures = tables.read_closures(finished / "closures.parquet")
+    told = ledger(page)
+    rows = [dict(zip(told["columns"], row, strict=True)) for row in told["rows"]]
+    assert [row["row"] for row in rows] == list(range(len(closures)))
+    assert [row["verdict"] for row in rows] == [verdict.value for verdict in closures.verdict]
+    assert [row["inliers"] for row in rows] == closures.inliers.tolist()
+    assert [row["weight"] is None for row in rows] == np.isnan(closures.weight).tolist()
+
+
+def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finished: Path) -> None:
+    closures = tables.read_closures(finished / "closures.parquet")
+    pictures = mcap_read.read_pictures(finished / "result.mcap").pictures
+    assert ledger(page)["pictures"] == sorted(pictures)
+    assert {closures.verdict[row] for row in pictures} == set(closures.verdict)
+    for row, data in pictures.items():
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        assert min(image.shape[:2]) > 100
+        assert f'id="closure-{row}"' in page
+
+
+def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> None:
+    record = json.loads((finished / "run.json").read_text())
+    for name in record["stages"]:
+        if name != "report":  # it is written before it knows how long it took
+            assert f"<td>{name}</td>" in page
+    assert f"least matches {record['settings']['verify']['min_matches']}" in page
+    assert sum(record["library"]["used"]) > 0
+    for verdict in {Verdict(name) for name in record["counts"]["verdicts"]}:
+        assert verdict.sentence in page
+
+
+def test_same_run_same_bytes(verb: Verb, finished: Path, tmp_path: Path) -> None:
+    files = []
+    for name in ("one.html", "two.html"):
+        assert verb("report", finished, "-o", tmp_path / name).code == 0
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1]
+
+
+def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: Path) -> None:
+    found = verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "r.html", "--json").json
+    text = (tmp_path / "r.html").read_text()
+    assert found["bytes"] == (tmp_path / "r.html").stat().st_size
+    assert "Precision and recall" in text
+    told = ledger(text)
+    evaluation = verb("evaluate", finished, "--truth", drive.truth, "--json").json
+    assert f"{evaluation['ate_after']['rmse_m']:.3f}" in text
+    accepted = [row for row in (dict(zip(told["columns"], r, strict=True)) for r in told["rows"])
+                if row["verdict"] == "accepted"]  # fmt: skip
+    for name, count in (("true", "accepted_true"), ("same place", "same_place")):
+        assert sum(row[name] == "yes" for row in accepted) == evaluation["closures"][count] > 0
+    assert f"within {evaluation['closures']['criterion']['translation_m']:.2f} m and 5 deg" in text
+    narrow = ("--distance-m", 0.01, "--heading-deg", 3)
+    assert verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "n.html", *narrow).code == 0
+    assert "within 0.01 m and 3 deg" in (tmp_path / "n.html").read_text()
+    assert "give --truth" in verb("report", finished, "-o", tmp_path / "n.html", *narrow).error
+    gps = verb("report", finished, "--truth", "gps", "-o", tmp_path / "g.html")
+    assert gps.code == 0
+    assert "ATE rmse" in (tmp_path / "g.html").read_text()
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 3])
+def test_accepted_closures_that_are_false_stand_out(finished: Path, wrong: int) -> None:
+    """The map draws them apart, and the ledger has their truth beside the verdict."""
+    verdicts = tables.read_closures(finished / "closures.parquet").verdict
+    accepted = [row for row, verdict in enumerate(verdicts) if verdict is Verdict.ACCEPTED]
+    true, known = np.ones(len(verdicts), bool), np.ones(len(verdicts), bool)
+    true[accepted[:wrong]] = False
+    known[accepted[-1]] = False
+    text = write_page(gather(finished, {}, Judged("truth.tum", {}, true=true, known=known)))
+    assert ("accepted closures that are false" in text) == bool(wrong)
+    [edges] = re.findall(r'<path class="edge false" d="(.*?)"/>', text)
+    assert edges.count("M") == wrong
+    told = ledger(text)
+    assert told["columns"][1:3] == ["verdict", "true"]
+    assert [told["rows"][row][2] for row in accepted] == ["no"] * wrong + ["yes"] * (len(accepted) - 1 - wrong) + [None]
+
+
+def test_the_curves_enclose_the_average_precision(finished: Path, drive: Drive) -> None:
+    keyframes, _ = tables.read_keyframes(finished / "keyframes.parquet")
+    closures, truth = tables.read_closures(finished / "closures.parquet"), read_truth(drive.truth)
+    stop = candidate_stops(keyframes, ProposeSettings())
+    score, found = score_closures(keyframes, closures, BodyTruth(truth), stop)
+    for name, expected in (
+        ("score", score.average_precision),
+        ("inliers", score.average_precision_by_inliers),
+    ):
+        recall, precision, value = found.curves[name].T
+        assert (np.diff(recall) >= 0).all()
+        assert (np.diff(value) < 0).all()
+        assert (np.diff(recall, prepend=0.0) * precision).sum() == pytest.approx(expected)
+
+
+def test_pictures_come_from_the_log_where_the_run_kept_none(
+    verb: Verb, finished: Path, drive: Drive, tmp_path: Path
+) -> None:
+    from vplog.results.mcap import write_mcap
+
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    keyframes, world = tables.read_keyframes(folder / "keyframes.parquet")
+    graph, _, _ = tables.read_edges(folder / "edges.parquet", world)
+    closures = tables.read_closures(folder / "closures.parquet")
+    write_mcap(folder / "result.mcap", keyframes, world, graph, closures, tables.TableMetadata({}, ""))
+    assert verb("report", folder).code == 0
+    assert "<img" not in (folder / "report.html").read_text()
+    assert verb("report", folder, "--log", drive.log).code == 0
+    text = (folder / "report.html").read_text()
+    kept = mcap_read.read_pictures(finished / "result.mcap").pictures
+    assert ledger(text)["pictures"] == sorted(kept)
+    (tmp_path / "empty").mkdir()
+    cv2.imwrite(str(tmp_path / "empty" / "1.png"), np.zeros((80, 80), np.uint8))
+    assert "stamps" in verb("report", folder, "--log", tmp_path / "empty").error
+
+
+def test_damaged_and_unfinished_runs_are_one_line(verb: Verb, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    data = (folder / "result.mcap").read_bytes()
+    (folder / "result.mcap").write_bytes(data[: len(data) // 2])
+    assert "result.mcap cannot be read" in verb("report", folder).error
+    (folder / "result.mcap").unlink()
+    assert "does not exist" in verb("report", folder).error
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**record, "finished": False}))
+    assert "did not finish" in verb("report", folder).error
+    assert "run.json" in verb("report", tmp_path).error
+
+
+@pytest.fixture
+def hostile(finished: Path, tmp_path: Path) -> Path:
+    """A run whose names come from a stranger."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    record = json.loads((folder / "run.json").read_text())
+    record |= {"log": HOSTILE, "warnings": [HOSTILE], "noise": HOSTILE, "inputs": {HOSTILE: HOSTILE}}
+    record["solution"]["reason"] = HOSTILE
+    record["stages"] = {HOSTILE: {"seconds": HOSTILE}}
+    (folder / "run.json").write_text(json.dumps(record))
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(folder / "keyframes.parquet")
+    at = table.schema.get_field_index("drive")
+    pq.write_table(table.set_column(at, table.schema.field(at), [[HOSTILE] * len(table)]), folder / "keyframes.parquet")
+    return folder
+
+
+def test_what_strangers_wrote_is_text(verb: Verb, hostile: Path, page: str) -> None:
+    assert verb("report", hostile).code == 0
+    text = (hostile / "report.html").read_text()
+    assert Page(text).scripts == Page(page).scripts == 2
+    assert "onerror=alert(1)&gt;" in text
+    assert HOSTILE not in text
+
+
+def test_losses_are_placed_in_time(verb: Verb, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    record = json.loads((folder / "run.json").read_text())
+    start = int(tables.read_keyframes(folder / "keyframes.parquet")[0].stamp_ns[0])
+    spans = [[start + 1_000_000_000, start + 2_000_000_000], [start + 3_000_000_000, start + 3_500_000_000]]
+    loss = {"reason": "cut", "topic": "/a<b", "messages": 450, "of": 1500, "spans_ns": spans, "detail": "no footer"}
+    unknown = {"reason": "damaged_bytes", "topic": "", "messages": None, "of": None, "spans_ns": []}
+    (folder / "run.json").write_text(json.dumps({**record, "losses": [loss, unknown]}))
+    assert verb("report", folder).code == 0
+    text = (folder / "report.html").read_text()
+    assert "<td>/a&lt;b</td><td>450</td><td>1\u202f500</td><td>1.0 to 3.5</td>" in text
+    assert "cut: no footer" in text
+    assert "damaged_bytes" in text
+
+
+def test_a_record_of_any_shape_is_shown_as_far_as_it_goes(verb: Verb, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "run.json").write_text(
+        json.dumps({"finished": True, "stages": [1], "library": {"used": "x"}, "warnings": 3})
+    )
+    assert verb("report", folder).code == 0
+    Page((folder / "report.html").read_text())
+
+
+# In a real browser
+
+
+@pytest.fixture(scope="session")
+def browser() -> str:
+    found = [path for name in BROWSERS if (path := shutil.which(name))]
+    if not found:
+        pytest.skip(f"none of {', '.join(BROWSERS)} is installed")
+    return found[0]
+
+
+def opened(browser: str, page: Path, tmp_path: Path, *options: str) -> tuple[str, str]:
+    """The page after its script has run, and what the browser's console said."""
+    flags = [
+        "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+        "--disable-background-networking", "--disable-component-update", f"--user-data-dir={tmp_path / 'profile'}",
+        "--enable-logging=stderr", "--virtual-time-budget=2000",
+    ]  # fmt: skip
+    command = [browser, *flags, *options, page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+
+
+def cells(dom: str) -> list[list[str]]:
+    body = re.search(r'<tbody id="rows">(.*?)</tbody>', dom, re.DOTALL)
+    assert body is not None
+    rows = re.findall(r"<tr>(.*?)</tr>", body[1])
+    return [[re.sub("<[^>]*>", "", cell) for cell in re.findall(r"<td.*?>(.*?)</td>", row)] for row in rows]
+
+
+def test_a_browser_fills_and_sorts_the_table_without_a_complaint(
+    browser: str, finished: Path, page: str, tmp_path: Path
+) -> None:
+    clicks = (
+        "<script>const f=document.getElementById('filter');f.value='accepted';f.dispatchEvent(new Event('change'));"
+        "[...document.querySelectorAll('#closures th button')].find(b=>b.textContent==='matches').click();</script>"
+    )
+    (tmp_path / "page.html").write_text(page.replace("</body>", f"{clicks}</body>"))
+    dom, console = opened(browser, tmp_path / "page.html", tmp_path, "--dump-dom")
+    assert not console
+    closures = tables.read_closures(finished / "closures.parquet")
+    accepted = [row for row, verdict in enumerate(closures.verdict) if verdict is Verdict.ACCEPTED]
+    shown = cells(dom)
+    assert len(shown) == min(len(accepted), 100)
+    at = ledger(page)["columns"].index("matches")
+    assert [int(row[at]) for row in shown] == sorted(closures.matches[accepted].tolist(), reverse=True)[:100]
+    assert {row[1] for row in shown} == {"accepted"}
+
+
+def test_a_browser_runs_nothing_of_a_strangers(verb: Verb, browser: str, hostile: Path, tmp_path: Path) -> None:
+    assert verb("report", hostile).code == 0
+    dom, console = opened(browser, hostile / "report.html", tmp_path, "--dump-dom")
+    assert not console
+    assert "<title>owned" not in dom
+    assert cells(dom)
+
+
+def test_a_run_that_proposed_nothing_is_a_page_too(verb: Verb, browser: str, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    closures = tables.read_closures(folder / "closures.parquet")
+    none = Closures(**{field.name: getattr(closures, field.name)[:0] for field in dataclasses.fields(Closures)})
+    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    tables.write_closures(folder / "closures.parquet", none, keyframes, tables.TableMetadata({}, ""))
+    assert verb("report", folder).code == 0
+    dom, console = opened(browser, folder / "report.html", tmp_path, "--dump-dom")
+    assert not console
+    assert "Nothing was proposed" in dom
+
+
+@pytest.mark.parametrize("size", ["1280,900", "500,900"])
+def test_nothing_is_wider_than_the_window(browser: str, page: str, tmp_path: Path, size: str) -> None:
+    """Tables scroll inside their box, so the page itself never scrolls sideways; dark paper where dark is asked for."""
+    probe = "<script>document.title=[document.documentElement.scrollWidth<=innerWidth]</script>"
+    (tmp_path / "page.html").write_text(page.replace("</body>", f"{probe}</body>"))
+    dom, console = opened(browser, tmp_path / "page.html", tmp_path, f"--window-size={size}", "--dump-dom")
+    assert "<title>true</title>" in dom
+    assert not console
+    shots = []
+    for scheme in ("0", "1"):  # blink's numbers of dark and light
+        flags = (f"--window-size={size}", f"--blink-settings=preferredColorScheme={scheme}")
+        opened(browser, tmp_path / "page.html", tmp_path, *flags, f"--screenshot={tmp_path / scheme}.png")
+        shot = cv2.imread(f"{tmp_path / scheme}.png")
+        assert shot is not None
+        shots.append(float(shot[:, :4].mean()))
+    dark, light = shots
+    assert dark < 60
+    assert light > 200

@@ -1,0 +1,127 @@
+"""Web servers that lie, stop or lead astray: each is one line, and none is waited for without end."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from vplog.storage import http
+from vplog.storage.http import get_range, head
+from vplog.storage.remote_path import located
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from conftest import Said
+
+DATA = bytes(range(256)) * 40
+FOUND = f"HTTP/1.1 200 OK\r\nContent-Length: {len(DATA)}\r\n\r\n".encode()
+PART = b"HTTP/1.1 206 Partial Content\r\nContent-Length: 10\r\n"
+
+
+@contextmanager
+def saying(answer: Callable[[str], bytes]) -> Iterator[str]:
+    """A server that answers each request, of which it is given the first lines, with these bytes, and hangs up."""
+
+    def serve() -> None:
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            with connection:
+                said = b""
+                while b"\r\n\r\n" not in said and (more := connection.recv(65536)):
+                    said += more
+                connection.sendall(answer(said.decode()))
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}/drive.mcap"
+        server.shutdown(socket.SHUT_RDWR)
+    thread.join(5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (b"\x1b[31m\xff\xfe garbage\r\n\r\n", "is not HTTP"),
+        (b"HTTP/1.1 200 OK\r\n" + b"X: y\r\n" * 500 + b"\r\n", "is not HTTP"),
+        (b"HTTP/1.1 200 OK\r\nX: " + b"y" * 100_000 + b"\r\n\r\n", "is not HTTP"),
+        (b"", "is not HTTP"),
+        (b"HTTP/1.1 302 Found\r\nLocation: /drive.mcap\r\n\r\n", "infinite loop"),
+        (b"HTTP/1.1 302 Found\r\nLocation: file:///etc/passwd\r\n\r\n", "not allowed"),
+        (b"HTTP/1.1 302 Found\r\nLocation: ftp://127.0.0.1:1/a\r\n\r\n", "unknown url type"),
+        (b"HTTP/1.1 500 No \x1b[31m" + b"y" * 900 + b"\r\n\r\n", "[31myyy"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n", "does not say how long"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: abc\r\n\r\n", "does not say how long"),
+        (b"HTTP/1.1 403 Forbidden\r\n\r\n", "403 Forbidden"),
+    ],
+)
+def test_what_is_no_file_is_one_line(answer: bytes, told: str, verb: Callable[..., Said]) -> None:
+    with saying(lambda _: answer) as url:
+        assert told in (said := verb("info", url).error)
+        assert all(one.isprintable() for one in said)
+        assert len(said) < 400
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (b"HTTP/1.1 206 Partial Content\r\nContent-Length: 0\r\n\r\n", "sends none from byte 100"),
+        (PART + b"\r\n", "sends none from byte 100"),
+        (PART + b"Content-Range: bytes 0-9/10240\r\n\r\n" + DATA[:10], "from byte 0 on, not from byte 100"),
+        (b"HTTP/1.1 206 P\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\nabc", "is not HTTP"),
+        (FOUND + DATA, "does not answer range requests"),
+    ],
+)
+def test_a_part_that_is_not_what_was_asked_for_is_refused(answer: bytes, told: str) -> None:
+    with saying(lambda _: answer) as url, pytest.raises(OSError, match=told):
+        get_range(url, 100, 10, len(DATA))
+
+
+def test_a_part_is_never_longer_than_asked_and_a_short_one_is_taken() -> None:
+    found = b"HTTP/1.1 206 P\r\nContent-Length: 10240\r\n\r\n"
+    with saying(lambda _: found + DATA) as url:
+        assert get_range(url, 0, 10, len(DATA)) == DATA[:10]
+    with saying(lambda _: PART + b"\r\n" + DATA[:4]) as url:
+        assert get_range(url, 0, 10, len(DATA)) == DATA[:4]
+
+
+def test_a_server_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "_TIMEOUT_S", 1e-9)
+    monkeypatch.setattr(http, "_SLOWEST", 1e12)
+    opener: Any = http._opener()
+    opened = opener.open
+    monkeypatch.setattr(opener, "open", lambda request, timeout: opened(request, timeout=30))
+    with saying(lambda _: PART + b"\r\n" + DATA[:10]) as url, pytest.raises(OSError, match="bytes a second"):
+        get_range(url, 0, 10, len(DATA))
+
+
+def test_a_link_that_allows_no_head_is_read() -> None:
+    """As links to object stores do that are signed for GET."""
+
+    def answer(said: str) -> bytes:
+        if said.startswith("HEAD"):
+            return b"HTTP/1.1 403 Forbidden\r\n\r\n"
+        first, last = (int(part) for part in said.partition("bytes=")[2].split("\r\n")[0].split("-"))
+        part = DATA[first : last + 1]
+        about = f"Content-Length: {len(part)}\r\nContent-Range: bytes {first}-{last}/{len(DATA)}\r\n\r\n"
+        return b"HTTP/1.1 206 Partial Content\r\n" + about.encode() + part
+
+    with saying(answer) as url:
+        path = located(f"{url}?X-Signature=abc")
+        assert path.stat().st_size == len(DATA)
+        assert path.name == "drive.mcap"
+        assert path.read_bytes() == DATA
+
+
+def test_nothing_there_is_nothing() -> None:
+    with saying(lambda _: b"HTTP/1.1 404 Not Found\r\n\r\n") as url:
+        assert head(url) == {}
+        assert not located(url).exists()

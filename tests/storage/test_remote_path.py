@@ -1,0 +1,205 @@
+"""Logs and results by URL, against a server that speaks S3 and a web server that answers ranges, both on loopback."""
+
+from __future__ import annotations
+
+import json
+import threading
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING
+
+import pytest
+
+from vplog import logs
+from vplog.errors import LogError, ResultError, SettingsError
+from vplog.run.provenance import library_at, library_of
+from vplog.storage.remote_path import RemotePath, local_copy, local_output, located
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+
+QUICK = [f"--set={one}" for one in ("features.max_features=400", "propose.per_query=2", "library.size=5")]
+
+
+class RangeHandler(SimpleHTTPRequestHandler):
+    """Files with byte ranges, as web servers answer them."""
+
+    asked: list[int]
+
+    def do_GET(self) -> None:
+        path = self.translate_path(self.path)
+        wanted = self.headers.get("Range")
+        try:
+            with open(path, "rb") as file:  # noqa: PTH123
+                data = file.read()
+        except OSError:
+            self.send_error(404)
+            return
+        if wanted:
+            first, last = (int(part) for part in wanted.removeprefix("bytes=").split("-"))
+            self.send_response(206)
+            data = data[first : last + 1]
+        else:
+            self.send_response(200)
+        type(self).asked.append(len(data))
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@contextmanager
+def web(folder: Path) -> Iterator[str]:
+    RangeHandler.asked = []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(RangeHandler, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture(scope="module")
+def bucket() -> Iterator[str]:
+    """A bucket on a server that speaks S3."""
+    moto = pytest.importorskip("moto.server", reason="moto speaks S3 on loopback: pip install 'moto[server]'")
+    from pyarrow import fs
+
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        patch.setenv("AWS_ACCESS_KEY_ID", "test")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+        patch.setenv("AWS_REGION", "us-east-1")
+        fs.S3FileSystem(endpoint_override=f"http://{host}:{port}", allow_bucket_creation=True).create_dir("drives")
+        yield "s3://drives"
+    server.stop()
+
+
+def put(source: Path, url: str) -> None:
+    with local_output(located(url)) as folder:
+        folder.mkdir()
+        (folder / source.name).write_bytes(source.read_bytes())
+
+
+def test_a_log_on_s3_reads_as_the_file_does(drive: Drive, bucket: str) -> None:
+    put(drive.log, f"{bucket}/one")
+    there, here = logs.open(located(f"{bucket}/one/drive.mcap")), logs.open(drive.log)
+    assert (there.stamps() == here.stamps()).all()
+    stamps = here.stamps()[[3, 20]]
+    for one, other in zip(there.frames(stamps), here.frames(stamps), strict=True):
+        assert (one.decode().image == other.decode().image).all()
+    odometry, known = there.odometry(), here.odometry()
+    assert odometry is not None
+    assert known is not None
+    assert len(odometry.stamp_ns) == len(known.stamp_ns)
+    assert there.name == "drive"
+
+
+def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(drive: Drive, bucket: str, verb: Callable[..., Said]) -> None:
+    put(drive.log, f"{bucket}/two")
+    found = verb("run", f"{bucket}/two/drive.mcap", "-o", f"{bucket}/runs/a", "--threads", 2, "--json", *QUICK).json
+    assert found["run"] == f"{bucket}/runs/a"
+    assert found["log"] == f"{bucket}/two/drive.mcap"
+    assert list(found["inputs"]) == ["drive.mcap"]
+    names = {path.name for path in located(f"{bucket}/runs/a").iterdir()}
+    assert {"run.json", "result.mcap", "closures.parquet", "trajectory.tum"} <= names
+    assert json.loads((located(f"{bucket}/runs/a") / "run.json").read_text())["finished"] is True
+    put(drive.truth, f"{bucket}/two")
+    truth = f"{bucket}/two/{drive.truth.name}"
+    assert verb("evaluate", f"{bucket}/runs/a", "--truth", truth, "--json").json["closures"]["keyframes"] > 40
+    assert "Cannot read s3://" in verb("evaluate", f"{bucket}/runs/a", "--truth", f"{truth}.not").error
+    assert verb("evaluate", f"{bucket}/runs/a", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
+
+
+def test_a_web_server_is_asked_for_parts(drive: Drive) -> None:
+    with web(drive.log.parent) as url:
+        log = logs.open(located(f"{url}/drive.mcap"))
+        frame = next(log.frames(log.stamps()[-1:]))
+        assert frame.decode().image.shape[0] > 100
+        assert max(RangeHandler.asked) <= 1 << 20 < drive.log.stat().st_size
+        with pytest.raises(LogError, match="no such file"):
+            logs.open(located(f"{url}/none.mcap"))
+        with pytest.raises(SettingsError, match="for reading"), local_output(located(f"{url}/out")):
+            pass
+
+
+def test_what_is_not_there_is_said_in_one_line(bucket: str, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    assert "no such file" in verb("info", f"{bucket}/nothing.mcap").error
+    assert "nothing at" in verb("evaluate", f"{bucket}/nothing", "--truth", "gps").error
+    with pytest.raises(ResultError, match="Cannot write"), local_output(located("s3://no-such-bucket/a")) as folder:
+        folder.mkdir()
+        (folder / "run.json").write_text("{}")
+    wrong = verb("info", "ftp://somewhere/a.mcap")
+    assert wrong.code == 2
+    assert "ftp:// is not known" in wrong.err
+    refused = verb("info", "http://127.0.0.1:1/a.mcap")
+    assert refused.code == 1
+    assert "Cannot read http://127.0.0.1:1/a.mcap" in refused.error
+
+
+def test_a_single_file_is_sent(bucket: str, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    graph = tmp_path / "in.g2o"
+    graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    verb("optimize", graph, "-o", f"{bucket}/solved/out.g2o")
+    verb("optimize", graph, "-o", tmp_path / "out.g2o")
+    with located(f"{bucket}/solved/out.g2o").open("rb") as stream:
+        assert stream.read() == (tmp_path / "out.g2o").read_bytes()
+    for asked in (("map", "export", tmp_path), ("export", tmp_path, "--format", "tum"), ("report", tmp_path)):
+        said = verb(*asked, "-o", f"{bucket}/file")
+        assert said.code == 2
+        assert "must be a local file" in said.err
+
+
+def test_a_copy_is_known_by_what_it_is_of(bucket: str, tmp_path: Path) -> None:
+    (tmp_path / "library.json").write_text("{}")
+    put(tmp_path / "library.json", f"{bucket}/library")
+    with local_copy(located(f"{bucket}/library")) as folder:
+        assert library_of(folder) == f"{bucket}/library"
+        assert library_of(tmp_path) == str(tmp_path)
+    with library_at(tmp_path / "run", {"library": {"from": f"{bucket}/library"}}) as library:
+        assert (library / "library.json").read_text() == "{}"
+    with library_at(tmp_path / "run", {"library": {"from": str(tmp_path)}}) as library:
+        assert library == tmp_path
+    with pytest.raises(ResultError, match=r"library\.from"), library_at(tmp_path, {"library": 3}):
+        pass
+
+
+def test_a_run_by_url_is_begun_again(bucket: str, verb: Callable[..., Said]) -> None:
+    said = verb("run", "--resume", "-o", f"{bucket}/run")
+    assert said.code == 2
+    assert "uploaded when finished" in said.err
+
+
+def test_nothing_is_sent_of_what_failed(bucket: str) -> None:
+    with pytest.raises(ValueError, match="stop"), local_output(located(f"{bucket}/failed")) as folder:
+        folder.mkdir()
+        (folder / "a").write_text("a")
+        raise ValueError("stop")
+    assert not located(f"{bucket}/failed").exists()
+
+
+def test_paths_stay_paths(tmp_path: Path) -> None:
+    assert located(tmp_path) == tmp_path
+    assert located("a/b") == located("a/b")
+    remote = RemotePath("s3://bucket/folder/drive.mcap")
+    assert (remote.name, remote.stem, remote.suffix) == ("drive.mcap", "drive", ".mcap")
+    assert str(remote.relative_to(RemotePath("s3://bucket/folder"))) == "drive.mcap"
+    named = RemotePath("s3://bucket/a%20b") / "drive=x%2Fy" / "z"
+    assert named.place[1] == "bucket/a b/drive=x%2Fy/z", "a URL is unquoted, a name is as it is"
+    assert RemotePath(str(named)).place == named.place
+    assert named.relative_to(RemotePath("s3://bucket/a%20b")).as_posix() == "drive=x%2Fy/z"
+    with local_copy(tmp_path) as same:
+        assert same == tmp_path

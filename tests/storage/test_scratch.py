@@ -1,0 +1,148 @@
+"""Folders that travel arrive as they were, are unpacked once, and leave nothing behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from vplog.errors import ResultError
+from vplog.storage import scratch as scratch_of
+from vplog.storage.scratch import (
+    files_in,
+    own_folder,
+    packed,
+    pieces,
+    put_in_place,
+    replacing,
+    scratch,
+    unpacked,
+    write_pieces,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The temporary folder of a machine."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return tmp_path
+
+
+def make_folder(place: Path) -> Path:
+    (place / "below").mkdir(parents=True)
+    (place / "a.bin").write_bytes(bytes(range(256)) * 3)
+    (place / "below" / "empty").touch()
+    (place / ".features").write_bytes(b"nobody's")
+    return place
+
+
+def test_a_folder_comes_back_from_its_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scratch_of, "_PIECE_BYTES", 100)
+    source, target = make_folder(tmp_path / "source"), tmp_path / "target"
+    assert files_in(source) == ["a.bin", "below/empty"]
+    for name in files_in(source):
+        parts = list(pieces(source / name))
+        assert all(part.size <= 100 for part in parts)
+        write_pieces(target, name, iter(parts))
+        assert (target / name).read_bytes() == (source / name).read_bytes()
+    for name in ("../out", "/out", "below/../../out"):
+        with pytest.raises(ResultError, match="not inside"):
+            write_pieces(target, name, iter([np.zeros(1, np.uint8)]))
+
+
+def test_it_is_unpacked_once_and_again_where_something_is_missing(tmp_path: Path, machine: Path) -> None:
+    files = packed(make_folder(tmp_path / "source"))
+    place = unpacked(files, "library-1")
+    assert place.is_relative_to(machine)
+    assert {name: data.tobytes() for name, data in packed(place).items()} == {
+        name: data.tobytes() for name, data in files.items()
+    }
+    before = (place / "a.bin").stat().st_ino
+    assert unpacked(files, "library-1") == place
+    assert (place / "a.bin").stat().st_ino == before
+    (place / "below" / "empty").unlink()
+    assert files_in(unpacked(files, "library-1")) == ["a.bin", "below/empty"]
+    assert list(own_folder().iterdir()) == [place]
+
+
+def test_what_a_killed_process_leaves_goes_when_the_next_one_comes(machine: Path) -> None:
+    code = f"""
+import os, tempfile
+tempfile.tempdir = {str(machine)!r}
+from vplog.storage.scratch import scratch
+with scratch("run") as folder:
+    (folder / "large").touch()
+    os.kill(os.getpid(), 9)
+"""
+    subprocess.run([sys.executable, "-c", code], check=False)
+    [left] = own_folder().iterdir()
+    assert (left / "large").exists()
+    with scratch("run") as first, scratch("run") as second:
+        assert sorted(own_folder().iterdir()) == sorted([first, second]), "of those that run none is taken"
+    assert not list(own_folder().iterdir())
+
+
+def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, machine: Path) -> None:
+    (tmp_path / "theirs").mkdir()
+    own = own_folder()
+    assert own.parent == machine
+    own.rmdir()
+    own.symlink_to(tmp_path / "theirs")
+    with pytest.raises(ResultError, match="TMPDIR"):
+        own_folder()
+
+
+def written_in_pieces(path: Path) -> None:
+    write_pieces(path.parent, path.name, iter([np.arange(9, dtype=np.uint8)]))
+
+
+def written_as_a_whole(path: Path) -> None:
+    with replacing(path) as stream:
+        stream.write(b"whole")
+
+
+def moved_folder(path: Path) -> None:
+    put_in_place(make_folder(path.parent / "made"), path)
+
+
+@pytest.mark.parametrize("write", [written_in_pieces, written_as_a_whole, moved_folder])
+def test_content_is_on_the_disk_before_its_name_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], None]
+) -> None:
+    """Every file that is renamed was synced before, and the folder that has its new name after."""
+    synced, events, fsync, replace = set[int](), list[str](), os.fsync, Path.replace
+
+    def note_sync(handle: int) -> None:
+        synced.add(os.fstat(handle).st_ino)
+        events.append("folder" if os.fstat(handle).st_ino == tmp_path.stat().st_ino else "file")
+        fsync(handle)
+
+    def note_rename(self: Path, target: Path) -> Path:
+        assert {one.stat().st_ino for one in [self, *self.rglob("*")]} <= synced
+        events.append("rename")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(Path, "replace", note_rename)
+    write(tmp_path / "result")
+    assert (tmp_path / "result").exists()
+    assert events[-2:] == ["rename", "folder"]
+    assert "file" in events[:-2]
+
+
+def test_what_a_process_leaves_that_is_killed_meanwhile_goes_with_the_block(tmp_path: Path) -> None:
+    with scratch("run", tmp_path) as own:
+        left = tmp_path / "run-1-left"
+        left.mkdir()
+        (left / ".lock").touch()
+        (left / "run.json").touch()
+    assert not own.exists()
+    assert not left.exists()

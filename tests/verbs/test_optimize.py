@@ -1,0 +1,166 @@
+"""`vplog optimize` from file to file, as a function and as the verb."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.graphs import city, spoiled
+from vplog.cli import main, results
+from vplog.errors import GraphError, ResultError
+from vplog.geometry import se3
+from vplog.graph.consistency import is_loop, odometry_chain
+from vplog.graph.solve import OptimiserSettings
+from vplog.results.g2o import read_g2o, write_g2o
+from vplog.verbs.optimize import optimize
+
+CITY, FALSE = spoiled(city(200, seed=5), 0.3, 0)
+PUBLIC = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2] / "shared" / "data")) / "posegraphs"
+EDGE = "1 0 0 100 0 0 100 0 100\n"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "in.g2o"
+    write_g2o(path, CITY, CITY.world_from_body, np.arange(200) * 3 + 50, held=7)
+    return path
+
+
+@pytest.mark.parametrize("kind", results._SOLVERS)
+def test_every_method_solves_and_nothing_is_lost(path: Path, tmp_path: Path, kind: str) -> None:
+    done = optimize(path, tmp_path / "out.g2o", kind)
+    before, after = read_g2o(path), read_g2o(tmp_path / "out.g2o")
+    np.testing.assert_array_equal(after.ids, before.ids)
+    np.testing.assert_allclose(after.graph.a_from_b, before.graph.a_from_b, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(after.graph.information, before.graph.information)
+    np.testing.assert_allclose(after.graph.world_from_body, done.solution.world_from_body, atol=1e-12)
+    # FIX 71, the eighth
+    assert after.held == 7
+    np.testing.assert_allclose(after.graph.world_from_body[7], before.graph.world_from_body[7], atol=1e-12)
+    record = json.loads(json.dumps(done.record))
+    assert record["method"] == kind
+    assert record["kept"] + record["rejected"] == record["loops"] == is_loop(CITY).sum()
+    assert record["error_after"] <= record["error_before"]
+    if kind in ("gnc", "pcm"):
+        false = np.flatnonzero(FALSE)
+        expected = {(int(50 + 3 * CITY.a[edge]), int(50 + 3 * CITY.b[edge])) for edge in false}
+        assert expected <= set(map(tuple, record["rejected_edges"]))
+
+
+def test_the_methods_of_the_command_line_are_those_of_the_seam() -> None:
+    assert set(results._SOLVERS) == {settings().kind for settings in get_args(get_args(OptimiserSettings)[0])}
+
+
+def test_closures_that_bend_the_odometry_are_not_believed(path: Path, tmp_path: Path) -> None:
+    done = optimize(path, tmp_path / "out.g2o", "lm")
+    assert done.record["odometry_kept"]
+    assert "Odometry was kept" in done.record["reason"]
+    chain = odometry_chain(read_g2o(path).graph)[0]
+    moved = CITY.world_from_body[7] @ se3.inverse(chain[7]) @ chain
+    np.testing.assert_allclose(done.solution.world_from_body, moved, atol=1e-9)
+
+
+def test_parts_are_solved_each_by_itself_and_that_is_said(tmp_path: Path) -> None:
+    text = "".join(f"VERTEX_SE2 {node} {node} 9 0\n" for node in (0, 1, 2, 40, 41, 42, 99))
+    text += "".join(f"EDGE_SE2 {a} {b} {EDGE}" for a, b in ((0, 1), (1, 2), (40, 41), (41, 42), (40, 42)))
+    (tmp_path / "in.g2o").write_text(text)
+    done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o", "lm")
+    said = " ".join(done.record["warnings"])
+    assert "2 unconnected parts" in said
+    assert "from 0, 40 on" in said
+    assert "1 poses have no edge" in said
+    poses = read_g2o(tmp_path / "out.g2o").graph.world_from_body
+    np.testing.assert_allclose(poses[:3, 0, 3], [0, 1, 2])
+    np.testing.assert_allclose(poses[3:6, 0, 3], [40, 41 - 1 / 3, 41 + 1 / 3], atol=1e-6)  # two of one, one of two
+    np.testing.assert_allclose(poses[6, :2, 3], [99, 9])
+
+
+def test_indefinite_information_is_mended_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "in.g2o").write_text(f"EDGE_SE2 0 1 {EDGE}EDGE_SE2 1 2 1 0 0 100 200 0 100 0 100\n")
+    done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o")
+    assert any("not positive" in text for text in done.record["warnings"])
+
+
+def test_what_cannot_be_is_said(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match="is not a file"):
+        optimize(tmp_path / "none.g2o", tmp_path / "out.g2o")
+    with pytest.raises(ResultError, match="Cannot write"):
+        optimize(path, tmp_path / "none" / "out.g2o")
+
+
+def test_the_verb(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["vplog", *words])
+        with pytest.raises(SystemExit) as end:
+            main.main(words)
+        code, read = end.value.code, capsys.readouterr()
+        return code if isinstance(code, int) else 0, read.out, read.err
+
+    out = str(tmp_path / "out.g2o")
+    code, told, _ = said("optimize", str(path), "-o", out, "--json")
+    assert code == 0
+    assert json.loads(told)["poses"] == 200
+    code, told, _ = said("optimize", str(path), "-o", out, "--method", "dcs")
+    assert code == 0
+    assert "closures" in told
+    (tmp_path / "bad.g2o").write_text(f"EDGE_SE2 0 1 {EDGE.replace('1 0 0 1', 'nan 0 0 1', 1)}")
+    code, told, error = said("optimize", str(tmp_path / "bad.g2o"), "-o", out)
+    assert (code, told) == (1, "")
+    assert "line 1: 'nan' is not a finite number" in error
+    assert said("optimize", str(path), "-o", out, "--method", "magic")[0] == 2
+
+
+def public(name: str) -> Path:
+    if not (PUBLIC / name).exists():
+        pytest.skip(f"{PUBLIC / name} is not there; set VPLOG_DATA to the folder of public data.")
+    return PUBLIC / name
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("SE-Sync/CSAIL.g2o", 20.2755), ("SE-Sync/kitti_00.g2o", 49.161), ("SE-Sync/intel.g2o", 22.5022)],
+)
+def test_public_graphs_reach_their_known_errors(tmp_path: Path, name: str, error: float) -> None:
+    done = optimize(public(name), tmp_path / "out.g2o", "lm")
+    assert done.record["error_after"] == pytest.approx(error, rel=1e-4)
+    assert not done.record["odometry_kept"]
+
+
+@pytest.mark.parametrize("name", ["robot_a", "robot_b", "ordered", "unordered"])
+def test_graphs_of_two_robots_are_read_with_their_symbols(tmp_path: Path, name: str) -> None:
+    source = public(f"Kimera-RPGO/{name}.g2o")
+    done = optimize(source, tmp_path / "out.g2o")
+    ids = [int(line.split()[1]) for line in source.read_text().splitlines() if line.startswith("VERTEX")]
+    np.testing.assert_array_equal(done.file.ids, np.sort(ids))
+    assert done.record["converged"]
+
+
+def test_real_false_closures_do_not_bend_the_map(tmp_path: Path) -> None:
+    done = optimize(public("rrr/B25b/B25b_0.300.g2o"), tmp_path / "out.g2o")
+    assert done.record["rejected"] > 32  # so many are false by the GPS
+    assert not done.record["odometry_kept"]
+
+
+def test_poses_without_an_edge_are_no_parts_to_solve(tmp_path: Path) -> None:
+    count = 30_000
+    lines = [f"VERTEX_SE2 {at} {at} 0 0" for at in range(count)]
+    lines += [f"EDGE_SE2 {at} {at + 1} 1 0 0 1 0 0 1 0 1" for at in (0, 1, 5)]
+    (tmp_path / "parts.g2o").write_text("\n".join(lines))
+    found = optimize(tmp_path / "parts.g2o", tmp_path / "out.g2o", "lm")
+    assert any("29995 poses have no edge" in text for text in found.record["warnings"])
+    assert len(found.solution.world_from_body) == count
+
+
+def test_information_beyond_what_a_double_squares_is_refused(tmp_path: Path) -> None:
+    graph = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1e300 0 0 1 0 1\n"
+    (tmp_path / "graph.g2o").write_text(graph)
+    with pytest.raises(GraphError, match=r"holds 1e\+300; it must be finite .* at most 1e\+30"):
+        optimize(tmp_path / "graph.g2o", tmp_path / "out.g2o")

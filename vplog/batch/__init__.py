@@ -1,0 +1,1 @@
+"""Many drives at once, on this machine or on a Ray cluster, into one map."""

@@ -1,0 +1,121 @@
+"""What the logs of a batch are: their sha256, which is known of those that have not changed since the last one."""
+
+from __future__ import annotations
+
+import os
+import time
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
+from contextlib import suppress
+from threading import Event
+from typing import TYPE_CHECKING, Any
+
+from vplog import logs as all_logs
+from vplog.cache.input_hashes import bytes_of, changed_s, hash_inputs, look_of
+from vplog.errors import LogError, ResultError
+from vplog.results.run_record import read_run_json, write_run_json
+from vplog.storage.remote_path import RemotePath
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from vplog.logs import TopicChoice
+
+    Progress = Callable[[str, int, int], None]
+
+NAME = ".inputs.json"
+"""In the map: hidden, as it tells of the logs on this machine and nothing of the map."""
+_SETTLED_S = 3.0
+"""A file written this short a time ago could be written again without a change of its times: some file systems count
+them in steps of two seconds."""
+_MOST_BYTES = 10**9
+"""Longest record that is read: a million logs of several files."""
+
+_TELL_EVERY_S = 0.2
+"""How often it is said how far reading has come."""
+
+Hashes = dict[str, str]
+
+
+def known_hashes(
+    logs: Mapping[str, Path], topics: TopicChoice, record: Path, threads: int, progress: Progress = lambda *_: None
+) -> tuple[list[Hashes], dict[str, str]]:
+    """sha256 of the files of each log and of those beside it, by name, in order; by log one line where they cannot be
+    read, or are no log.
+
+    A file whose length and times are those of the record, a file that is made and kept up to date, is not read. The
+    record is only to save time: one that cannot be read is made anew, one that cannot be written is done without.
+    Ctrl-C ends it within a block, and `progress` tells of MB read.
+    """
+    beside = [file for file in (topics.odometry_file, topics.calibration_file) if file is not None]
+    known = _read(record)
+    seen: dict[str, dict[str, Any]] = {}
+    done, total, stop = [0] * len(logs), [0] * len(logs), Event()
+
+    def one(path: Path, number: int) -> Hashes:
+        if isinstance(path, RemotePath):
+            return hash_inputs(path)
+        name, look = str(path.absolute()), look_of(path)
+        if name in known and known[name]["look"] == look:
+            seen[name] = known[name]
+            return known[name]["hashes"]
+
+        def read(count: int) -> None:
+            done[number] += count
+            if stop.is_set():
+                raise CancelledError
+
+        if path not in beside:
+            all_logs.check(path)  # a folder of other things may hold anything
+        asked, total[number] = time.time(), total[number] + bytes_of(path)
+        hashes = hash_inputs(path, read)
+        if look_of(path) == look and changed_s(path) < asked - _SETTLED_S:
+            seen[name] = {"look": look, "hashes": hashes}
+        return hashes
+
+    def of_log(path: Path, number: int) -> Hashes | str:
+        try:
+            found = [one(file, number) for file in (path, *beside)]
+        except LogError as error:
+            return str(error)
+        except OSError as error:
+            return f"Cannot read {error.filename or path}: {error.strerror or error}."
+        return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}
+
+    with ThreadPoolExecutor(threads) as pool:
+        waiting = [pool.submit(of_log, path, number) for number, path in enumerate(logs.values())]
+        try:
+            while wait(waiting, _TELL_EVERY_S).not_done:
+                progress("check (MB)", sum(done) // 10**6, sum(total) // 10**6)
+        except BaseException:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+        answers = dict(zip(logs, (one.result() for one in waiting), strict=True))
+        if sum(done):
+            progress("check (MB)", sum(done) // 10**6, sum(done) // 10**6)
+    if any(known.get(name) != about for name, about in seen.items()):
+        _write(record, {**known, **seen})
+    errors = {log: answer for log, answer in answers.items() if isinstance(answer, str)}
+    return [{} if isinstance(answer, str) else answer for answer in answers.values()], errors
+
+
+def _read(record: Path) -> dict[str, dict[str, Any]]:
+    """By log, its `look` and its `hashes`; nothing where there is no such file, or another thing."""
+    try:
+        known = read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {}
+    except (OSError, ResultError):
+        return {}
+
+    def sound(about: Any) -> bool:
+        parts = [about.get("look"), about.get("hashes")] if isinstance(about, dict) else [None]
+        return all(isinstance(part, dict) and all(isinstance(text, str) for text in part.values()) for part in parts)
+
+    return {name: about for name, about in known.items() if sound(about)}
+
+
+def _write(record: Path, known: dict[str, dict[str, Any]]) -> None:
+    """Of all logs that are still there."""
+    there = {name: about for name, about in sorted(known.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
+    with suppress(ResultError):
+        write_run_json(record, there, checksum=True)

@@ -1,0 +1,109 @@
+"""The library that all drives of a map are described with."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+from vplog import logs
+from vplog.errors import LibraryError, LogError, ResultError, VplogError
+from vplog.maps.storage import map_store
+from vplog.places.library_files import read_library_record
+from vplog.places.reference_choice import PAPER_SIZE, evenly
+from vplog.run.reference_library import build_library, check_library
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from vplog.data import Ints
+    from vplog.logs import TopicChoice
+    from vplog.maps.storage.map_store import Store
+    from vplog.pipeline import Pipeline
+    from vplog.stages import Log
+
+    Progress = Callable[[str, int, int], None]
+
+_TRIED = 8
+"""Frames of a log that are decoded before it is relied on: one that does is enough."""
+
+
+def map_library(
+    store: Store, paths: Sequence[Path], given: Path | None, pipeline: Pipeline, topics: TopicChoice, threads: int,
+    progress: Progress,
+) -> str:  # fmt: skip
+    """The hash of the map's library, which is put into the map where it has none yet.
+
+    Raises LibraryError where another one is given, or where the settings describe places otherwise.
+    """
+    begun = (store.root / "map.json").exists()
+    known = store.head().library if begun else None
+    if known is not None and not store.library(known).is_dir():
+        raise LibraryError(
+            f"{store} lacks its library {known[:12]}. Copy it back, or make another map with `vplog batch`."
+        )
+    made = store.staging / "library"
+    if given is not None:
+        check_library(given, pipeline)
+        digest = str(read_library_record(given)["hash"])
+        if known not in (None, digest):
+            raise LibraryError(
+                f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
+                f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
+            )
+        if known is None:
+            digest = pipeline.places.load(given, threads).hash  # held against what it says of itself
+            try:
+                shutil.copytree(given, made, symlinks=True)
+            except (OSError, shutil.Error) as error:
+                shutil.rmtree(made, ignore_errors=True)
+                told = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error
+                raise ResultError(f"Cannot copy the library {given} into {store}: {told}.") from None
+    elif known is None:
+        digest = build_library(_that_can_be_read(paths, topics), made, pipeline, topics, threads, progress).hash
+    else:
+        check_library(store.library(known), pipeline)
+        digest = known
+    if known is None:
+        if not begun:  # a folder that holds a library alone is known as a map
+            store.write_head(map_store.Head(None, pipeline.model_dump(mode="json")))
+        map_store.add_library(store, made, digest)
+    return digest
+
+
+def _that_can_be_read(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
+    """The first logs, as many as a library has references, without those of which no frame can be had: their own run
+    says why.
+
+    Raises LogError of the first where there is no other.
+    """
+    sound, first = [], None
+    for path in paths:
+        try:
+            log = logs.open(path, topics)
+            if _decodes(log, log.stamps()):
+                sound.append(path)
+        except VplogError as error:
+            first = first or error
+        except OSError as error:
+            first = first or LogError(f"Cannot read {path}: {error.strerror or error}.")
+        if len(sound) == PAPER_SIZE:
+            break
+    if not sound:
+        raise first or LibraryError("None of the logs has a frame, so there is nothing to build a library from.")
+    return sound
+
+
+def _decodes(log: Log, stamps: Ints) -> bool:
+    """Whether one of a few frames does, over the whole drive. Raises LogError where none does."""
+    why: VplogError | None = None
+    for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
+        try:
+            encoded.decode()
+        except VplogError as error:
+            why = why or error
+        else:
+            return True
+    if why is not None:
+        raise why
+    return False

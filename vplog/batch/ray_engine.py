@@ -1,0 +1,214 @@
+"""A Ray cluster as the engine of a batch: drives as Ray tasks, on machines that share nothing but the logs.
+
+The library goes once into Ray's object store, and from there once to each machine. A drive's run folder is made on the
+worker's own disk and comes back in pieces. This module is imported where Ray is asked for.
+"""
+
+from __future__ import annotations
+
+import secrets
+from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import vplog
+from vplog.batch.ray_cluster import connected, watched_head
+from vplog.batch.worker import Outcome, Task, made_by
+from vplog.errors import SettingsError, VplogError
+from vplog.run.feature_extraction import missing_parts, parts_of
+from vplog.storage.remote_path import located
+from vplog.storage.scratch import packed, write_pieces
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from vplog.batch.ray_cluster import Head
+    from vplog.batch.ray_tasks import RemoteOutcome
+    from vplog.run.feature_extraction import Part
+
+_PROBE_S = 60.0
+"""Until the machines of a cluster have told what they run; a slower one is asked again with each drive."""
+_DRIVE_BYTES = 2**30
+"""Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
+_FETCH_S = 5.0
+"""Until it is asked again whether the cluster is there from which a piece is to come."""
+
+
+@contextmanager
+def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterator[RayEngine]:
+    """The cluster at `address`, or one of this machine with so many cores that ends with the block.
+
+    If its machines see `folder`, of the map, they do more with it. Raises SettingsError where there is no such cluster,
+    or where its machines do not run what this one does.
+    """
+    with connected(address, threads) as ray, watched_head(ray) as head:
+        engine = RayEngine(ray, head, address is None)
+        engine.check_nodes()
+        if folder is not None:
+            engine.look_for(folder)
+        yield engine
+
+
+class RayEngine:
+    """The cluster that this process is connected to."""
+
+    def __init__(self, ray: Any, head: Head, is_ours: bool) -> None:
+        from vplog.batch import ray_tasks
+
+        self._is_ours = is_ours
+        self._ray, self._head, self._tasks, self._shares_disk = ray, head, ray_tasks, False
+        self.executor = RayExecutor(ray, head, ray_tasks.call)
+        # a process of its own for each drive, so that memory is given back
+        self._drive = ray.remote(max_calls=1, max_retries=0)(ray_tasks.call)
+        self._part = ray.remote(num_cpus=1)(ray_tasks.compute_remote_part)
+        self._library: tuple[Path, Any] | None = None
+
+    @property
+    def cores(self) -> int:
+        return max(int(sum(self._of_nodes("CPU"))), 1)
+
+    @property
+    def widest(self) -> int:
+        return max(int(max(self._of_nodes("CPU"))), 1)
+
+    def at_once(self, threads: int) -> int:
+        return max(sum(int(cores) // threads for cores in self._of_nodes("CPU")), 1)
+
+    def start(self, task: Task) -> Future[Outcome]:
+        """Begin a drive; one in parts with its frames, on all machines."""
+        task = task if self._shares_disk else replace(task, cache=None)
+        if self._library is None or self._library[0] != task.library:
+            self._library = task.library, self._ray.put(packed(task.library))
+        memory = min(_DRIVE_BYTES, int(max(self._of_nodes("memory"))))
+        drive = self._drive.options(num_cpus=task.threads, memory=memory, name=f"vplog {task.drive}")
+        if self._is_ours:  # nobody else's tasks are there, and the system shares out the cores, the last drive has all
+            task = replace(task, threads=self.widest)
+        parts = self._parts(task) if task.in_parts and self.cores > self.widest else []
+        return self.executor.follow(drive.remote(self._tasks.compute_remote_drive, task, self._library[1], parts))
+
+    def _parts(self, task: Task) -> list[tuple[Part, Any]]:
+        """The parts of a drive that are to be extracted, and the task of each, which gives its bytes."""
+        try:
+            found = parts_of(located(task.log), task.pipeline, task.topics, task.cache)
+        except (VplogError, OSError):
+            return []  # the drive's own task says why
+        missing, wanted = found if task.cache is None else missing_parts(task.cache, found), made_by()
+        return [(part, self._part.remote(part, wanted)) for part in missing]
+
+    def take(self, task: Task, outcome: Outcome) -> None:
+        """Write the files from their pieces."""
+        remote = cast("RemoteOutcome", outcome)
+        places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
+        for folder, files in places:
+            for name, parts in files:
+                write_pieces(folder, name, map(self._fetched, parts))
+
+    def helpers(self, threads: int) -> Executor | None:
+        """Tasks over all machines, if each of them sees the map."""
+        if not self._shares_disk or self._head.is_lost:
+            return None
+        return RayExecutor(self._ray, self._head, self._tasks.call, min(threads, self.widest))
+
+    def look_for(self, folder: Path) -> None:
+        """Whether all machines see a folder of this one."""
+        sign, content = folder / "seen", secrets.token_hex(16)
+        sign.write_text(content, encoding="utf-8")
+        answers = self._on_every_node(self._tasks.is_here, str(sign), content)
+        self._shares_disk = all(self._answer(answer) is True for answer in answers)
+        sign.unlink()
+
+    def check_nodes(self) -> None:
+        """Raises SettingsError where no machine computes, or one would do so with something else than this one."""
+        if max(self._of_nodes("CPU")) < 1:
+            raise SettingsError(
+                "No machine of the Ray cluster has CPUs, as with `ray start --num-cpus 0`. Add one that has some."
+            )
+        own, answers = made_by(), self._on_every_node(self._tasks.about_node)
+        for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
+            found, same = self._answer(answer), f"Install the same there: vplog {vplog.__version__}."
+            if isinstance(found, self._ray.exceptions.RayTaskError):
+                raise SettingsError(f"{answers[answer]} cannot run vplog: {found.cause}. {same}")
+            if isinstance(found, BaseException):  # it has just left
+                continue
+            where, other = found
+            for name, told in {**own["versions"], "vplog's code": own["code"]}.items():
+                theirs = {**other["versions"], "vplog's code": other["code"]}[name]
+                if theirs != told:
+                    raise SettingsError(f"{where} has {name} {theirs[:12]}, and this machine {told[:12]}. {same}")
+
+    def _on_every_node(self, function: Callable[..., Any], *args: Any) -> dict[Any, str]:
+        """A task on every machine, whatever else it does; each with the machine's name."""
+        affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
+        task = self._ray.remote(num_cpus=0, max_retries=0)(function)
+        return {
+            task.options(scheduling_strategy=affinity(node["NodeID"], soft=False)).remote(*args): node["NodeName"]
+            for node in self._ray.nodes()
+            if node["Alive"]
+        }
+
+    def _answer(self, answer: Any) -> Any:
+        """What a task gave, or its error."""
+        try:
+            return self._ray.get(answer, timeout=_PROBE_S)
+        except self._ray.exceptions.RayError as error:
+            return error
+
+    def _fetched(self, part: Any) -> Any:
+        while True:
+            try:
+                return self._ray.get(part, timeout=_FETCH_S)
+            except self._ray.exceptions.GetTimeoutError:
+                self._head.check()
+            except self._ray.exceptions.RayError as error:
+                raise translated(error) from None
+
+    def _of_nodes(self, resource: str) -> list[float]:
+        self._head.check()
+        return [node["Resources"].get(resource, 0.0) for node in self._ray.nodes() if node["Alive"]] or [0.0]
+
+
+class RayExecutor(Executor):
+    """Ray tasks as `concurrent.futures` has them, with so many cores each."""
+
+    def __init__(self, ray: Any, head: Head, call: Callable[..., Any], cores: int = 1) -> None:
+        self._head, self._task = head, ray.remote(num_cpus=cores)(call)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return self.follow(self._task.remote(fn, *args, **kwargs))
+
+    def follow(self, answer: Any) -> Future[Any]:
+        """The future of a Ray task, whose errors are those of this side."""
+        future = self._head.future()
+
+        def settle(done: Future[Any]) -> None:
+            error = done.exception()
+            with suppress(InvalidStateError):  # the head was lost before
+                if error is None:
+                    future.set_result(done.result())
+                else:
+                    future.set_exception(translated(error))
+
+        answer.future().add_done_callback(settle)
+        return future
+
+
+def translated(error: BaseException) -> BaseException:
+    """An error of Ray as one of `concurrent.futures` where the same may end well another time; else its cause."""
+    from ray import exceptions
+
+    if isinstance(error, exceptions.RayTaskError):
+        return error.cause
+    for kind, text in (
+        (exceptions.OutOfMemoryError, "Its machine ran out of memory. Give it more, or use fewer --jobs"),
+        (exceptions.NodeDiedError, "Its machine left the cluster. Look at `ray status`"),
+        (exceptions.LocalRayletDiedError, "Ray was stopped on this machine. Start it again"),
+        (exceptions.ObjectLostError, "What it gave back was lost along with a machine. Look at `ray status`"),
+        (exceptions.ObjectStoreFullError, "The cluster has no room for what it gives back"),
+        (exceptions.OutOfDiskError, "The cluster's disks have no room for what it gives back"),
+        (exceptions.RayError, f"Its worker was killed, as for want of memory ({type(error).__name__})"),
+    ):
+        if isinstance(error, kind):
+            return BrokenExecutor(f"{text}, and run again.")
+    return error

@@ -1,0 +1,108 @@
+"""One drive of a batch, computed by a worker: what it is told, and what it tells."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import VplogError
+from vplog.execution.cores import limited
+from vplog.execution.execution import Execution
+from vplog.execution.timing import peak_memory_mb
+from vplog.maps.storage import drive_ids
+from vplog.pipeline import CacheOptions, Pipeline
+from vplog.pipeline import run as run_alone
+from vplog.results import run_record
+from vplog.run import provenance
+from vplog.storage.remote_path import located
+
+if TYPE_CHECKING:
+    from vplog.logs import TopicChoice
+
+
+@dataclass(frozen=True)
+class Task:
+    """One drive to compute, as it goes to another process."""
+
+    drive: str
+    log: str
+    """Path or URL of the log, with the query that `about` omits."""
+    folder: Path
+    """Where the run folder is made; it is the map's when it is renamed in."""
+    library: Path
+    pipeline: Pipeline
+    topics: TopicChoice
+    threads: int
+    about: dict[str, Any]
+    """drive.json: what the drive is made from."""
+    cache: Path | None = None
+    """Where what an attempt had done stays when it ends before its time; None to keep nothing."""
+    keep_cache: bool = False
+    """Whether that is wanted of a drive that is finished, too."""
+    in_parts: bool = False
+    """Whether its frames are extracted on all machines at once: it is longer than all other drives together."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt at a drive ended."""
+
+    error: str = ""
+    """One line; none where all went well."""
+    may_pass: bool = False
+    """Whether the cause of the error may be gone at another attempt."""
+    seconds: float = 0.0
+    """Wall time in the worker."""
+    worker: str = ""
+    """Machine and process; none of a worker that died."""
+    peak_memory_mb: float = 0.0
+    """Largest resident memory of the worker, in MB (10^6 bytes); 0 where unknown."""
+    keyframes: int = 0
+    """Of the drive."""
+    accepted: int = 0
+    """Closures within it."""
+    warnings: tuple[str, ...] = ()
+    """What the run had to say."""
+
+
+def made_by() -> dict[str, Any]:
+    """Code and packages of this machine, as drive.json has them: a drive is computed where they are the batch's."""
+    return {"code": drive_ids.code_hash(), "versions": provenance.head(Pipeline(), Path(), 1)["versions"]}
+
+
+def compute_drive(task: Task) -> Outcome:
+    """Make the run folder of a drive, drive.json last; why not, in one line, where that fails."""
+    began, error, may_pass, peak, found = time.perf_counter(), "", False, 0.0, dict[str, Any]()
+    try:
+        log = located(task.log)
+        with limited(task.threads):
+            done = run_alone(
+                log, task.folder, task.pipeline, task.library, task.topics, Execution(task.threads),
+                CacheOptions(task.cache, use=task.cache is not None),
+            )  # fmt: skip
+        peak = done.record["totals"]["peak_memory_mb"]
+        if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):
+            error = f"{task.about['log']} changed while it was read. Run again when it is complete."
+        else:
+            if done.keyframes.drive != task.drive:
+                drive_ids.name_keyframes(task.folder / "keyframes.parquet", task.drive)
+            run_record.write_run_json(task.folder / "drive.json", task.about)
+            counts = done.record["counts"]
+            found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
+            found["warnings"] = tuple(done.record["warnings"])
+    except VplogError as problem:
+        error = str(problem)
+    except MemoryError:
+        error, may_pass = "Out of memory. Use fewer --jobs, or a machine with more.", True
+    except OSError as problem:
+        # another attempt may be on another machine, and finds what this one had done
+        error, may_pass = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True
+    except Exception as problem:  # a fault of ours in one drive must not stop the others
+        text = " ".join(str(problem).split())[:200]
+        error = f"Internal error: {type(problem).__name__}: {text}. `vplog run LOG --debug` shows where."
+    seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
+    return Outcome(error, may_pass, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)

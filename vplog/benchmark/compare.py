@@ -1,0 +1,244 @@
+"""Place recognisers side by side: the frames of one drive are looked for among those of another, or among older ones.
+
+Every method gets the same features, the same reference images and the same truth.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import vplog
+from vplog import logs
+from vplog.benchmark import compare_figures
+from vplog.benchmark.method_scores import evaluate_method
+from vplog.benchmark.recogniser_specs import read_methods
+from vplog.benchmark.traversals import Walk, candidate_stops, extract_walk
+from vplog.errors import SettingsError, TruthError
+from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
+from vplog.execution.execution import logged_warnings
+from vplog.features.store import FeatureStore
+from vplog.places.library_files import load_references, references_hash
+from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
+from vplog.places.sequence import SequenceSettings
+from vplog.results import run_record
+from vplog.results.staging import staged
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from vplog.benchmark.traversals import Progress
+    from vplog.data import Float32s, Ints, Reference
+    from vplog.evaluate.calibration import Reliability
+    from vplog.evaluate.retrieval import Ranks
+    from vplog.pipeline import Pipeline
+    from vplog.stages import Log
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Every method's figures, and the ranks they are of."""
+
+    record: dict[str, Any]
+    """What compare.json says."""
+    ranks: dict[str, Ranks]
+    """By name; a method by sequences has `, L=..` added."""
+
+
+def compare(
+    query: Path,
+    other: Path | None,
+    methods: Iterable[str],
+    truth: TruthChoice,
+    pipeline: Pipeline,
+    library: Path | None = None,
+    library_size: int = PAPER_SIZE,
+    library_seed: int = 0,
+    min_gap: int | None = None,
+    sequence: int | None = None,
+    out: Path | None = None,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> Comparison:
+    """Every method on a query and a map drive; without a map, or with the same one, frames among their own past.
+
+    `library` is a drive or a saved library, None the map. `sequence` is a length in frames, the rest of it the
+    pipeline's; None for single views only. With `out`, compare.json, the scores and the curves are written there.
+    Raises VplogError with one line where that cannot be.
+    """
+    other = query if other is None else other
+    recognisers = read_methods(methods, pipeline)
+    sequences = None
+    if sequence is not None:
+        sequences = SequenceSettings.read({**pipeline.sequence.model_dump(), "length": sequence}, "--sequence")
+    itself = same_drive(query, other)
+    _check_gap(query, itself, min_gap)
+    warnings: list[str] = []
+    with ExitStack() as stack:
+        made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out)))
+        stack.enter_context(logged_warnings(warnings))
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
+        query_log = logs.open(query, topics)
+        map_log = query_log if itself else logs.open(other, topics)
+        known = open_truth(truth, query_log, map_log)
+        warnings += check_truth(known, query_log, map_log, min_gap)  # before the long part
+        if library is None or same_drive(library, other):
+            library = None
+        wanted = LibrarySettings(choose="random", size=library_size, seed=library_seed)
+        map_walk, query_walk, references, notes = _extract_all(
+            query_log, map_log, known, library, wanted, pipeline, topics, threads, progress, stack, scratch
+        )
+        warnings += notes
+        stops = candidate_stops(query_walk.frames, map_walk.frames, min_gap)
+        pairs = known.pairs(query_walk.frames, map_walk.frames).below(stops)
+        account: dict[str, Any] = {
+            "vplog": vplog.__version__,
+            "query": str(query),
+            "map": str(other),
+            "min_gap": min_gap,
+            "library": {
+                "from": str(library or other),
+                "size": len(references),
+                "seed": None if _is_saved(library) else library_seed,
+                "hash": references_hash(references, pipeline.features),
+            },
+            "truth": {**known.about, "pairs": pairs.count},
+            "queries": len(query_walk),
+            "map_frames": len(map_walk),
+            "positives": int(pairs.positive.sum()),
+            "features": pipeline.features.model_dump(mode="json"),
+            "methods": {},
+        }
+        ranks: dict[str, Ranks] = {}
+        reliable: dict[str, Reliability] = {}
+        for number, (name, settings) in enumerate(recognisers.items(), start=1):
+            result = evaluate_method(
+                settings, references, map_walk, query_walk, pairs, stops, threads,
+                lambda stage, done, total, name=name: progress(f"{name}: {stage}", done, total), sequences, scratch,
+            )  # fmt: skip
+            account["methods"][name] = result.figures
+            ranks[name] = result.ranks
+            if result.reliability is not None:
+                reliable[name] = result.reliability
+            if result.sequence_ranks is not None:
+                ranks[f"{name}, L={sequence}"] = result.sequence_ranks
+            if made is not None:
+                result.figures["scores"] = _write_scores(made, number, name, result.scores, query_walk, map_walk)
+        account["warnings"] = list(dict.fromkeys([*query_log.warnings, *map_log.warnings, *warnings]))
+        if made is not None:
+            compare_figures.draw_curves(ranks, made)
+            if reliable:
+                compare_figures.draw_reliability(reliable, made)
+            run_record.write_run_json(made / "compare.json", account)
+    return Comparison(account, ranks)
+
+
+def _extract_all(
+    query: Log,
+    other: Log,
+    known: PlaceTruth,
+    library: Path | None,
+    wanted: LibrarySettings,
+    pipeline: Pipeline,
+    topics: logs.TopicChoice | None,
+    threads: int,
+    progress: Progress,
+    stack: ExitStack,
+    scratch: Path,
+) -> tuple[Walk, Walk, list[Reference], list[str]]:
+    """Walks of the map and the query, one and the same for a drive against itself, the references, and warnings."""
+
+    def walk_of(log: Log, role: str, frames: Ints, chosen: Ints | None = None) -> Walk:
+        store = stack.enter_context(FeatureStore(scratch / f"{role}.features"))
+        return extract_walk(log, pipeline.features, store, frames, chosen, threads, progress)
+
+    saved = load_references(library) if library is not None and _is_saved(library) else None
+    chosen = known.map_frames[choose(other.stamps()[known.map_frames], wanted)] if library is None else None
+    map_walk = walk_of(other, "map", known.map_frames, chosen)
+    query_walk = map_walk if query is other else walk_of(query, "query", known.query_frames)
+    warnings = list(dict.fromkeys(map_walk.warnings + query_walk.warnings))
+    if saved is not None:
+        return map_walk, query_walk, saved, warnings
+    references = map_walk.references
+    if library is not None:
+        log = logs.open(library, topics)
+        rows = choose(log.stamps(), wanted)
+        walk = walk_of(log, "library", rows, rows)
+        references = walk.references
+        warnings += walk.warnings
+    if len(references) < (wanted.size or 0):
+        warnings.append(
+            f"The library has {len(references)} images instead of {wanted.size}: its drive has no more frames."
+        )
+    return map_walk, query_walk, references, warnings
+
+
+def _is_saved(library: Path | None) -> bool:
+    return library is not None and os.path.lexists(library / "library.json")
+
+
+def _check_gap(query: Path, itself: bool, min_gap: int | None) -> None:
+    if itself and min_gap is None:
+        raise SettingsError(
+            f"{query} is compared with itself, where every frame finds itself. "
+            "Say how many frames older a match must be: --min-gap 50."
+        )
+    if not itself and min_gap is not None:
+        raise SettingsError("--min-gap is for a drive compared with itself; leave it out, or leave out MAP.")
+
+
+def check_truth(known: PlaceTruth, query: Log, other: Log, min_gap: int | None) -> list[str]:
+    """What the truth does not cover, one sentence each. Raises TruthError where no query can find anything."""
+    stops = candidate_stops(known.query_frames, known.map_frames, min_gap)
+    if not known.pairs(known.query_frames, known.map_frames).below(stops).positive.any():
+        gap = "" if min_gap is None else f" at least {min_gap} frames older"
+        raise TruthError(
+            f"By --truth {known.about['source']} none of the {len(known.query_frames)} frames of {query.name} shows a "
+            f"place of a frame of {other.name}{gap}, so nothing can be found. Give the truth of these drives, or allow "
+            "more with --tolerance, --distance-m or --heading-deg."
+        )
+    warnings = []
+    for log, frames in {query.name: (query, known.query_frames), other.name: (other, known.map_frames)}.values():
+        if len(frames) < len(log.stamps()):
+            outside = len(log.stamps()) - len(frames)
+            warnings.append(f"{log.name}: {outside} of {len(log.stamps())} frames have no truth and are left out.")
+    if known.about["source"] == "poses" and query is not other:
+        warnings.append(
+            "--truth poses assumes that the odometry of both drives is in one frame; else give a TUM file for each."
+        )
+    return warnings
+
+
+def same_drive(a: Path, b: Path) -> bool:
+    return a.resolve() == b.resolve()
+
+
+def _comparison_in(out: Path) -> list[str]:
+    """The files of a comparison in a folder that a new one replaces. Raises SettingsError where there are others."""
+    if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "compare.json").is_file():
+        raise SettingsError(f"{out} is a folder with other things in it, not a comparison. Choose another with -o.")
+    return ["compare.json", "scores-[0-9][0-9]-*.npz", *(f"{name}.[ps][nv]g" for name in ("curves", "reliability"))]
+
+
+def _write_scores(out: Path, number: int, name: str, scores: Float32s, query: Walk, other: Walk) -> str:
+    """Name of the file; the number tells apart what the letters that files may have do not."""
+    file = f"scores-{number:02d}-{re.sub(r'[^A-Za-z0-9.=+-]+', '_', Path(name).name)[:80]}.npz"
+    with replacing(out / file) as stream:
+        np.savez(
+            stream,
+            scores=scores,
+            query_frame=query.frames,
+            query_ns=query.stamp_ns,
+            map_frame=other.frames,
+            map_ns=other.stamp_ns,
+        )
+    return file

@@ -1,0 +1,253 @@
+"""One place recogniser on one query walk and one map: what it finds, what it takes.
+
+Times are CPU time of the thread that does the work, so they are those of one thread, however many are busy.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from shutil import disk_usage
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+
+from vplog.errors import ResultError
+from vplog.evaluate import retrieval
+from vplog.evaluate.calibration import reliability
+from vplog.features.extraction import map_in_order, one_thread_each
+from vplog.places.sequence import sequence_rows
+from vplog.stages import ProbableIndex
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from vplog.benchmark.traversals import Progress, Walk
+    from vplog.data import Float32s, Floats, Ints, Reference
+    from vplog.evaluate.calibration import Reliability
+    from vplog.evaluate.pairs import Pairs
+    from vplog.evaluate.retrieval import Ranks
+    from vplog.places import PlaceSettings
+    from vplog.places.sequence import SequenceSettings
+    from vplog.stages import PlaceIndex, PlaceState, Recogniser
+
+RELIABILITY_BINS = 10
+"""Of probability: with the 200 answers of a short walk a bin holds 20."""
+ANSWERS = 10
+"""Rows that a timed search returns: what `vplog run` asks for by default, and the deepest recall reported."""
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """What one method made of one query walk and one map."""
+
+    state: PlaceState
+    scores: Float32s
+    """(Q, M), NaN for rows that are no candidates."""
+    ranks: Ranks
+    figures: dict[str, Any]
+    """What compare.json says of the method."""
+    sequence_ranks: Ranks | None = None
+    """The same by sequences, where these were asked for."""
+    reliability: Reliability | None = None
+    """Whether its probabilities mean what they say, where it gives any."""
+
+
+def evaluate_method(
+    settings: PlaceSettings,
+    references: Sequence[Reference],
+    map_walk: Walk,
+    query_walk: Walk,
+    truth: Pairs,
+    stops: Ints,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+    sequence: SequenceSettings | None = None,
+    scratch: Path | None = None,
+) -> MethodResult:
+    """Learn the references, describe both walks, look for every query among the map rows below `stops[q]`, (Q,).
+
+    A drive against itself is the same walk twice, described once. The map is rebuilt from what a table would store of
+    it, so the bytes counted are all that is used. Scores are kept in a file of the folder `scratch`, or in memory.
+    Raises TruthError without a true pair, and whatever the method raises.
+    """
+    state, learn_s = _learn(settings, references, threads)
+    places, mining_ms = describe_walk(state, map_walk, threads, lambda *at: progress("describe map", *at))
+    column = state.to_arrow(places)
+    places = state.from_arrow(column)
+    index, queries = state.index(places), places
+    if query_walk is not map_walk:
+        queries, more = describe_walk(state, query_walk, threads, lambda *at: progress("describe queries", *at))
+        mining_ms = np.concatenate([mining_ms, more])
+    scores = score_table(len(queries), len(index), scratch, "scores")
+    query_ms = search(index, queries, stops, scores, threads, lambda *at: progress("search", *at))
+    ranks = retrieval.rank_queries(scores, truth, stops)
+    walks = [map_walk] if query_walk is map_walk else [map_walk, query_walk]
+    feature_ms = float(np.median(np.concatenate([walk.feature_ms for walk in walks])))
+    figures = {
+        **asdict(retrieval.score_retrieval(ranks)),
+        "bytes_per_image": round(stored_bytes(column) / len(column), 1),
+        "encode_ms": round(feature_ms + float(np.median(mining_ms)), 3),
+        "feature_ms": round(feature_ms, 3),
+        "mining_ms": round(float(np.median(mining_ms)), 3),
+        "query_ms": round(float(np.median(query_ms)), 4),
+        "learn_s": round(learn_s, 3),
+        "bits": state.bits,
+        "hash": state.hash,
+        "settings": settings.model_dump(mode="json"),
+    }
+    reliable = (
+        reliability_of(index, queries, stops, ranks, truth, threads) if isinstance(index, ProbableIndex) else None
+    )
+    if reliable is not None:
+        figures["calibration"] = reliable.as_json()
+    if sequence is None:
+        return MethodResult(state, scores, ranks, figures, reliability=reliable)
+    lines = score_table(len(queries), len(index), scratch, "sequences")
+    match_lines(scores, sequence, stops, lines, threads, lambda *at: progress("sequences", *at))
+    by_sequence = retrieval.rank_queries(lines, truth, stops)
+    figures["sequence"] = {**sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
+    return MethodResult(state, scores, ranks, figures, by_sequence, reliable)
+
+
+def _learn(recogniser: Recogniser, references: Sequence[Reference], threads: int) -> tuple[PlaceState, float]:
+    """What it learned, and the CPU s that all threads took."""
+    began = time.process_time()
+    state = recogniser.learn(references, threads)
+    return state, time.process_time() - began
+
+
+def describe_walk(
+    state: PlaceState, walk: Walk, threads: int, progress: Callable[[int, int], None]
+) -> tuple[list[Any], Floats]:
+    """A descriptor for every row, and the CPU ms (N,) each took."""
+
+    def work(row: int) -> tuple[Any, float]:
+        features = walk.store[row]
+        began = time.thread_time()
+        place = state.describe(features)
+        return place, 1e3 * (time.thread_time() - began)
+
+    return _timed_map(work, len(walk), threads, progress)
+
+
+def search(
+    index: PlaceIndex,
+    queries: Sequence[Any],
+    stops: Ints,
+    scores: Float32s,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> Floats:
+    """Fill `scores` (Q, M), NaN beyond each query's stop; CPU ms (Q,) of a search for the best ANSWERS rows."""
+
+    def work(row: int) -> tuple[None, float]:
+        stop = int(stops[row])
+        began = time.thread_time()
+        index.query(queries[row], ANSWERS, stop)
+        spent = time.thread_time() - began
+        scores[row, :stop] = index.scores(queries[row], stop)
+        scores[row, stop:] = np.nan
+        return None, 1e3 * spent
+
+    return _timed_map(work, len(queries), threads, progress)[1]
+
+
+def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, threads: int) -> None:
+    """Fill `scores` (Q, M), NaN beyond each query's stop, without timing a search."""
+
+    def work(row: int) -> None:
+        stop = int(stops[row])
+        scores[row, :stop] = index.scores(queries[row], stop)
+        scores[row, stop:] = np.nan
+
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        for _ in map_in_order(pool, work, range(len(queries)), ahead=4 * threads):
+            pass
+
+
+def reliability_of(
+    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, truth: Pairs, threads: int
+) -> Reliability | None:
+    """The probabilities of the best answers against how often these are right; None without an answer.
+
+    A drive's neighbouring frames show one place, among which its probability is divided. An answer is right where a
+    true row is near, so what is near counts for it: as many rows around it as a true run has, by their median.
+    """
+    beside = int(np.median(truth.stop - truth.first)) // 2 if len(truth.first) else 0
+
+    def work(row: int) -> float:
+        best = int(ranks.top_row[row])
+        probability = index.posterior(queries[row], int(stops[row]))[0]
+        return min(float(probability[max(best - beside, 0) : best + beside + 1].sum()), 1.0)
+
+    answered = np.flatnonzero(ranks.top_row >= 0)
+    if not len(answered):
+        return None
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        said = list(map_in_order(pool, work, answered.tolist(), ahead=4 * threads))
+    return reliability(said, ranks.top_true[answered] > 0.5, RELIABILITY_BINS)
+
+
+def match_lines(
+    scores: Float32s,
+    settings: SequenceSettings,
+    stops: Ints,
+    lines: Float32s,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Fill `lines` (Q, M) with the scores of sequences, NaN beyond each query's stop; a few rows at a time."""
+    found = sequence_rows(lambda query: scores[query, : stops[query]], stops, settings, threads)
+    for query, (row, _) in enumerate(found):
+        lines[query, : len(row)] = row
+        lines[query, len(row) :] = np.nan
+        progress(query + 1, len(stops))
+
+
+def _timed_map(
+    work: Callable[[int], tuple[Any, float]], count: int, threads: int, progress: Callable[[int, int], None]
+) -> tuple[list[Any], Floats]:
+    results, spent = [], []
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        for result, ms in map_in_order(pool, work, range(count), ahead=4 * threads):
+            results.append(result)
+            spent.append(ms)
+            progress(len(results), count)
+    return results, np.array(spent)
+
+
+def score_table(queries: int, rows: int, scratch: Path | None, name: str) -> Float32s:
+    """(Q, M) float32 to be filled, in a file of the folder where one is given."""
+    if scratch is None:
+        return np.empty((queries, rows), np.float32)
+    needed, free = 4 * queries * rows, disk_usage(scratch).free
+    if needed > free:  # a full disk below a mapped file ends the process, so it is asked for first
+        raise ResultError(
+            f"The scores of {queries} queries against {rows} frames need {needed / 1e9:.1f} GB, and {scratch} has "
+            f"{free / 1e9:.1f} GB free. Free space, or compare shorter drives."
+        )
+    path = scratch / f"{name}.npy"
+    path.unlink(missing_ok=True)  # not written over: an earlier table may still be in use
+    return np.lib.format.open_memmap(path, "w+", np.dtype("<f4"), (queries, rows))
+
+
+def stored_bytes(column: pa.Array) -> int:
+    """Bytes of the values of an Arrow column and of an offset a row where their number varies.
+
+    The bitmaps that mark empty cells are not counted: no descriptor is empty.
+    """
+    kind: Any = column.type
+    if pa.types.is_struct(kind):
+        return sum(stored_bytes(part) for part in column.flatten())  # pyright: ignore[reportAttributeAccessIssue]
+    nested = pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    below = stored_bytes(column.flatten()) if nested else 0  # pyright: ignore[reportAttributeAccessIssue]
+    if pa.types.is_fixed_size_list(kind):
+        return below
+    if nested:
+        return below + len(column) * (8 if pa.types.is_large_list(kind) else 4)
+    bitmap = (len(column) + 7) // 8 if column.buffers()[0] is not None else 0
+    return column.nbytes - bitmap

@@ -1,0 +1,298 @@
+"""The whole study: drives opened, experiments chosen, each written when it is done and not done twice."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import re
+import shutil
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from glob import escape
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import vplog
+from vplog import logs
+from vplog.benchmark.compare import check_truth, same_drive
+from vplog.benchmark.recogniser_specs import read_methods
+from vplog.benchmark.study.charts import CHARTS
+from vplog.benchmark.study.example_figures import PICTURES
+from vplog.benchmark.study.experiments import NUMBERS, Plan
+from vplog.benchmark.study.trial_store import Bench, all_pairs
+from vplog.cache.code_hash import code_of
+from vplog.cache.input_hashes import hash_inputs
+from vplog.errors import ResultError, SettingsError, TruthError, nearest
+from vplog.evaluate.place_truth import TruthChoice, open_truth
+from vplog.execution.execution import logged_warnings
+from vplog.places.reference_choice import PAPER_SIZE
+from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
+from vplog.results.staging import staged
+from vplog.storage.folders import check_regular
+from vplog.storage.urls import shown
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from vplog.benchmark.traversals import Progress
+    from vplog.pipeline import Pipeline
+
+METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
+"""Compared where the user names none."""
+SIZES = (10, 20, 50, 100)
+"""L of Fig. 6."""
+SEEDS = 3
+"""Libraries drawn for each figure: enough to see where one draw was lucky."""
+EXPERIMENTS = (*NUMBERS, *PICTURES)
+"""All of them, in the order they are done."""
+_WORK = ".study"
+"""Folder in OUT of the experiments that an interrupted study finished: the next one with the same inputs takes them."""
+_TWO_DRIVES = {
+    "library": "which drive the library comes from",
+    "conditions": "a change of condition between drives",
+}
+"""What these experiments need two drives for."""
+_SCORES = ("vplog.benchmark.study.trial_store", "vplog.benchmark.recogniser_specs")
+"""Modules that the scores of a trial depend on, with all that these import."""
+
+
+def study(
+    drives: Sequence[Path],
+    truth: TruthChoice,
+    pipeline: Pipeline,
+    out: Path,
+    methods: Sequence[str] = METHODS,
+    sizes: Sequence[int] = SIZES,
+    seeds: int = SEEDS,
+    library_size: int = PAPER_SIZE,
+    min_gap: int | None = None,
+    only: Sequence[str] | None = None,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """Every experiment (those of `only`) on drives of one route, each query and map in turn; what study.json says.
+
+    A single drive is looked for in its own past, frames at least `min_gap` older. Raises VplogError with one line
+    where that cannot be.
+    """
+    chosen = _choose(only, len(drives))
+    plan = Plan(tuple(methods), library_size, tuple(sorted(set(sizes))), seeds, pipeline)
+    recognisers = read_methods(methods, pipeline)
+    _check_drives(drives, min_gap)
+    warnings: list[str] = []
+    with staged(out, lambda: _figures_in(out)) as made, ExitStack() as stack:
+        stack.enter_context(logged_warnings(warnings))
+        opened = [logs.open(path, topics) for path in drives]
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=made)))
+        names = short_names([log.name for log in opened])
+        known = {}
+        for query, other in all_pairs(len(drives)):
+            of_pair = truth_of_pair(truth, query, other, len(drives))
+            known[query, other] = open_truth(of_pair, opened[query], opened[other])
+            warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)
+        hashes = [_hash(hash_inputs(path)) for path in drives]
+        _check_same_drives(out, hashes)
+        common = {
+            "features": pipeline.features.model_dump(mode="json"),
+            "topics": None if topics is None else topics.model_dump(mode="json"),
+            "min_gap": min_gap,
+            "truth_hash": _truth_hash(truth),
+        }
+        bench = Bench(
+            names, opened, hashes, recognisers, known, _covered(known, opened), pipeline.features, min_gap,
+            {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, stack, threads, progress,
+        )  # fmt: skip
+        account = {
+            "vplog": vplog.__version__,
+            "drives": [
+                {"name": name, "log": str(path), "frames": len(log.stamps()), "hash": digest}
+                for name, path, log, digest in zip(names, drives, opened, hashes, strict=True)
+            ],
+            "truth": _shown(truth),
+            **common,
+            "library_size": library_size,
+            "sizes": list(plan.sizes),
+            "seeds": seeds,
+            "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
+        }
+        inputs = _hash({**account, "pipeline": pipeline.model_dump(mode="json"), "code": code_of(__name__)})
+        work = out / _WORK
+        done, files = {}, dict[str, Path]()
+        for folder in (out, work):
+            for name, one in _finished(folder, inputs).items():
+                done[name] = one
+                files |= {file: folder / file for file in one["figures"]}
+        work.mkdir(exist_ok=True)
+        for name in chosen:
+            if name not in done:
+                done[name] = _do(name, bench, plan, work)
+                files |= {file: work / file for file in done[name]["figures"]}
+                _write(work, account, inputs, done, [])
+        for file, path in files.items():
+            shutil.copy2(path, made / file)
+        said = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
+        result = _write(made, account, inputs, done, list(dict.fromkeys(said)))
+    shutil.rmtree(out / _WORK, ignore_errors=True)
+    return result
+
+
+def _do(name: str, bench: Bench, plan: Plan, out: Path) -> dict[str, Any]:
+    began = time.perf_counter()
+    if name in NUMBERS:
+        found = NUMBERS[name](bench, plan)
+        CHARTS[name](found, out)
+        figures = [name]
+    else:
+        found, figures = PICTURES[name](bench, plan, out)
+    files = [f"{figure}.{kind}" for figure in figures for kind in ("png", "svg")]
+    return {"figures": files, **found, "seconds": round(time.perf_counter() - began, 3)}
+
+
+def _write(
+    out: Path, account: dict[str, Any], inputs: str, done: dict[str, Any], warnings: list[str]
+) -> dict[str, Any]:
+    ordered = {name: done[name] for name in EXPERIMENTS if name in done}
+    result = plain({**account, "inputs": inputs, "experiments": ordered, "warnings": warnings})
+    write_run_json(out / "study.json", result)
+    return result
+
+
+def _finished(folder: Path, inputs: str) -> dict[str, Any]:
+    """Experiments that study.json of a folder holds of the same inputs, with all their figures there."""
+    found = _read(folder)
+    return {
+        name: one
+        for name, one in _experiments(found)
+        if found.get("inputs") == inputs and all((folder / file).is_file() for file in one["figures"])
+    }
+
+
+def _figures_in(out: Path) -> list[str]:
+    """Results of an earlier study in `out`, which a new one replaces. Raises SettingsError where it holds other
+    things."""
+    there = {file.name for file in out.iterdir() if not file.name.startswith(".")}
+    if there and not there & {"study.json", "trials.json"}:
+        raise SettingsError(f"{out} is a folder with other things in it, not a study. Choose another with -o.")
+    check_regular(out)
+    return [escape(file) for _, one in _experiments(_read(out)) for file in one["figures"]]
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """study.json of a folder; empty where it has none that is sound."""
+    try:
+        return read_run_json(folder / "study.json")
+    except ResultError:
+        return {}
+
+
+def _experiments(found: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Those of a study.json whose figures are named as files of a study, by name."""
+    earlier = found.get("experiments")
+    for name, one in earlier.items() if isinstance(earlier, dict) else ():
+        figures = one.get("figures") if isinstance(one, dict) else None
+        if name in EXPERIMENTS and isinstance(figures, list) and all(map(_is_figure, figures)):
+            yield name, one
+
+
+def _is_figure(file: Any) -> bool:
+    return isinstance(file, str) and PurePath(file).name == file and file.endswith((".png", ".svg"))
+
+
+def _choose(only: Sequence[str] | None, drives: int) -> list[str]:
+    """Names of the experiments to do. Raises SettingsError for one that is none, or that needs more drives."""
+    for name in only or ():
+        if name not in EXPERIMENTS:
+            known = f"Experiments: {', '.join(EXPERIMENTS)}."
+            raise SettingsError(f"--only {name}: there is no such experiment.{nearest(name, EXPERIMENTS)} {known}")
+        if drives < 2 and name in _TWO_DRIVES:
+            raise SettingsError(f"--only {name} is about {_TWO_DRIVES[name]}; give two drives or more.")
+    return [name for name in EXPERIMENTS if (only is None or name in only) and not (drives < 2 and name in _TWO_DRIVES)]
+
+
+def _check_drives(drives: Sequence[Path], min_gap: int | None) -> None:
+    for number, path in enumerate(drives):
+        if any(same_drive(path, other) for other in drives[:number]):
+            raise SettingsError(f"{path} is given twice. Give each drive once; it is query and map in turn.")
+    if len(drives) == 1 and min_gap is None:
+        raise SettingsError(
+            f"{drives[0]} is the only drive, so its frames are matched with older ones. Say how many frames older: "
+            "--min-gap 50. Or give more drives of the same route."
+        )
+    if len(drives) > 1 and min_gap is not None:
+        raise SettingsError("--min-gap is for one drive, matched with its own past; leave it out, or give one drive.")
+
+
+def _check_same_drives(out: Path, hashes: Sequence[str]) -> None:
+    """Raises SettingsError where `out` holds the study of a drive that is not among these, by content."""
+    earlier = _read(out).get("drives")
+    if earlier is None and (out / "study.json").is_file():
+        raise SettingsError(f"{out}/study.json is damaged, so its drives are not known. Choose another folder with -o.")
+    for drive in earlier if isinstance(earlier, list) else ():
+        if isinstance(drive, dict) and drive.get("hash") not in hashes:
+            raise SettingsError(f"{out} holds a study of {drive.get('log')}. Choose another folder with -o.")
+
+
+def truth_of_pair(truth: TruthChoice, query: int, other: int, drives: int) -> TruthChoice:
+    """The choice for one pair: of a list of TUM files, one for each drive, those of its two.
+
+    Raises TruthError where the list has another length, or a table of pairs would serve more than one pair.
+    """
+    if truth.source.lower().endswith(".csv") and drives > 1:
+        raise TruthError(
+            f"--truth {shown(truth.source)} lists the pairs of one query and one map, and here every drive is both. "
+            "Use index, poses, gps or a TUM file for each drive."
+        )
+    files = truth.source.split(",")
+    if len(files) == 1 or Path(truth.source).is_file():
+        return truth
+    if len(files) != drives:
+        raise TruthError(f"--truth has {len(files)} files for {drives} drives. Give one for all, or one for each.")
+    return replace(truth, source=f"{files[query]},{files[other]}")
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names without the words that all begin with, and different from each other.
+
+    >>> short_names(["walk_day_left", "walk_night", "walk_night"])
+    ['day_left', 'night', 'night (2)']
+    """
+    begin = 0
+    if len(names) > 1:
+        alike = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+        shared = "".join(letters[0] for letters in alike)
+        begin = max(shared.rfind(mark) for mark in "_- ") + 1
+    result: list[str] = []
+    for name in names:
+        short = name[begin:] or name
+        same = sum(re.sub(r" \(\d+\)$", "", other) == short for other in result)
+        result.append(f"{short} ({same + 1})" if same else short)
+    return result
+
+
+def _covered(known: dict[tuple[int, int], Any], opened: Sequence[Any]) -> list[np.ndarray]:
+    """Frames of each drive that the truth of all its pairs covers."""
+    frames = [np.arange(len(log.stamps())) for log in opened]
+    for (query, other), truth in known.items():
+        frames[query] = np.intersect1d(frames[query], truth.query_frames)
+        frames[other] = np.intersect1d(frames[other], truth.map_frames)
+    return frames
+
+
+def _hash(tree: Any) -> str:
+    return hashlib.sha256(canonical_json(tree).encode()).hexdigest()
+
+
+def _shown(truth: TruthChoice) -> dict[str, Any]:
+    """The choice as it is stored."""
+    return {**asdict(truth), "source": shown(truth.source)}
+
+
+def _truth_hash(truth: TruthChoice) -> str:
+    """Hash of the choice, and of the files it names."""
+    files = [Path(file) for file in {truth.source, *truth.source.split(",")} if Path(file).is_file()]
+    return _hash([_shown(truth), [hash_inputs(file) for file in sorted(files)]])

@@ -1,0 +1,222 @@
+"""Trials of recognisers on pairs of drives: features extracted once, each library learned and described with once.
+
+What a trial found is remembered by all that it depends on, so a study that was cut short goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from itertools import permutations
+from typing import TYPE_CHECKING, Any
+
+from vplog.benchmark.method_scores import describe_walk, score_rows, score_table, stored_bytes
+from vplog.benchmark.traversals import candidate_stops, extract_walk
+from vplog.data import Reference
+from vplog.errors import LogError
+from vplog.evaluate import retrieval
+from vplog.features.store import FeatureStore
+from vplog.places.library_files import references_hash
+from vplog.places.reference_choice import LibrarySettings, choose
+from vplog.results.run_record import canonical_json, write_run_json
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from contextlib import ExitStack
+    from pathlib import Path
+
+    from vplog.benchmark.traversals import Progress, Walk
+    from vplog.data import Bytes, Ints
+    from vplog.evaluate.pairs import Pairs
+    from vplog.evaluate.place_truth import PlaceTruth
+    from vplog.evaluate.retrieval import Ranks
+    from vplog.stages import Extractor, Log, PlaceState
+
+SCORES = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100")
+"""What a trial is judged by, as `evaluate.retrieval` defines them."""
+LESS_IS_BETTER = frozenset({"anr"})
+
+
+@dataclass(frozen=True)
+class Library:
+    """Random frames of a drive as reference images."""
+
+    drive: int
+    size: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The frames of one drive looked for in another, by one method with one library. Drives by number."""
+
+    method: str
+    library: Library
+    query: int
+    map: int
+
+
+@dataclass(eq=False)
+class Bench:
+    """The drives of a study and what has been tried on them. Drives are decoded when first needed."""
+
+    names: list[str]
+    """Names of the drives, short and different."""
+    logs: list[Log]
+    hashes: list[str]
+    """Hashes of the drives' files."""
+    methods: dict[str, Any]
+    """Recognisers by name; grows with those of the ablations."""
+    truth: dict[tuple[int, int], PlaceTruth]
+    """By query and map; its keys are the pairs of the study."""
+    frames: list[Ints]
+    """Numbers of the frames of each drive that the truth covers."""
+    extractor: Extractor
+    min_gap: int | None
+    common: dict[str, Any]
+    """All else that a trial's outcome depends on, as plain values."""
+    remembered: Path
+    """File of the trials done, by the hash of what they depend on."""
+    scratch: Path
+    stack: ExitStack
+    """Closes the feature stores."""
+    threads: int
+    progress: Progress
+    warnings: list[str] = field(default_factory=list)
+    _walks: dict[int, Walk] = field(default_factory=dict)
+    _done: dict[str, dict[str, Any]] | None = None
+    _learned: tuple[Any, Any] = (None, None)
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """(query, map) of every pair, in order."""
+        return list(self.truth)
+
+    def walk(self, drive: int) -> Walk:
+        """The drive's frames as features."""
+        if drive not in self._walks:
+            store = self.stack.enter_context(FeatureStore(self.scratch / f"{drive}.features"))
+            walk = extract_walk(
+                self.logs[drive], self.extractor, store, self.frames[drive], None, self.threads, self.progress
+            )
+            self.warnings += walk.warnings
+            self._walks[drive] = walk
+        return self._walks[drive]
+
+    def images(self, drive: int, rows: Sequence[int]) -> list[Bytes]:
+        """The grey images of rows of a walk, in the order given. Raises LogError where one is gone."""
+        walk = self.walk(drive)
+        stamps = walk.stamp_ns[sorted(set(rows))]
+        found = {one.stamp_ns: one.decode().image for one in self.logs[drive].frames(stamps)}
+        if len(found) < len(stamps):
+            why = "a frame that was read before cannot be read again. Leave the log unchanged, and run again."
+            raise LogError(f"{self.names[drive]}: {why}")
+        return [found[int(walk.stamp_ns[row])] for row in rows]
+
+    def references(self, library: Library) -> list[Reference]:
+        """Frames as `vplog compare` chooses them; those that cannot be decoded are left out after the choice."""
+        walk, covered = self.walk(library.drive), self.frames[library.drive]
+        wanted = LibrarySettings(choose="random", size=library.size, seed=library.seed)
+        numbers = set(covered[choose(covered, wanted)].tolist())
+        rows = [row for row, number in enumerate(walk.frames.tolist()) if number in numbers]
+        images = self.images(library.drive, rows)
+        return [
+            Reference(image, walk.store[row], walk.name, int(walk.stamp_ns[row]))
+            for image, row in zip(images, rows, strict=True)
+        ]
+
+    def learn(self, method: str, library: Library) -> PlaceState:
+        """What a method learned of a library; the references of the last one are kept, for they are the same for all
+        methods."""
+        if self._learned[0] != library:
+            self._learned = library, self.references(library)
+        return self.methods[method].learn(self._learned[1], self.threads)
+
+    def ask(
+        self, state: PlaceState, query: int, other: int, places: dict[int, Sequence[Any]]
+    ) -> tuple[Ranks, Pairs, Ints]:
+        """Ranks of every query of a pair, its true pairs, and where each query's candidates end."""
+        walks = self.walk(query), self.walk(other)
+        stops = candidate_stops(walks[0].frames, walks[1].frames, self.min_gap)
+        truth = self.truth[query, other].pairs(walks[0].frames, walks[1].frames).below(stops)
+        index = state.index(places[other])
+        scores = score_table(len(walks[0]), len(walks[1]), self.scratch, "scores")
+        score_rows(index, places[query], stops, scores, self.threads)
+        return retrieval.rank_queries(scores, truth, stops), truth, stops
+
+    def run(self, stage: str, trials: Iterable[Trial]) -> list[dict[str, Any]]:
+        """Figures of every trial, in order. Those remembered are not tried again."""
+        wanted = list(dict.fromkeys(trials))
+        keys = {trial: self._key(trial) for trial in wanted}
+        done = self._remember()
+        groups: dict[tuple[Library, str], list[Trial]] = {}
+        for trial in wanted:
+            if keys[trial] not in done:
+                groups.setdefault((trial.library, trial.method), []).append(trial)
+        used = {group: sorted({drive for t in some for drive in (t.query, t.map)}) for group, some in groups.items()}
+        total = sum(len(self.frames[drive]) for drives in used.values() for drive in drives)
+        described = 0
+        for (library, method), some in sorted(groups.items(), key=lambda one: _order(one[0][0])):
+            state = self.learn(method, library)
+            places = {}
+            for drive in used[library, method]:
+                before = described
+                places[drive] = self.describe(
+                    state, drive, lambda at, _, before=before: self.progress(stage, before + at, total)
+                )
+                described += len(self.frames[drive])
+            for trial in some:
+                ranks, _, _ = self.ask(state, trial.query, trial.map, places)
+                done[keys[trial]] = {
+                    **asdict(retrieval.score_retrieval(ranks)),
+                    "bytes_per_image": self._bytes(state, places[trial.map]),
+                    "bits": state.bits,
+                    "library_hash": references_hash(self._learned[1], self.methods[method]),
+                }
+            write_run_json(self.remembered, dict(sorted(done.items())))
+        return [done[keys[trial]] for trial in wanted]
+
+    def describe(self, state: PlaceState, drive: int, progress: Callable[[int, int], None]) -> Sequence[Any]:
+        """Places of a walk as a table would give them back."""
+        places, _ = describe_walk(state, self.walk(drive), self.threads, progress)
+        return state.from_arrow(state.to_arrow(places))
+
+    @staticmethod
+    def _bytes(state: PlaceState, places: Sequence[Any]) -> float:
+        return round(stored_bytes(state.to_arrow(places)) / len(places), 1)
+
+    def _key(self, trial: Trial) -> str:
+        about = {
+            **self.common,
+            "method": self.methods[trial.method].model_dump(mode="json"),
+            "library": [self.hashes[trial.library.drive], trial.library.size, trial.library.seed],
+            "query": self.hashes[trial.query],
+            "map": self.hashes[trial.map],
+            "truth": self.truth[trial.query, trial.map].about,
+        }
+        return hashlib.sha256(canonical_json(about).encode()).hexdigest()
+
+    def _remember(self) -> dict[str, dict[str, Any]]:
+        if self._done is None:
+            try:
+                found = json.loads(self.remembered.read_text(encoding="utf-8"))
+            except (OSError, ValueError, RecursionError):  # none yet, or no use: all is tried again
+                found = {}
+            entries = found.items() if isinstance(found, dict) else ()
+            self._done = {key: value for key, value in entries if _is_whole(value)}
+        return self._done
+
+
+def _is_whole(entry: Any) -> bool:
+    numbers = (*SCORES, "bytes_per_image", "bits")
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), (int, float)) for name in numbers)
+
+
+def _order(library: Library) -> tuple[int, int, int]:
+    return library.drive, library.size, library.seed
+
+
+def all_pairs(count: int) -> list[tuple[int, int]]:
+    """(query, map) of every two of `count` drives, each way; a single drive with itself."""
+    return [(0, 0)] if count == 1 else [(query, other) for other, query in permutations(range(count), 2)]

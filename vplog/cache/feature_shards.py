@@ -1,0 +1,133 @@
+"""The features and pictures of a drive's keyframes, in the files that extraction left in the stage cache."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+from vplog.cache.checked_file import CONTENT_AT, AbsentError, DamagedError
+from vplog.errors import ResultError
+from vplog.features.store import features_from, features_to, size_of
+from vplog.results.previews import Previews
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from vplog.data import Features
+
+_LENGTH = struct.Struct("<I")
+"""Bytes of the JSON head of a part, which comes before its features and pictures."""
+
+
+class _Row(NamedTuple):
+    """Where a keyframe's features and picture lie in the file of its part."""
+
+    stamp_ns: int
+    offset: int
+    """From the end of the head."""
+    features: int
+    width: int
+    height: int
+    thumbnail: int
+    """1 where there is one."""
+    picture: int
+    """Bytes of the picture, which follows the features; 0 for none."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the features."""
+        return size_of(self.features, bool(self.thumbnail))
+
+    @property
+    def end(self) -> int:
+        return self.offset + self.size + self.picture
+
+
+class Extracted:
+    """Features and pictures of keyframes in the files of their parts. Reads are safe from any thread."""
+
+    def __init__(self) -> None:
+        self.stamp_ns: list[int] = []
+        """Of the keyframes that were decoded."""
+        self.lost: list[str] = []
+        """Why each of the others was not."""
+        self.undecodable: list[tuple[str, int]] = []
+        """Topic and stamp of each message whose image does not decode, those beside a sound one among them."""
+        self.files: list[str] = []
+        self._rows: list[tuple[Path, int, _Row]] = []
+
+    def add(self, path: Path) -> None:
+        """Take the keyframes of the next part. Raises DamagedError, and AbsentError where there is no such file."""
+        try:
+            with path.open("rb") as stream:
+                length = path.stat().st_size
+                stream.seek(CONTENT_AT)
+                begin = CONTENT_AT + _LENGTH.size + (told := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
+                if begin > length:
+                    raise DamagedError("its header is longer than the file")
+                head = json.loads(stream.read(told))
+            rows = [_Row(*map(int, row)) for row in head["rows"]]
+            lost = [str(why) for why in head["lost"]]
+            undecodable = [(str(topic), int(stamp_ns)) for topic, stamp_ns in head["undecodable"]]
+        except FileNotFoundError:
+            raise AbsentError from None
+        except (OSError, ValueError, TypeError, KeyError, RecursionError, struct.error) as error:
+            raise DamagedError(f"its header cannot be read: {error}") from None
+        for row in rows:
+            if min(row[1:]) < 0 or not row.width or not row.height or begin + row.end > length:
+                raise DamagedError("its header points beyond its end")
+        self.stamp_ns += [row.stamp_ns for row in rows]
+        self.lost += lost
+        self.undecodable += undecodable
+        self.files.append(path.name)
+        self._rows += [(path, begin, row) for row in rows]
+
+    @property
+    def token(self) -> str:
+        """Stands for all that the features were made from: the names of the files hold the hashes of that."""
+        return " ".join(self.files)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, at: int) -> Features:
+        """The features of keyframe `at`. Raises ResultError where its file is gone."""
+        path, begin, row = self._rows[at]
+        data = _bytes_at(path, begin + row.offset, row.size)
+        return features_from(data, row.features, row.width, row.height, bool(row.thumbnail))
+
+    @property
+    def pictures(self) -> Previews:
+        return Previews(sum(row.picture > 0 for _, _, row in self._rows), self._picture)
+
+    def _picture(self, at: int) -> bytes:
+        path, begin, row = self._rows[at]
+        return _bytes_at(path, begin + row.offset + row.size, row.picture)
+
+
+def _bytes_at(path: Path, offset: int, length: int) -> bytes:
+    try:
+        with path.open("rb", buffering=0) as stream:
+            stream.seek(offset)
+            data = stream.read(length)
+    except OSError as error:
+        raise ResultError(f"Cannot read {path}: {error.strerror}. Did another run use the folder? Run again.") from None
+    if len(data) != length:
+        raise ResultError(f"{path} was cut off while it was in use. Run again.")
+    return data
+
+
+def packed(
+    decoded: Iterable[tuple[int, Features, bytes]], lost: Sequence[str], undecodable: Sequence[tuple[str, int]]
+) -> bytes:
+    """What the file of a part holds: stamp, features and picture of its keyframes, and what was lost of others."""
+    rows, chunks, at = [], [], 0
+    for stamp_ns, features, picture in decoded:
+        data, small = features_to(features), int(features.thumbnail is not None)
+        rows.append(_Row(stamp_ns, at, len(features), features.width, features.height, small, len(picture)))
+        chunks += [data, picture]
+        at += len(data) + len(picture)
+    head = json.dumps({"rows": rows, "lost": lost, "undecodable": undecodable}).encode()
+    return b"".join([_LENGTH.pack(len(head)), head, *chunks])

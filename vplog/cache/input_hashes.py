@@ -1,0 +1,76 @@
+"""The files of a drive: which they are, and how it is told that they are the same as before."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, cast
+
+from vplog.storage.remote_path import RemotePath
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+
+_BLOCK_BYTES = 2**20
+"""Read at once: hashing one takes a millisecond."""
+
+
+def files_of(drive: Path | Sequence[Path]) -> list[Path]:
+    """The files of a drive: of one log, or of a recording in several."""
+    return list(drive) if isinstance(drive, list | tuple) else [cast("Path", drive)]
+
+
+def hash_inputs(drive: Path | Sequence[Path], told: Callable[[int], None] = lambda _: None) -> dict[str, str]:
+    """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole.
+
+    `told` the bytes of every block read; what it raises ends the reading.
+    """
+    result: dict[str, str] = {}
+    for own, file in _named(drive):
+        name = str(file) if own in result else own
+        name = f"{name} ({len(result) + 1})" if name in result else name  # URLs that differ in their queries alone
+        if isinstance(file, RemotePath):
+            result[name] = file.version()
+            continue
+        with file.open("rb") as stream:
+            digest, block = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
+            while count := stream.readinto(block):
+                digest.update(block[:count])
+                told(count)
+        result[name] = digest.hexdigest()
+    return result
+
+
+def bytes_of(drive: Path | Sequence[Path]) -> int:
+    """Length of the files of a log on this machine. Raises OSError."""
+    return sum(file.stat().st_size for _, file in _named(drive) if not isinstance(file, RemotePath))
+
+
+def look_of(drive: Path | Sequence[Path]) -> dict[str, str]:
+    """What changes with every file of a log, by its full path, without reading one: length and times.
+
+    The time of the last change of any kind counts too: a copy may bring its source's time of writing along.
+    """
+    look = {}
+    for _, file in _named(drive):
+        if isinstance(file, RemotePath):
+            look[str(file) if str(file) not in look else f"{file} ({len(look) + 1})"] = file.version()
+        else:
+            stat = file.stat()
+            look[str(file.resolve())] = f"length {stat.st_size}, times {stat.st_mtime_ns} {stat.st_ctime_ns}"
+    return look
+
+
+def changed_s(drive: Path | Sequence[Path]) -> float:
+    """When a file of a log on this machine was last changed in any way, in seconds since the epoch; 0 without files."""
+    stats = [file.stat() for _, file in _named(drive) if not isinstance(file, RemotePath)]
+    return max((max(stat.st_mtime, stat.st_ctime) for stat in stats), default=0.0)
+
+
+def _named(drive: Path | Sequence[Path]) -> list[tuple[str, Path]]:
+    return [
+        (str(file.relative_to(path)) if path.is_dir() else file.name, file)
+        for path in files_of(drive)
+        for file in (sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path])
+    ]

@@ -1,0 +1,247 @@
+"""What the stages of a run came to, kept beside it: each result a file, found again by all that it was made from.
+
+A file is named by its stage and the sha256 over what it depends on: the results and settings that went in, the code
+that made it and the packages which that uses. It is written beside and renamed, and holds length and checksum of its
+content: what is found is whole, or is made anew with a warning. One folder is for one drive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, is_dataclass
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import numpy as np
+
+from vplog.cache.checked_file import (
+    CACHE_FILES,
+    ENDING,
+    INPUTS,
+    AbsentError,
+    DamagedError,
+    content_of,
+    file_name,
+    sealed,
+)
+from vplog.cache.input_hashes import hash_inputs, look_of
+from vplog.errors import ResultError
+from vplog.results.run_record import canonical_json, read_run_json, write_run_json
+from vplog.settings import Settings
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog.cache.codecs import Codec
+
+T = TypeVar("T")
+
+_INPUTS_BYTES = 2**26
+"""Longest inputs.json that is read: a folder of 400,000 images has one of 60 MB."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Which files a drive is."""
+
+    look: dict[str, str]
+    """Lengths and times, by full path."""
+    token: str
+    """Stands for the content in the keys of all that is made from it."""
+    hashes: dict[str, str] | None
+    """sha256 by name, where known."""
+
+    @property
+    def lengths(self) -> str:
+        """sha256 over the lengths of the files: copies on other machines have other times."""
+        return key_of(_lengths(self.look))
+
+
+def key_of(made_from: Any) -> str:
+    """sha256 over all that a result depends on, a tree of plain values."""
+    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()
+
+
+def digest_of(value: Any) -> str:
+    """sha256 over a value: of settings and dataclasses all fields, of arrays type, shape and bytes, of a recogniser's
+    state its hash, of stored features their token."""
+    digest = hashlib.sha256()
+    if isinstance(stands_for := getattr(value, "token", getattr(value, "hash", None)), str):
+        digest.update(stands_for.encode())
+    elif is_dataclass(value):
+        for field in fields(value):
+            digest.update(f"{field.name} {digest_of(getattr(value, field.name))}\n".encode())
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str} {value.shape}\n".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, list | tuple):
+        digest.update("".join(map(digest_of, value)).encode())
+    else:
+        digest.update(canonical_json(value.model_dump(mode="json") if isinstance(value, Settings) else value).encode())
+    return digest.hexdigest()
+
+
+def inputs_of(drive: Path | Sequence[Path], cache: Path | None) -> Inputs:
+    """The files of a drive; their content has the name that the cache knows it by, if it does.
+
+    It does where length and times are the same, and where they are not but the sha256 is: then the files are read.
+    """
+    look = look_of(drive)
+    known = {} if cache is None else _known_inputs(cache)
+    hashes = known.get("hashes")
+    if known.get("look") == look:
+        return Inputs(look, known["token"], hashes)
+    if hashes and _lengths(known["look"]) == _lengths(look):
+        found = hash_inputs(drive)
+        return Inputs(look, known["token"] if found == hashes else key_of(look), found)
+    return Inputs(look, key_of(look), None)
+
+
+def _lengths(look: dict[str, str]) -> list[str]:
+    return sorted(text.partition(",")[0] for text in look.values())
+
+
+def _known_inputs(cache: Path) -> dict[str, Any]:
+    """inputs.json of a cache; empty where there is none, or another thing."""
+    path = cache / INPUTS
+    try:
+        known = read_run_json(path) if path.stat().st_size <= _INPUTS_BYTES else {}
+    except (OSError, ResultError):
+        return {}
+
+    def texts(value: Any) -> bool:
+        return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+    sound = texts(known.get("look")) and isinstance(known.get("token"), str)
+    return known if sound and (known.get("hashes") is None or texts(known["hashes"])) else {}
+
+
+class StageCache:
+    """The results of one drive's stages, those of this run and those found."""
+
+    def __init__(self, folder: Path, drive: Path | Sequence[Path], warnings: list[str], keep: bool = True) -> None:
+        """`warnings` are those of the run.
+
+        What a stage adds to the warnings is repeated when its result is found. Without `keep` nothing is found, and
+        what has to be written is gone when the block ends. Raises ResultError where the folder cannot be made.
+        """
+        self.folder, self.keep, self.drive = folder, keep, drive
+        self._warnings, self._used, self._full = warnings, set[str](), False
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ResultError(f"Cannot make the folder {folder}: {error.strerror}. Choose another with -o.") from None
+        if not keep:
+            self._remove(set())
+
+    def __enter__(self) -> Self:
+        """Begin to read the drive's files for their hashes, beside the stages."""
+        self.inputs = inputs_of(self.drive, self.folder)
+        self._aside = ThreadPoolExecutor(1)
+        self._hashes = self._aside.submit(self._know_inputs)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._aside.shutdown()
+        if not self.keep or not any(self.folder.glob(f"*{ENDING}")):  # nothing came of the run: no log, no odometry
+            self.drop()
+
+    def hashes(self) -> dict[str, str]:
+        """sha256 of the files of the drive, by name."""
+        return self._hashes.result()
+
+    def find(self, name: str, key: str, codec: Codec[T]) -> T:
+        """A result that an earlier run stored. Raises AbsentError where there is none that is whole."""
+        if not self.keep:
+            raise AbsentError
+        path = self.folder / file_name(name, key)
+        try:
+            head, _, content = content_of(path.read_bytes(), key).tobytes().partition(b"\n")
+            warnings, value = json.loads(head), codec.from_bytes(content)
+            if not isinstance(warnings, list):
+                raise DamagedError("it holds something else")
+        except FileNotFoundError:
+            raise AbsentError from None
+        except Exception as error:  # whatever bytes do to a reader
+            self.damaged(path, error)
+            raise AbsentError from None
+        self._warnings += map(str, warnings)
+        self._used.add(path.name)
+        return value
+
+    def store(self, name: str, key: str, warnings: list[str], content: bytes) -> None:
+        """Write a result with the warnings that came with it, as long as the disk takes it."""
+        if not self.keep or self._full:
+            return
+        try:
+            self.put(file_name(name, key), sealed(key, json.dumps(warnings).encode() + b"\n" + content))
+        except ResultError as error:
+            self._full = True
+            self._warnings.append(f"The results of the stages are not cached for another run. {error}")
+
+    def put(self, name: str, data: bytes) -> Path:
+        """Write a file as a whole. Raises ResultError."""
+        with replacing(self.folder / name) as stream:
+            stream.write(data)
+        self._used.add(name)
+        return self.folder / name
+
+    def use(self, name: str) -> None:
+        """This run needs the file, which was there."""
+        self._used.add(name)
+
+    def damaged(self, path: Path, error: Exception) -> None:
+        """Say that a file was found damaged and is not used."""
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        self._warnings.append(f"{path.name} in {self.folder} is not used, its stage runs again: {reason}.")
+
+    def _know_inputs(self) -> dict[str, str]:
+        """sha256 of the files of the drive, which are read unless it is known; a later run then knows it.
+
+        Not if they change meanwhile: what is made from them may be of what they were before.
+        """
+        inputs = self.inputs
+        hashes = hash_inputs(self.drive) if inputs.hashes is None else inputs.hashes
+        if self.keep and look_of(self.drive) == inputs.look:
+            known = _known_inputs(self.folder)
+            known = known if known.get("token") == inputs.token else {}
+            self._write_inputs({**known, "look": inputs.look, "token": inputs.token, "hashes": hashes})
+        return hashes
+
+    def finish(self, parts: Sequence[str]) -> None:
+        """The run is done: remove what it did not use. `parts` are the files of its features, in order."""
+        self.hashes()
+        inputs, changed = self.inputs, look_of(self.drive) != self.inputs.look
+        if changed:
+            self._warnings.append("The log changed while it was read, so nothing is cached for another run.")
+            self._remove(set())
+        if self.keep and not changed:
+            known = {"look": inputs.look, "token": inputs.token, "hashes": inputs.hashes, **_known_inputs(self.folder)}
+            self._write_inputs({**known, "parts": list(parts)})
+            self._remove({*self._used, INPUTS})
+
+    def drop(self) -> None:
+        """Remove all of the cache, and its folder if nothing else is in it."""
+        self._remove(set())
+        if self.folder.is_dir() and not any(self.folder.iterdir()):
+            self.folder.rmdir()
+
+    def _write_inputs(self, known: dict[str, Any]) -> None:
+        try:
+            write_run_json(self.folder / INPUTS, known, checksum=True)
+        except ResultError:  # it only spares work; the result's own files say that the disk is full
+            self._full = True
+
+    def _remove(self, kept: set[str]) -> None:
+        """Remove the cache's own files but these."""
+        for file in [file for pattern in CACHE_FILES for file in self.folder.glob(pattern)]:
+            if file.name not in kept:
+                file.unlink(missing_ok=True)
+
+
+def finished_parts(cache: Path) -> list[str]:
+    """Names of the files of a finished run's features, in order; none where no run was finished."""
+    parts = _known_inputs(cache).get("parts")
+    return [str(name) for name in parts if "/" not in str(name)] if isinstance(parts, list) else []

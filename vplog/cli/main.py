@@ -1,0 +1,396 @@
+"""The verbs: each a plain function of its arguments. The only place that prints and exits."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import shlex
+import signal
+import sys
+import threading
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import vplog
+from vplog.cli.benchmark import add_studies
+from vplog.cli.maps import add_maps
+from vplog.cli.options import (
+    at_least_one,
+    local,
+    local_file,
+    pipeline_of,
+    place,
+    settings_options,
+    topic_options,
+    topics_of,
+)
+from vplog.cli.parser import Parser
+from vplog.cli.printing import (
+    Progress,
+    print_evaluation,
+    print_info,
+    print_joint,
+    print_json,
+    print_line,
+    print_run,
+    say,
+    warn,
+)
+from vplog.cli.results import add_results
+from vplog.errors import LogError, VplogError, was_interrupted
+from vplog.execution.cores import available, limited
+from vplog.execution.execution import Execution
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from vplog.logs import TopicChoice
+    from vplog.pipeline import Pipeline
+
+    Verb = Callable[[argparse.Namespace], None]
+
+
+def main(argv: Sequence[str] | None = None) -> NoReturn:
+    """Parse, run one verb, exit: 0 done, 1 a known error in one line, 2 wrong usage, 130 interrupted, 143 ended."""
+    try:
+        _run_verb(argv)
+    finally:
+        _flush()
+
+
+def _run_verb(argv: Sequence[str] | None) -> NoReturn:
+    # before numpy loads: every stage has its own workers, and a BLAS pool inside each would only get in their way
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
+    arguments = _parser().parse_args(sys.argv[1:] if argv is None else argv)
+    arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
+    logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
+    try:
+        with _ended_by(signal.SIGTERM), _at_hand(arguments), limited(getattr(arguments, "threads", None)):
+            arguments.verb(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
+        sys.exit(0)
+    except KeyboardInterrupt as error:
+        _interrupted(error)
+    except VplogError as error:
+        _fail(arguments, str(error))
+    except MemoryError:
+        _fail(arguments, "Out of memory. Use fewer --threads, or a shorter log.")
+    except OSError as error:  # a full disk, a drive that went away
+        _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
+    except Exception as error:  # a fault of ours: still one line, and how to see more
+        if was_interrupted(error):
+            _interrupted(error)
+        text = " ".join(str(error).split())[:200]
+        _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
+    sys.exit(0)
+
+
+@contextmanager
+def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
+    """Run folders and libraries named by URL are copied for the verb; what it writes to one is sent when it is done."""
+    places = {name: getattr(arguments, name, None) for name in ("run", "runs", "library", "output")}
+    if not any("://" in str(place) for place in places.values()):
+        yield
+        return
+    from vplog.storage.remote_path import local_copy, local_output
+
+    with ExitStack() as stack:
+        for name, place in places.items():
+            if place is None:
+                continue
+            if name == "runs":
+                arguments.runs = [stack.enter_context(local_copy(run)) for run in place]
+            else:
+                setattr(arguments, name, stack.enter_context((local_output if name == "output" else local_copy)(place)))
+        yield
+
+
+@contextmanager
+def _ended_by(number: signal.Signals) -> Iterator[None]:
+    """What asks a process to end, as schedulers and containers do, ends it as Ctrl-C: workers and scratch files go."""
+
+    def end(*_: object) -> NoReturn:
+        _ended.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _ended.clear()
+    before = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+_ended: list[signal.Signals] = []
+
+
+def _flush() -> None:
+    """Write out stdout and stderr. What one of them does not take is dropped: the interpreter, which flushes both once
+    more, would end with a status of its own (120)."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            with suppress(OSError):  # what stands in for the stream may be no file
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _interrupted(error: BaseException) -> NoReturn:
+    known = getattr(error, "__notes__", ["what was finished in the output folder stays"])
+    say(f"interrupted; {known[-1]}")
+    sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
+
+
+def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
+    if arguments.debug:
+        raise  # noqa: PLE0704 (called from an except block)
+    _flush()
+    say(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))
+    sys.exit(1)
+
+
+def info(arguments: argparse.Namespace) -> None:
+    """Show what is in a log, what a run would use, what is wrong, and the command to run."""
+    from vplog.verbs.info import preflight
+
+    found = preflight(arguments.log, topics_of(arguments))
+    if arguments.html is not None:
+        from vplog.verbs.info_page import write_page
+
+        write_page(arguments.html, found)
+    record = found.record
+    if arguments.json:
+        print_json(record)
+    elif not arguments.check:
+        print_info(record)
+        if arguments.html is not None:
+            print(f"page      {arguments.html}")
+    elif record["ready"]:
+        print(f"{arguments.log} can be run: {record['command']}")
+    if arguments.check and not record["ready"]:
+        instead = f" This works: {record['command']}" if record["command"] else ""
+        raise LogError(f"{arguments.log} cannot be run. {' '.join(record['problems'])}{instead}")
+
+
+def library(arguments: argparse.Namespace) -> None:
+    """Build a reference library from frames of logs."""
+    from vplog.run.reference_library import build_library
+
+    pipeline, warnings = pipeline_of(arguments), []
+    with Progress(arguments) as progress:
+        state = build_library(
+            arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress,
+            warnings.append, force=arguments.force,
+        )  # fmt: skip
+    record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
+    if arguments.json:
+        print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
+        return
+    text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
+    print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
+    warn(warnings)
+    print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
+    from vplog.run.report import outcome_of
+    from vplog.storage.remote_path import local_copy
+
+    paths, pipeline, library, topics = _asked(arguments)
+    # a cache that is sent over the net costs more than it saves
+    use_cache = arguments.cache and "://" not in str(arguments.shown)
+    with ExitStack() as stack, Progress(arguments) as progress:
+        if library is not None:  # by URL, as an unfinished run may name it
+            library = stack.enter_context(local_copy(library))
+        if len(paths) > 1 and not arguments.one_drive:
+            from vplog.sessions.joint_run import run_joint
+
+            found = run_joint(
+                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress), use_cache,
+                arguments.force,
+            )  # fmt: skip
+        else:
+            from vplog.pipeline import CacheOptions
+            from vplog.pipeline import run as run_pipeline
+
+            found = run_pipeline(
+                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress),
+                CacheOptions(use=use_cache, force=arguments.force),
+            ).record  # fmt: skip
+    if arguments.json:
+        print_json({"run": str(arguments.shown), **found})
+    elif "maps" in found:
+        print_joint(arguments.shown, found)
+    else:
+        print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
+
+
+def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
+    """Logs, settings, library and topics: those of the command, or with --resume those of the unfinished run."""
+    if not arguments.resume:
+        if not arguments.logs:
+            arguments.refuse("the following arguments are required: LOG")
+        if arguments.gps:
+            arguments.set.append("gps.use=true")
+        return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
+    from vplog.verbs.resume import asked_for
+
+    if "://" in str(arguments.shown):
+        arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
+    asking, asked_by = vars(arguments), ("pipeline", "set", "library", "gps")
+    names = [name for name in asking if name in asked_by or name.endswith(("_topic", "_file"))]
+    given = [name for name in names if asking[name] not in (None, [], False, "default")]
+    if given or not arguments.cache:
+        option = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
+        arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{option}")
+    asked = asked_for(arguments.output, arguments.logs)
+    arguments.one_drive, arguments.force = not asked.several, True  # what it replaces, it was asked when it began
+    return asked.logs, asked.pipeline, asked.library, asked.topics
+
+
+def config(arguments: argparse.Namespace) -> None:
+    """Print every setting of a pipeline as YAML, in the form of a pipeline file."""
+    import yaml
+
+    tree = pipeline_of(arguments).model_dump(mode="json")
+    if arguments.json:
+        print_json(tree)
+    else:
+        print(yaml.safe_dump(tree, sort_keys=False), end="")
+
+
+def schemas(arguments: argparse.Namespace) -> None:
+    """Write the schemas of tables, MCAP messages and settings."""
+    from vplog.pipeline import pipeline_schema
+    from vplog.results.contracts import write_schemas
+
+    _folder(arguments.output)
+    written = [str(path) for path in write_schemas(arguments.output, pipeline_schema())]
+    if arguments.json:
+        print_json({"written": written})
+    else:
+        print("\n".join(written))
+
+
+def _folder(path: Path) -> None:
+    from vplog.errors import ResultError
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"Cannot make the folder {path}: {error.strerror}. Choose another with -o.") from None
+
+
+def demo(arguments: argparse.Namespace) -> None:
+    """Render a small drive, run on it and evaluate the result."""
+    from vplog.demo import DemoSettings, make_drive
+    from vplog.pipeline import CacheOptions
+    from vplog.pipeline import run as run_pipeline
+    from vplog.run.report import outcome_of
+    from vplog.verbs.evaluate_run import evaluate as evaluate_run
+    from vplog.verbs.report import report as write_report
+
+    pipeline = pipeline_of(arguments)
+    _folder(arguments.output)
+    with Progress(arguments) as progress:
+        progress("render", 0, 1)
+        drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
+        progress("render", 1, 1)
+        done = run_pipeline(
+            drive.log, arguments.output / "run", pipeline, execution=Execution(arguments.threads, progress),
+            cache=CacheOptions(force=arguments.force),
+        )  # fmt: skip
+    found = evaluate_run(arguments.output / "run", str(drive.truth))
+    write_report(arguments.output / "run", truth=str(drive.truth))
+    if arguments.json:
+        print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
+        return
+    out = arguments.output / "run"
+    print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
+    print_evaluation(found)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="vplog", description=vplog.__doc__)
+    parser.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--json", action="store_true", help="print one JSON object")
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    topics = topic_options()
+    threads = argparse.ArgumentParser(add_help=False)
+    threads.add_argument(
+        "--threads", type=at_least_one, default=available(), metavar="N", help="threads (default: all cores)"
+    )
+    settings = settings_options("default", "default")
+    verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
+
+    def group(name: str, text: str, parents: Sequence[argparse.ArgumentParser] = ()) -> argparse.ArgumentParser:
+        said = text[0].lower() + text[1:].rstrip(".")
+        return verbs.add_parser(name, help=said, description=text, parents=parents)
+
+    def add(name: str, verb: Verb, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
+        sub = group(name, verb.__doc__ or "", [common, *parents])
+        sub.set_defaults(verb=verb)
+        return sub
+
+    def output(sub: argparse.ArgumentParser, text: str) -> None:
+        sub.add_argument("-o", "--output", type=place, required=True, metavar="OUT", help=text)
+
+    _add_info(add("info", info, topics))
+    sub = add("library", library, topics, threads, settings)
+    sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
+    output(sub, "folder of the library")
+    _add_force(sub, "library")
+    sub = add("run", run, topics, threads, settings)
+    _add_run(sub)
+    output(sub, "run folder")
+    add_results(add, topics, threads)
+    add_studies(add, topics, threads, settings)
+    add_maps(add, group, common, topics, threads)
+    sub = add("demo", demo, threads, settings)
+    output(sub, "folder of the drive and the run")
+    _add_force(sub)
+    sub = add("schemas", schemas)
+    sub.add_argument(
+        "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
+    )
+    add("config", config, settings)
+    sub = group("help", "Show what a verb does, and all its options.")
+    sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
+    sub.set_defaults(verb=lambda arguments: parser.parse_args([*arguments.words, "--help"]), debug=False)
+    return parser
+
+
+def _add_info(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("log", type=place, metavar="LOG")
+    text = "print one line; exit status 1 if a run would fail"
+    sub.add_argument("--check", action="store_true", help=text)
+    text = "also write an HTML page with pictures of the drive"
+    sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
+
+
+def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:
+    sub.add_argument("--force", action="store_true", help=f"replace the {what} of another log in OUT")
+
+
+def _add_run(sub: argparse.ArgumentParser) -> None:
+    sub.set_defaults(refuse=sub.error)
+    sub.add_argument("logs", type=place, nargs="*", metavar="LOG")
+    sub.add_argument("--library", type=place, metavar="LIB", help="reference library (default: made from the drive)")
+    sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
+    sub.add_argument("--gps", action="store_true", help="use the log's satellite fixes as constraints")
+    sub.add_argument("--resume", action="store_true", help="continue the interrupted run in OUT; needs no LOG")
+    _add_force(sub)
+    sub.add_argument(
+        "--no-cache", dest="cache", action="store_false", help="do not cache results of stages in OUT for later runs"
+    )

@@ -1,0 +1,457 @@
+"""How results look on a terminal: text, tables, progress, and JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import sys
+import textwrap
+from contextlib import suppress
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, TextIO
+
+from vplog.storage.urls import without_secrets
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from vplog.batch.batch import Drive
+    from vplog.run.report import Outcome
+
+
+_UNMOVED_M = 1e-3
+"""m: less is what rounding and the solver's last digits come to."""
+
+
+def say(message: str) -> None:
+    """A line on stderr, wrapped as those of results. Where that is closed or full, no work is lost for it."""
+    with suppress(OSError):
+        print(_wrapped(f"vplog: {without_secrets(message)}", terminal_width(sys.stderr)), file=sys.stderr)
+
+
+def warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        say(f"warning: {warning}")
+
+
+def terminal_width(stream: TextIO) -> int | None:
+    """Columns of the terminal that a stream is; None for a pipe or a file, where a line has no limit."""
+    with suppress(OSError, ValueError):  # it is no file
+        return os.get_terminal_size(stream.fileno()).columns or None
+    return None
+
+
+def print_line(label: str, text: str) -> None:
+    """A label and a text, wrapped between words where stdout is a terminal: names are whole and can be copied."""
+    print(_wrapped(f"{label:10}{' ' if len(label) > 9 else ''}{text}", terminal_width(sys.stdout)))
+
+
+def _wrapped(line: str, width: int | None) -> str:
+    if width is None:
+        return line
+    return textwrap.fill(
+        line, max(width, 20), subsequent_indent=" " * min(10, width // 4), break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+
+
+def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Aligned columns, numbers to the right; a block for each row where the terminal is too narrow for them.
+
+    A title may have several lines. No cell is ever shortened, and no name broken.
+    """
+    from rich.cells import cell_len
+
+    cells = [["".join(c if c.isprintable() else repr(c)[1:-1] for c in cell) for cell in row] for row in rows]
+    heads = [list(line) for line in zip_longest(*(title.split("\n") for title in titles), fillvalue="")]
+    widths = [max(map(cell_len, column)) for column in zip(*heads, *cells, strict=True)]
+    right = [all(re.fullmatch(r"[-+.\d]*", cell) for cell in column) for column in zip(*cells, strict=True)]
+    width = terminal_width(sys.stdout)
+    if width is None or sum(widths) + 2 * len(widths) <= width:
+        for row in heads + cells:
+            blanks = [" " * (wide - cell_len(cell)) for wide, cell in zip(widths, row, strict=True)]
+            texts = (
+                blank + cell if number else cell + blank
+                for blank, cell, number in zip(blanks, row, right or [False] * len(row), strict=True)
+            )
+            print("  ".join(texts).rstrip())
+        return
+    for first, *others in cells:
+        print(first)
+        named = zip(titles[1:], others, strict=True)
+        print_line("", ", ".join(f"{' '.join(title.split())} {cell}" for title, cell in named if cell))
+
+
+def print_next(look: str, *commands: str) -> None:
+    """Where to look at what came of it, and the commands that go on from there, each on a line to be copied."""
+    print_line("look at", look)
+    for command in commands:
+        print(f"{'next':10}{command}")
+
+
+def print_info(found: dict[str, Any]) -> None:
+    from vplog.verbs.info import in_words
+
+    seconds = max(found["end_ns"] - found["start_ns"], 0) / 1e9
+    print(f"log       {found['path']}")
+    print_line("kind", f"{found['kind']}, {found['messages']} messages over {seconds:.1f} s")
+    rows = []
+    for topic in found["topics"]:
+        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f}"
+        used = "yes" if topic["used"] else ""
+        rows.append((topic["name"], topic["type"], str(topic["count"]), rate, topic["role"], used, topic["why"]))
+    print_table(("topic", "type", "count", "Hz", "role", "used", "why"), rows)
+    for name, text in in_words(found):
+        print_line(name, text)
+    for gap in found["gaps"]:
+        print_line("gap", f"{gap['seconds']:.1f} s without {gap['what']}, {gap['after_s']:.1f} s after the start")
+    for kind in ("warning", "problem"):
+        for text in found[f"{kind}s"]:
+            print_line(kind, text)
+    if found["command"]:
+        print(f"{'run' if found['ready'] else 'this works':10} {found['command']}")
+
+
+def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
+    """`outcome` is that of the run folder; `out` is what the user called it."""
+    from vplog.data import Verdict
+
+    counts, totals, named = record["counts"], record["totals"], shlex.quote(str(out))
+    print_line(f"{out}:", _came_of(outcome, record))
+    print_line("", f"{counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates:")
+    for name, count in counts["verdicts"].items():
+        print_line(f"{count:9d}", f"{name}: {Verdict(name).sentence}")
+    warn(record["warnings"])
+    print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+    commands = [f"vplog evaluate {named} --truth FILE.tum", f"vplog export {named} --format kitti -o FILE"]
+    if outcome.closures:
+        commands.insert(1, f"vplog explain {named} --worst")
+    print_next(f"{out}/report.html in a browser, {out}/result.mcap in Foxglove", *commands)
+
+
+def _came_of(outcome: Outcome, record: dict[str, Any]) -> str:
+    if outcome.moved_m < _UNMOVED_M:  # the reason is what the user needs, whatever its words
+        return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
+    closures = f"{outcome.closures} closure{'' if outcome.closures == 1 else 's'}"
+    places = f"{outcome.places} place{'' if outcome.places == 1 else 's'}"
+    causes = [f"{closures} at {places}"] if outcome.closures else []
+    causes += ["the satellite fixes"] if record["gps"] else []
+    return f"the trajectory moved by up to {outcome.moved_m:.2f} m{', by ' if causes else ''}{' and '.join(causes)}"
+
+
+def print_joint(out: Path, record: dict[str, Any]) -> None:
+    for number, found in enumerate(record["maps"]):
+        several = f" in one frame, map{number}.g2o" if len(found["drives"]) > 1 else " by itself"
+        print_line(f"{out}:", f"{', '.join(found['drives'])}{several}")
+    for tie in record["joins"]:
+        text = f"{tie['kept']} closures of {tie['candidates']} candidates"
+        print_line("", f"{tie['query_drive']} to {tie['match_drive']}: {text}")
+    warn(record["warnings"])
+    totals, named = record["totals"], shlex.quote(str(out))
+    print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
+    first = shlex.quote(f"{out}/{record['maps'][0]['drives'][0]}")
+    print_next(
+        f"{out}/DRIVE/report.html, and {out}/DRIVE/joint_trajectory.tum of each drive in a map of several",
+        f"vplog evaluate {named} --truth FILE.tum", f"vplog export {first} --format kitti -o FILE",
+    )  # fmt: skip
+
+
+def print_evaluation(found: dict[str, Any]) -> None:
+    from vplog.evaluate.closures import in_words
+
+    for number, one in enumerate(found.get("maps", [])):
+        ate = one["ate_after"]
+        print_line(f"map {number}", f"ATE rmse {ate['rmse_m']:.6f} m as one trajectory ({ate['alignment']})")
+        for drive in one["drives"]:
+            before, after = drive["ate_before"]["rmse_m"], drive["ate_after"]["rmse_m"]
+            print_line(f"  {drive['drive']}:", f"ATE rmse {before:.6f} m before, {after:.6f} m after, by itself")
+            _print_lines("  closures", in_words(drive["closures"]))
+    for pair in found.get("joins", []):
+        if pair["accepted"] or pair["not_judged"]:
+            _print_lines(f"  {pair['query_drive']} to {pair['match_drive']}:", in_words(pair))
+    for drive, why in found.get("uncovered", {}).items():
+        say(f"warning: {drive} is left out: {why}")
+    if "maps" in found:
+        return
+    warn(_truth_notes(found))
+    if found.get("closures"):
+        _print_lines("closures", in_words(found["closures"]))
+    residuals = found.get("residuals")
+    if residuals and residuals["to_truth"] is not None:
+        near = "" if residuals["to_neighbours"] is None else f", {residuals['to_neighbours']:.2f} to its neighbours"
+        text = (
+            f"median {residuals['to_truth']:.2f} sigma to the truth{near} (consistent with their covariance: about 1)"
+        )
+        print_line("residuals", text)
+    for when in ("before", "after"):
+        ate, rpe, drift = found[f"ate_{when}"], found.get(f"rpe_{when}"), found.get(f"drift_{when}")
+        scale = f", scale {ate['scale']:.4f}" if ate["alignment"] == "Sim(3)" else ""
+        line = f"ATE rmse {ate['rmse_m']:.6f} m, max {ate['max_m']:.3f} m ({ate['alignment']}{scale})"
+        if rpe is not None and rpe["count"]:
+            line += f"   RPE {rpe['translation_rmse_m']:.4f} m, {rpe['rotation_rmse_deg']:.4f} deg a frame"
+        print_line(when, line)
+        if drift is not None and drift["segments"]:
+            ends = f"{drift['lengths_m'][0]:g} to {drift['lengths_m'][-1]:g} m"
+            what = f"drift {drift['translation_m']:.2f} m, {drift['rotation_deg']:.2f} deg per 100 m"
+            print_line("", f"{what} (mean of {drift['segments']} segments of {ends} of path)")
+
+
+def _truth_notes(found: dict[str, Any]) -> list[str]:
+    """Warnings about the truth that bear on the figures."""
+    truth, notes = found.get("truth_is"), []
+    if truth is not None and truth["frame"] != "body":
+        what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
+        notes.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
+    if truth is not None and not truth["oriented"]:
+        notes.append(
+            "The truth has no orientations, so closures are judged by place, without heading. To judge their "
+            "poses, give a truth with orientations."
+        )
+    if found.get("interpolated"):
+        notes.append("Few poses have a stamp within 0.01 s of the truth's: poses are interpolated at its stamps.")
+    return notes
+
+
+def _print_lines(label: str, lines: list[str]) -> None:
+    for line in lines:
+        print_line(label, line)
+        label = ""
+
+
+def print_explanation(told: dict[str, Any]) -> None:
+    print(f"closure {told['closure']} of {told['run']}")
+    for name, text in (
+        ("verdict", told["verdict"]),
+        ("proposed", told["proposed"]),
+        ("geometry", told["geometry"]),
+        ("solver", told["solver"]),
+        ("to change", told["change"]),
+    ):
+        print_line(name, text)
+    if told["picture"]:
+        print(f"{'picture':10}{told['picture']['file']}")
+
+
+def print_optimised(found: dict[str, Any]) -> None:
+    print(
+        f"{found['output']}: {found['poses']} poses, {found['edges']} edges; of {found['loops']} closures "
+        f"{found['kept']} were kept, {found['rejected']} rejected"
+    )
+    print(f"  error {found['error_before']:.6g} before, {found['error_after']:.6g} after (half the chi-square)")
+    print(f"  {found['reason']}")
+    warn(found["warnings"])
+    print(f"  {sum(found['seconds'].values()):.2f} s")
+
+
+_BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
+"""What the table of a batch tells of each drive, with its decimals."""
+
+
+def print_batch(found: dict[str, Any]) -> None:
+    rows = []
+    for drive in found["drives"]:
+        computed = drive["state"] == "computed"
+        counts = [str(drive[name]) if computed else "" for name in ("keyframes", "accepted")]
+        counts += [str(drive["attempts"] or "")]
+        counts += [f"{drive[name]:.{digits}f}" if drive[name] else "" for name, digits in _BATCH_COSTS]
+        rows.append((drive["drive"], drive["state"], *counts, drive["worker"], drive["error"]))
+    titles = ("drive", "state", "keyframes", "closures", "attempts", "seconds", "peak MB", "worker", "error")
+    print_table(titles, rows)
+    print_line(
+        f"{found['map']}:",
+        f"{len(found['drives'])} drives, {found['failed']} failed, {found['seconds']:.1f} s, {found['jobs']} at once, "
+        f"{found['threads_per_job']} threads each",
+    )
+    for component in (found["joined"] or {}).get("components", []):
+        print_line("together", ", ".join(component["drives"]))
+    for drive in found["drives"]:
+        for warning in drive["warnings"]:
+            say(f"warning: {drive['drive']}: {warning}")
+    warn(found["warnings"] + (found["joined"] or {}).get("warnings", []))
+    named = shlex.quote(str(found["map"]))
+    look = f"{found['map']}/runs/drive=ID/report.html of each drive"
+    print_next(look, f"vplog map info {named}", f"vplog map query {named} LOG")
+
+
+def print_map(found: dict[str, Any]) -> None:
+    known = found["library"]
+    each = "" if found["bytes_per_place"] is None else f", {found['bytes_per_place']:g} bytes a place"
+    print(
+        f"{found['map']}: {len(found['drives'])} drives, {found['places']} places{each}, {found['bytes'] / 1e6:.1f} MB"
+    )
+    print(f"library   {known['hash'] or 'none yet'}, {known['references'] or 0} references")
+    boxes = [drive["bounds"] for drive in found["drives"] if drive["bounds"]]
+    sides = zip((min, min, max, max), zip(*boxes, strict=True), strict=False)  # no side where there is no box
+    where = ",".join(f"{most(side):.5f}" for most, side in sides)
+    around = f", within {where} (south, west, north, east)" if boxes else ""
+    print(f"on earth  {found['on_earth']} of {len(found['drives'])} drives{around}")
+    if found["components"] is not None:
+        joined = sum(len(one["drives"]) for one in found["components"])
+        groups = len(found["components"])
+        print(f"joined    {joined} drives in {groups} group{'' if groups == 1 else 's'}, each in one frame")
+    rows = []
+    for drive in found["drives"]:
+        counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
+        costs = (f"{value or 0:.1f}" for value in (drive["bytes"] / 1e6, drive["seconds"], drive["peak_memory_mb"]))
+        rows.append((drive["drive"], *counts, *costs))
+    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"), rows)
+    for drive, failure in found["failures"].items():
+        say(f"failed: {drive}: {failure['error']}")
+    warn(found["problems"])
+    for line in found["damaged_files"]:
+        say(f"damaged: {line}")
+
+
+def print_export(found: dict[str, Any]) -> None:
+    for drive in found.get("left_out", ()):
+        say(f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes.")
+    warn(found.get("warnings", ()))
+    print(f"{found['written']}: {found['places']} places of {len(found['drives'])} drives")
+
+
+def print_joined(found: dict[str, Any]) -> None:
+    print(f"{found['map']}: {found['pairs']} pairs of drives compared, {found['pairs_computed']} of them now")
+    for component in found["components"]:
+        print_line("together", f"{', '.join(component['drives'])}, in joint/{component['folder']}")
+    if found["alone"]:
+        print_line("alone", ", ".join(found["alone"]))
+    warn(found["warnings"])
+    named = shlex.quote(str(found["map"]))
+    print_next(f"{found['map']}/joint/KEY of the drives together", f"vplog evaluate {named} --truth FILE.tum")
+
+
+def print_merge(found: dict[str, Any]) -> None:
+    for one in found["drives"]:
+        other = "" if one["as"] == one["drive"] else f" as {one['as']}"
+        print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
+    warn(found["warnings"])
+    taken = sum(one["state"] != "there already" for one in found["drives"])
+    print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
+    if any(one["state"] == "taken" for one in found["drives"]):
+        print(f"next      vplog map join {shlex.quote(str(found['map']))}")
+
+
+def print_redescribed(found: dict[str, Any]) -> None:
+    for one in found["drives"]:
+        other = "" if one["was"] == one["drive"] else f", was {one['was']}"
+        print(f"{one['state']:10}{one['drive']}{other}{': ' if one['error'] else ''}{one['error']}")
+    print(f"{found['map']}: {len(found['drives']) - found['failed']} drives, library {found['library']}")
+    warn((found["joined"] or {}).get("warnings", []))
+    print(f"next      vplog map query {shlex.quote(str(found['map']))} LOG")
+
+
+def print_answers(found: dict[str, Any]) -> None:
+    """The best place of every view; all of them are in the file and in the JSON."""
+    rows = [
+        (str(one["query"]), one["drive"], str(one["keyframe"]), f"{one['score']:.3f}", str(one["support"]))
+        for one in found["answers"]
+        if one["rank"] == 0
+    ]
+    print_table(("view", "drive", "keyframe", "score", "support"), rows)
+    warn(found["warnings"])
+    print(f"{found['log']}: {found['answered']} of {found['views']} views match a place of {found['map']}")
+    if found["written"]:
+        print(f"written   {found['written']}")
+
+
+def print_comparison(found: dict[str, Any]) -> None:
+    print_line(
+        f"{found['queries']}",
+        f"queries, {found['positives']} with a true match, against {found['map_frames']} frames; library of "
+        f"{found['library']['size']} images",
+    )
+    shares = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1")
+    rows: list[Sequence[str]] = []
+    for name, method in found["methods"].items():
+        costs = [f"{method['bytes_per_image']:g}"]
+        costs += [f"{method[cost]:.2f}" for cost in ("encode_ms", "query_ms")]
+        rows.append((name, *(f"{method[share]:.3f}" for share in shares), *costs))
+        if "sequence" in method:
+            scores = method["sequence"]
+            rows.append((f"  L={scores['length']}", *(f"{scores[share]:.3f}" for share in shares), "", "", ""))
+    titles = ("method", "R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms")
+    print_table(titles, rows)
+    warn(found["warnings"])
+
+
+def print_study(out: Path, found: dict[str, Any]) -> None:
+    """Methods by pair of drives, departures from the paper, and where the rest is."""
+    done = found["experiments"]
+    scores = ("r_at_1", "anr", "ap")
+    if "pairs" in done:
+        rows = done["pairs"]["rows"]
+        pairs = dict.fromkeys((row["query"], row["map"]) for row in rows)
+        table = []
+        for mean in done["pairs"]["mean"]:
+            cells = [f"{r['r_at_1']:.2f} / {r['anr']:.2f}" for r in rows if r["method"] == mean["method"]]
+            cells += [f"{mean['r_at_1']:.3f} / {mean['anr']:.2f}"]
+            cells += [f"{mean['r_at_1_worst']:.2f} / {mean['anr_worst']:.2f}", f"{mean['bytes_per_image']:g}"]
+            table.append((mean["method"], *cells))
+        print_table(("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes"), table)
+    if "sizes" in done:
+        table = [
+            (str(row["size"]), row["method"], *(f"{row[score]:.3f}" for score in scores))
+            for row in done["sizes"]["mean"]
+        ]
+        print_table(("library size", "method", "R@1", "ANR %", "AP"), table)
+    if "ablations" in done:
+        table = [
+            (row["name"], row["setting"], *(f"{row[f'{score}_change']:+.3f}" for score in scores))
+            for row in done["ablations"]["rows"]
+        ]
+        print_table(("bobb without", "setting", "R@1", "ANR %", "AP"), table)
+    warn(found["warnings"])
+    figures = sum(len(one["figures"]) for one in done.values()) // 2
+    print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")
+
+
+class Progress:
+    """Bars with an ETA on a terminal's stderr; silence elsewhere."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn as Eta
+
+        self._tasks: dict[str, Any] = {}
+        self._line_by_line = not (arguments.json or sys.stderr.isatty())
+        self._bars = Progress(
+            TextColumn("{task.description:<18}", markup=False),
+            BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
+            console=Console(file=sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
+        )  # fmt: skip
+
+    def __enter__(self) -> Progress:
+        self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bars.stop()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total)
+        self._bars.update(self._tasks[stage], completed=done, total=total)
+
+    def tell_drive(self, drive: Drive) -> None:
+        """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
+        if self._line_by_line:
+            say(f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}")
+
+
+def print_result(
+    arguments: argparse.Namespace, found: dict[str, Any], in_words: Callable[[dict[str, Any]], None]
+) -> None:
+    """One JSON object with --json, else in words."""
+    (print_json if arguments.json else in_words)(found)
+
+
+def print_json(tree: dict[str, Any]) -> None:
+    from vplog.results.run_record import plain
+
+    print(json.dumps(plain(tree), indent=2, ensure_ascii=False, allow_nan=False))

@@ -1,0 +1,174 @@
+"""The verbs of what is finished: of a run, and of a pose graph from anywhere."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from vplog.cli.options import STDOUT, local_file, local_file_or_stdout, place, positive, topics_of
+from vplog.cli.printing import print_evaluation, print_explanation, print_json, print_optimised, print_result
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from vplog.verbs.evaluate_run import TruthOptions
+
+_SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
+"""The kinds of graph/solve.py, here too since that imports numpy."""
+_ALIGNMENTS = ("se3", "sim3", "origin")
+"""Those of evaluate/trajectory.py, here too since that imports numpy."""
+_MOST_OFFSET_S = 1e9
+"""s; thirty years, from any clock that starts at zero to one of today."""
+_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+"""Those of export.py, here too since that imports numpy."""
+_BINARY = ("geoparquet", "rrd")
+
+
+def evaluate(arguments: argparse.Namespace) -> None:
+    """Evaluate a run, of one or several drives, against ground truth."""
+    from vplog.verbs.evaluate_run import evaluate as evaluate_run
+
+    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), _truth_options(arguments))
+    print_result(arguments, found, print_evaluation)
+
+
+def explain(arguments: argparse.Namespace) -> None:
+    """Explain one candidate closure of a run in words and a picture of both frames."""
+    from vplog.verbs.explain import between, numbered, worst
+    from vplog.verbs.explain import explain as explain_closure
+
+    if arguments.worst:
+        choose = worst
+    else:
+        choose = numbered(*arguments.closure) if len(arguments.closure) == 1 else between(*arguments.closure)
+    told = explain_closure(arguments.run, choose, arguments.output, arguments.log, arguments.no_picture)
+    print_result(arguments, told, print_explanation)
+
+
+def optimize(arguments: argparse.Namespace) -> None:
+    """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
+    from vplog.verbs.optimize import optimize as optimize_graph
+
+    done = optimize_graph(arguments.graph, arguments.output, arguments.method)
+    print_result(arguments, done.record, print_optimised)
+
+
+def report(arguments: argparse.Namespace) -> None:
+    """Write the report of a finished run again, against a truth where one is given."""
+    from vplog.verbs.report import report as write_report
+
+    found = write_report(
+        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads,
+        _truth_options(arguments),
+    )  # fmt: skip
+    if arguments.json:
+        print_json(found)
+    else:
+        print(found["report"])
+
+
+def export(arguments: argparse.Namespace) -> None:
+    """Write a finished run in the format of another tool."""
+    from vplog.verbs.export import export as export_run
+
+    with _file_or_stdout(arguments, arguments.format in _BINARY) as path:
+        found = export_run(arguments.run, arguments.format, path)
+    if arguments.json:
+        print_json(found)
+    elif path == arguments.output:
+        print("\n".join(found["written"]))
+
+
+def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
+    from vplog.verbs.evaluate_run import TruthOptions
+
+    names = ("distance_m", "heading_deg", "align", "truth_offset_s")
+    return TruthOptions(**{name: value for name in names if (value := getattr(arguments, name)) is not None})
+
+
+def _add_truth_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--distance-m", type=positive, metavar="M", help="largest distance within one place (default: 6)")
+    sub.add_argument(
+        "--heading-deg", type=positive, metavar="DEG", help="largest angle between optical axes (default: 45)"
+    )
+    sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
+    sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help="add to the truth's stamps (default: 0)")
+
+
+@contextmanager
+def _file_or_stdout(arguments: argparse.Namespace, binary: bool = False) -> Iterator[Path]:
+    """The file to write: the one that -o names; for `-` a scratch file that goes to stdout when it is whole."""
+    if arguments.output is not STDOUT:  # ./- is a file
+        yield arguments.output
+        return
+    from vplog.errors import SettingsError
+    from vplog.storage.scratch import scratch
+
+    if arguments.json:
+        raise SettingsError("-o - and --json both write to stdout. Leave out one, or name a file with -o.")
+    if binary and sys.stdout.isatty():
+        raise SettingsError(f"{arguments.format} is binary and stdout a terminal. Name a file with -o, or use a pipe.")
+    with scratch("stdout") as folder:
+        yield folder / "out"
+        sys.stdout.buffer.write((folder / "out").read_bytes())
+        sys.stdout.buffer.flush()
+
+
+def add_results(
+    add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
+) -> None:
+    sub = add("evaluate", evaluate, topics)
+    sub.add_argument("run", type=place, metavar="RUN")
+    sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    _add_truth_options(sub)
+    _add_explain(add("explain", explain))
+    sub = add("report", report, topics, threads)
+    sub.add_argument("run", type=place, metavar="RUN")
+    sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    _add_truth_options(sub)
+    sub.add_argument("--log", type=place, metavar="LOG", help="log of the run, for pictures that result.mcap lacks")
+    sub.add_argument("-o", "--output", type=local_file, metavar="FILE.html", help="page (default: RUN/report.html)")
+    sub = add("export", export)
+    sub.add_argument("run", type=place, metavar="RUN")
+    sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
+    text = "file to write; - is stdout"
+    sub.add_argument("-o", "--output", type=local_file_or_stdout, required=True, metavar="FILE", help=text)
+    sub = add("optimize", optimize)
+    sub.add_argument("graph", type=local_file, metavar="GRAPH.g2o")
+    sub.add_argument(
+        "-o", "--output", type=place, required=True, metavar="OUT", help="the graph at its solved poses, as g2o"
+    )
+    sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
+
+
+def _add_explain(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("run", type=place, metavar="RUN")
+    which = sub.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        "--closure", type=_closure, metavar="K|QUERY:MATCH",
+        help="row of closures.parquet, or its two keyframes, by row or by stamp in ns",
+    )  # fmt: skip
+    which.add_argument("--worst", action="store_true", help="the closure that the solved trajectory is furthest from")
+    text = "picture, .png or .svg (default: RUN/closure-K.png)"
+    sub.add_argument("-o", "--output", type=local_file, metavar="PICTURE.png", help=text)
+    sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
+    sub.add_argument("--no-picture", action="store_true", help="no picture; the log is not needed")
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= _MOST_OFFSET_S:
+        raise argparse.ArgumentTypeError(f"must be seconds between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
+    return value
+
+
+def _closure(text: str) -> tuple[int, ...]:
+    parts = text.split(":")
+    if len(parts) > 2 or not all(re.fullmatch("-?[0-9]{1,20}", part) for part in parts):
+        what = "must be a row of closures.parquet (K), or two keyframes by row or stamp in ns (QUERY:MATCH)"
+        raise argparse.ArgumentTypeError(f"{what}, not {text!r}")
+    return tuple(int(part) for part in parts)

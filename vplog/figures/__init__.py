@@ -1,0 +1,1 @@
+"""Pictures of keyframes, boxes, closures and trajectories."""

@@ -1,0 +1,188 @@
+"""Figures of a run: the keyframes' pictures with their boxes, closures drawn, the trajectory on earth."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import Verdict
+from vplog.errors import ResultError
+from vplog.features.extraction import one_thread_each
+from vplog.figures.closure_view import find_agreement, find_boxes
+from vplog.geometry import geodesy, se3
+from vplog.results.collage import Half, Panel, collage
+from vplog.results.previews import jpeg, scaled_size, shrink
+from vplog.results.shown import Earth, Explained, Shown
+from vplog.stages import BoxState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from vplog.data import Bytes, Camera, Closures, Features, Gps, Reference, Trajectory
+    from vplog.loops.verify import VerifySettings
+    from vplog.results.previews import PictureSettings, Previews
+    from vplog.stages import PlaceState
+
+_REFERENCE_MEGAPIXELS = 0.05
+"""Size of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""
+_MOST_REFERENCES = 1000
+"""References whose pictures are written: 8 MB. Libraries of a drive have some hundred."""
+_VOTED = 1
+"""Shared references of a closure that are drawn with voting maps: each costs a search of the library."""
+_LEAST_FIXES = 3
+"""Fixes that determine position and heading of a trajectory."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClosureInputs:
+    """Images, features and places of a drive, for pictures of its closures."""
+
+    image: Callable[[int], Bytes]
+    """A keyframe's picture (h, w) by its row."""
+    features: Callable[[int], Features]
+    """Features of a keyframe's whole image by its row."""
+    camera: Camera
+    state: PlaceState
+    places: Sequence[Any]
+    """Descriptors of the keyframes."""
+
+
+def finished_picture(
+    inputs: ClosureInputs, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
+    pictures: PictureSettings, threads: int, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
+) -> Shown:  # fmt: skip
+    """All that result.mcap shows of a run, made while its features are at hand."""
+    state, camera = inputs.state, inputs.camera
+    small = {
+        number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
+        for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
+    }
+    drawn = {}
+    if len(previews):
+        rows = choose_examples(closures, pictures.closures)
+        drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, threads)
+    return Shown(
+        image=previews.__getitem__ if len(previews) else None,
+        image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
+        explained=(lambda row: explain(state, inputs.places[row])) if isinstance(state, BoxState) else None,
+        references=small,
+        pictures=drawn,
+        gps=gps,
+        earth=earth,
+        about=about,
+    )
+
+
+def explain(state: BoxState, place: Any) -> Explained | None:
+    """Where the parts of a keyframe were found on the reference that explains it best; None where none does."""
+    found = state.boxes(place)
+    if not len(found.references):
+        return None
+    return Explained(found.references.tolist(), state.windows(0), found.corners[0])
+
+
+def reference_use(state: PlaceState, places: Sequence[Any]) -> list[int] | None:
+    """Number of keyframes that each reference explains; None for a recogniser without boxes."""
+    if not isinstance(state, BoxState):
+        return None
+    count = np.zeros(len(state.references), np.int64)
+    for place in places:
+        count[state.boxes(place).references] += 1
+    return count.tolist()
+
+
+def choose_examples(closures: Closures, count: int) -> list[int]:
+    """Rows worth a picture: accepted ones evenly along the drive, and of every reason of rejection the best scored."""
+    verdicts = np.array([verdict.value for verdict in closures.verdict])
+    accepted = np.flatnonzero(verdicts == Verdict.ACCEPTED.value)
+    others = [
+        rows[np.argsort(-closures.score[rows], kind="stable")].tolist()
+        for verdict in reversed(Verdict)  # the reasons that come last in the checks are the most telling
+        if verdict is not Verdict.ACCEPTED and len(rows := np.flatnonzero(verdicts == verdict.value))
+    ]
+    room = count - min(count // 2, sum(map(len, others)))
+    chosen = accepted[np.linspace(0, len(accepted) - 1, min(room, len(accepted))).astype(np.int64)].tolist()
+    turn = 0
+    while len(chosen) < count and any(others):
+        if others[turn % len(others)]:
+            chosen.append(others[turn % len(others)].pop(0))
+        turn += 1
+    return sorted(chosen)
+
+
+def draw_closures(
+    rows: Sequence[int], inputs: ClosureInputs, closures: Closures, verify: VerifySettings, quality: int, threads: int
+) -> dict[int, bytes]:
+    """JPEGs of ledger rows."""
+    images = {node: inputs.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        drawn = pool.map(lambda row: jpeg(_draw(row, inputs, images, closures, verify), quality), rows)
+        return dict(zip(rows, drawn, strict=True))
+
+
+def _draw(
+    row: int, inputs: ClosureInputs, images: dict[int, Bytes], closures: Closures, verify: VerifySettings
+) -> Bytes:
+    nodes = int(closures.query[row]), int(closures.match[row])
+    features = inputs.features(nodes[0]), inputs.features(nodes[1])
+    agreement = find_agreement(*features, _pose_columns(closures, row), inputs.camera, verify)
+    sides = [np.array([one.width, one.height]) for one in features]
+    halves = [
+        Half(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
+        for name, node, points, side in zip(
+            ("query", "match"), nodes, (agreement.query, agreement.match), sides, strict=True
+        )
+    ]
+    return collage(halves[0], halves[1], agreement.agrees, _panels(row, nodes, features, inputs, closures))
+
+
+def _panels(
+    row: int, nodes: Sequence[int], features: Sequence[Features], inputs: ClosureInputs, closures: Closures
+) -> list[Panel]:
+    """Boxes of both on the references they share most on, and how both vote on the first of these."""
+    shared, state = closures.shared_references[row].tolist(), inputs.state
+    if not isinstance(state, BoxState):
+        return []
+    panels, none = [], np.zeros((0, 4))
+    for found in find_boxes(state, inputs.places[nodes[0]], inputs.places[nodes[1]], shared)[:2]:
+        name = f"reference {found.reference}"
+        panels.append(Panel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
+        if len(panels) <= _VOTED:
+            for who, one in zip(("query", "match"), features, strict=True):
+                votes = state.voting_map(one, found.reference)
+                panels.append(Panel(found.image, f"votes of the {who}", none, none, votes))
+    return panels
+
+
+def _pose_columns(closures: Closures, row: int) -> dict[str, Any]:
+    """The row as `find_agreement` takes it."""
+    pose = closures.match_from_query[row]
+    columns: dict[str, Any] = dict.fromkeys(("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    if np.isfinite(pose).all():
+        columns = dict(zip(columns, [*pose[:3, 3], *se3.quaternion(pose[None, :3, :3])[0]], strict=True))
+    return {**columns, "inliers": int(closures.inliers[row])}
+
+
+def earth_of(trajectory: Trajectory, gps: Gps | None, known: dict[str, Any] | None) -> Earth | None:
+    """The pose of a trajectory on earth: that of the solve (`known`, the `gps` of run.json), else by alignment to the
+    fixes (Umeyama 1991). None without at least three fixes within the drive."""
+    if known is not None:
+        try:
+            origin = [float(known["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]
+            world_from_enu = np.array(known["world_from_enu"], np.float64)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            origin, world_from_enu = [], np.empty(0)
+        if world_from_enu.shape != (4, 4) or not np.isfinite([*origin, *world_from_enu.ravel()]).all():
+            raise ResultError("run.json's `gps` lacks the run's place on earth. Run again: vplog run LOG --gps")
+        return Earth((origin[0], origin[1], origin[2]), se3.inverse(world_from_enu))
+    if gps is None or len(trajectory.stamp_ns) < 2:
+        return None
+    fixes = geodesy.local_enu(gps)
+    inside = (fixes.stamp_ns >= trajectory.stamp_ns[0]) & (fixes.stamp_ns <= trajectory.stamp_ns[-1])
+    if inside.sum() < _LEAST_FIXES:
+        return None
+    poses = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, fixes.stamp_ns[inside])
+    return Earth(fixes.origin, se3.umeyama(poses[:, :3, 3], fixes.enu_m[inside])[0])

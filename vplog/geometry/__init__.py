@@ -1,0 +1,1 @@
+"""Poses and positions: SE(3), places on earth, trajectories as TUM files."""

@@ -1,0 +1,32 @@
+"""Solved keyframes move every odometry sample."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Trajectory
+from vplog.geometry import se3
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Keyframes, Odometry
+
+
+def correct_trajectory(odometry: Odometry, keyframes: Keyframes, world_from_body: Floats) -> Trajectory:
+    """Every odometry sample, moved with its keyframes to their solved poses (N, 4, 4).
+
+    A sample hangs on the keyframe before it and on the one after it by the odometry between; the pose goes along the
+    geodesic from the one to the other with its share of the time between them. Before the first and after the last
+    keyframe it hangs on that one alone. So the path is continuous, keyframes are met exactly, and odometry that was
+    not corrected comes back as it was.
+    """
+    keys, poses = keyframes.stamp_ns, keyframes.odom_from_body
+    after = np.searchsorted(keys, odometry.stamp_ns, "right")
+    left, right = np.maximum(after - 1, 0), np.minimum(after, len(keys) - 1)
+    gap = np.maximum(keys[right] - keys[left], 1)  # left == right outside of the keyframes: any gap will do
+    share = np.clip((odometry.stamp_ns - keys[left]) / gap, 0.0, 1.0)
+    by_left, by_right = (
+        world_from_body[key] @ se3.between(poses[key], odometry.odom_from_body) for key in (left, right)
+    )
+    return Trajectory(odometry.stamp_ns, se3.interpolate(by_left, by_right, share))

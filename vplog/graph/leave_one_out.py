@@ -1,0 +1,221 @@
+"""What each closure, and each group of neighbouring ones, costs the rest of a solved graph.
+
+A closure between places that little else joins has no residual of its own: the graph bends until it fits. So what is
+tested is not how well a closure fits, but by how much the chi-square of all other edges would fall without it. That is
+its distance to where the others predict it, in units of the prediction's and its own noise (the externally studentised
+residual; Baarda's data snooping, 1968).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.geometry import se3
+from vplog.graph.build import AXES, informed
+from vplog.graph.consistency import OdometryChain
+from vplog.graph.least_squares import Objective
+from vplog.graph.marginals import edge_covariances, joint_covariance
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Int32s, Ints, PoseGraph
+    from vplog.graph.factors import Factors
+    from vplog.graph.sparse.linear import BayesTree, Supernodes
+
+_ALONE = 1e-9
+"""Least share of a closure's say that the rest has, so that no quotient is infinite."""
+_NEAREST = 4
+"""Places tried as a way round; the nearest in rows may not be the nearest in noise."""
+_BESIDE = 64
+"""Places on either side in order of rows among which the nearest are looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tension:
+    """Closures in a solved graph."""
+
+    cost: Floats
+    """(K,) by how much chi-square falls without the closure, to first order."""
+    covariance: Floats
+    """(K, d, d) of the motion between the ends, the closure itself included, in the frame of b."""
+    force: Floats
+    """(K, d) information times residual: how hard the closure pulls at b."""
+    log_spread: Floats
+    """(K,) half the log determinant of the covariance of the rest's prediction and the closure's noise together."""
+    freedom: Floats
+    """(K,) largest noise of the rest's prediction of the closure as a multiple of its own, in variance."""
+
+
+def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Tension:
+    """Of the closures `loops` (K,), all with weight, after least squares over the weighted edges (E,) at `poses`."""
+    graph = factors.graph
+    axes = AXES[graph.dimension]
+    error, Jr_inv = _errors(graph, poses, loops)
+    covariance = Jr_inv @ edge_covariances(Objective(factors, weight), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
+    information = informed(graph)[loops] * weight[loops, None, None]
+    root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
+    # leverage: the share of the closure's own say in where its ends are, 1 where nothing else tells
+    leverage, turn = np.linalg.eigh(root @ covariance @ np.swapaxes(root, 1, 2))
+    rest = np.clip(1.0 - leverage, _ALONE, 1.0)
+    whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
+    return Tension(
+        cost=(whitened**2 / rest).sum(1),
+        log_spread=-0.5 * (np.linalg.slogdet(information)[1] + np.log(rest).sum(1)),
+        covariance=covariance,
+        force=(information @ error[:, axes, None])[:, :, 0],
+        freedom=(1.0 / rest - 1.0).max(1),
+    )
+
+
+def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Supernodes | BayesTree, loops: Ints) -> float:
+    """By how much chi-square falls without all of a few closures, to first order; `tree` of Objective.information()."""
+    size = len(AXES[factors.graph.dimension])
+    error, Jr_inv = _errors(factors.graph, poses, loops)
+    information = informed(factors.graph)[loops] * weight[loops, None, None]
+    root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
+    whiten = np.zeros((len(loops) * size, len(loops) * size))
+    for row, matrix in enumerate(root @ Jr_inv):
+        whiten[row * size : (row + 1) * size, row * size : (row + 1) * size] = matrix
+    leverage, turn = np.linalg.eigh(whiten @ joint_covariance(factors, tree, poses, loops) @ whiten.T)
+    whitened = turn.T @ (root @ error[:, AXES[factors.graph.dimension], None]).ravel()
+    return float((whitened**2 / np.clip(1.0 - leverage, _ALONE, 1.0)).sum())
+
+
+def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
+    """Squared distance (K,) of closures without weight to where the solved graph has them, in sigma, and log_spread."""
+    graph = factors.graph
+    axes = AXES[graph.dimension]
+    # with next to no weight they are in the factorisation, which then knows their covariance, and change nothing
+    barely = np.array(weight)
+    barely[loops] = 1e-9
+    error, Jr_inv = _errors(graph, poses, loops)
+    covariance = Jr_inv @ edge_covariances(Objective(factors, barely), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
+    covariance = covariance + np.linalg.inv(informed(graph)[loops])
+    error = error[:, axes]
+    squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+    return squared, 0.5 * np.linalg.slogdet(covariance)[1]
+
+
+def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
+    """Residual twists (K, 6), and how they turn with the motion between the ends, (K, d, d).
+
+    The inverse of the right Jacobian of the exponential, by its series (Barfoot 2017, eq. 7.77, with the other sign).
+    """
+    measured = se3.between(poses[graph.a[loops]], poses[graph.b[loops]])
+    error = se3.log(se3.between(graph.a_from_b[loops], measured))
+    ad = np.zeros((len(loops), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = se3.skew(error[:, :3])
+    ad[:, 3:, :3] = se3.skew(error[:, 3:])
+    squared = ad @ ad
+    axes = AXES[graph.dimension]
+    jacobian = np.eye(6) + ad / 2.0 + squared / 12.0 - squared @ squared / 720.0
+    return error, jacobian[:, axes][:, :, axes]
+
+
+def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> list[Ints]:
+    """Places among `loops` (K,) of which the closures support each other, as positions within `loops`.
+
+    Two closures are of one place where the odometry between their ends adds less noise than they have themselves, and
+    so on from neighbour to neighbour. `chain` is the graph's where it is at hand.
+    """
+    chain = chain or OdometryChain.of(graph)
+    own: Floats = np.asarray(
+        np.median(np.diagonal(np.linalg.inv(informed(graph)[loops]), axis1=1, axis2=2), axis=0), np.float64
+    )
+    walked = chain.walked(own)
+    first, second = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
+    order = np.lexsort((second, first))
+    at, to = walked[first[order]], walked[second[order]]
+    root = list(range(len(loops)))
+
+    def find(node: int) -> int:
+        while root[node] != node:
+            root[node] = root[root[node]]
+            node = root[node]
+        return node
+
+    # 2: the noise of two closures, each one unit
+    starts = np.searchsorted(at, at - 2.0)
+    for this in range(len(loops)):
+        part = slice(starts[this], this)
+        near = np.flatnonzero(at[this] - at[part] + np.abs(to[this] - to[part]) <= 2.0)
+        for other in near.tolist():
+            root[find(starts[this] + other)] = find(this)
+    label = np.unique([find(node) for node in range(len(loops))], return_inverse=True)[1]
+    by_group = np.argsort(label, kind="stable")
+    return [order[part] for part in np.split(by_group, np.cumsum(np.bincount(label))[:-1])]
+
+
+def group_costs(
+    graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, places: list[Ints], chain: OdometryChain | None = None
+) -> Floats:
+    """At most how much chi-square falls without each place (G,), about.
+
+    The members pull as one at their middle one. Against them stands the way round by another place or by the odometry,
+    whatever is shorter, or what of the graph's information on the middle one is left without theirs. Both say too
+    little as a rule, so a large figure is a reason to look closely. What the members pull against each other is added.
+    """
+    axes = AXES[graph.dimension]
+    chain = chain or OdometryChain.of(graph)
+    information = informed(graph)
+    middle = np.array([loops[place[len(place) // 2]] for place in places])
+    member = np.concatenate(places)
+    size = np.array([len(place) for place in places])
+    whose = np.repeat(np.arange(len(places)), size)
+    at_middle = se3.adjoint(se3.between(poses[graph.b[loops[member]]], poses[graph.b[middle[whose]]]))
+    at_middle = at_middle[:, axes][:, :, axes]
+    back = np.swapaxes(at_middle, 1, 2)
+    first = np.cumsum(size) - size
+    force = np.add.reduceat((back @ pull.force[member][:, :, None])[:, :, 0], first, axis=0)
+    together = np.add.reduceat(back @ information[loops[member]] @ at_middle, first, axis=0)
+    own = np.linalg.inv(together)
+
+    a, b = graph.a[middle], graph.b[middle]
+    least = _quadratic(force, own + chain.covariance(a, b))
+    least = np.where(chain.part[a] == chain.part[b], least, np.inf)
+    for near in _nearest(a, b, min(_NEAREST, len(places) - 1)):
+        moved = se3.adjoint(se3.between(poses[b], poses[b[near]]))[:, axes][:, :, axes]
+        round_ = moved @ np.linalg.inv(information[middle[near]]) @ np.swapaxes(moved, 1, 2)
+        for here, there in ((b, b[near]), (a, a[near])):
+            round_ = round_ + _leg(chain, poses, b, here, there)
+        joined = (chain.part[a] == chain.part[a[near]]) & (chain.part[b] == chain.part[b[near]])
+        least = np.where(joined, np.minimum(least, _quadratic(force, own + round_)), least)
+    at = np.array([place[len(place) // 2] for place in places])
+    legs = np.linalg.inv(information[loops[member]])
+    for here, there in ((graph.b[loops[member]], b[whose]), (graph.a[loops[member]], a[whose])):
+        legs = legs + _leg(chain, poses, graph.b[loops[member]], here, there)
+    soft = np.add.reduceat(back @ np.linalg.inv(legs) @ at_middle, first, axis=0)
+    root = np.swapaxes(np.linalg.cholesky(soft), 1, 2)
+    leverage, turn = np.linalg.eigh(root @ pull.covariance[at] @ np.swapaxes(root, 1, 2))
+    whitened = (np.swapaxes(turn, 1, 2) @ np.linalg.solve(np.swapaxes(root, 1, 2), force[:, :, None]))[:, :, 0]
+    left = (whitened**2 / np.maximum(1.0 - leverage, _ALONE)).sum(1)
+    alone = _quadratic(pull.force[member], np.asarray(np.linalg.inv(information[loops[member]]), np.float64))
+    among = np.add.reduceat(alone, first) - _quadratic(force, own)
+    return np.minimum(least, left) + np.maximum(among, 0.0)
+
+
+def _leg(chain: OdometryChain, poses: Floats, end: Int32s, here: Int32s, there: Int32s) -> Floats:
+    """(G, d, d) noise of the odometry between each two poses, in the frames of `end`."""
+    later = np.maximum(here, there)
+    moved = se3.adjoint(se3.between(poses[end], poses[later]))[:, chain.axes][:, :, chain.axes]
+    return moved @ chain.covariance(np.minimum(here, there), later) @ np.swapaxes(moved, 1, 2)
+
+
+def _quadratic(force: Floats, covariance: Floats) -> Floats:
+    return np.einsum("gi,gij,gj->g", force, covariance, force)
+
+
+def _nearest(a: Int32s, b: Int32s, count: int) -> list[Ints]:
+    """For each of G pairs of rows, near pairs of rows: `count` arrays (G,), of those next in order of a."""
+    order = np.lexsort((b, a))
+    beside = np.concatenate([np.arange(-_BESIDE, 0), np.arange(1, _BESIDE + 1)])
+    other = np.arange(len(a))[:, None] + beside
+    inside = (other >= 0) & (other < len(a))
+    other = order[np.clip(other, 0, len(a) - 1)]
+    rows = np.abs(a[other].astype(np.int64) - a[order, None]) + np.abs(b[other].astype(np.int64) - b[order, None])
+    best = np.argsort(np.where(inside, rows, np.iinfo(np.int64).max), axis=1, kind="stable")[:, :count]
+    result = np.empty((len(a), count), np.int64)
+    result[order] = np.take_along_axis(other, best, axis=1)
+    return list(result.T)

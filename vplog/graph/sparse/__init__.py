@@ -1,0 +1,1 @@
+"""Sparse linear algebra of large pose graphs; knows nothing of drives."""

@@ -1,0 +1,96 @@
+"""Factors R^T R of large sparse symmetric matrices in blocks, by supernodes, and what solves with them.
+
+Multifrontal (Duff and Reid 1983; Davis, Direct Methods for Sparse Linear Systems, 2006): each supernode gathers its
+columns and what its children hand on in one dense front, eliminates its columns, and hands on the rest. Subtrees are
+worked on side by side, then what is above them front by front, each by all threads. What is added to a number is added
+in one fixed order, whatever the threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.errors import GraphError
+from vplog.graph.sparse.dense_front import SHARED, eliminate_together
+from vplog.graph.sparse.frontal import by_supernode, eliminate_run, fill, gather, keep, rows_of_child
+from vplog.graph.sparse.triangular_solve import add_rows, back_run, forward_run
+from vplog.graph.sparse.workers import Workers
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from vplog.data import Floats, Ints
+    from vplog.graph.sparse.frontal import Blocks
+    from vplog.graph.sparse.symbolic import Elimination
+
+_BY_THREAD = 4
+"""Shares for each thread of what a child hands on: the first rows of a triangle are longer."""
+OPEN = "The graph does not constrain all its poses. Check the information of its edges."
+
+
+@dataclass(frozen=True, eq=False)
+class Cholesky:
+    """R of a matrix R^T R."""
+
+    shape: Elimination
+    size: int
+    """d, of a block."""
+    begin: Ints
+    """(S + 1,) where the rows of R of each supernode begin in `values`."""
+    values: Floats
+    """For each supernode (k, k + m): k its columns, m the rows below them, all in scalars."""
+
+    @classmethod
+    def of(cls, shape: Elimination, matrix: Blocks) -> Self:
+        """Raises GraphError where the matrix is not positive definite, to working precision."""
+        size = matrix.diagonal.shape[1]
+        wide, below = np.diff(shape.first) * size, np.diff(shape.start) * size
+        begin = np.concatenate([[0], np.cumsum(wide * (wide + below))])
+        values = np.empty(begin[-1])
+        children = np.bincount(shape.parent[shape.parent >= 0], minlength=len(wide))
+        form, subtrees = shape.form, shape.subtrees
+        listed = by_supernode(shape.place, shape.first, matrix.a, matrix.b)
+        handed: dict[int, tuple[Floats, int]] = {}  # a matrix, and how many of its first rows and columns are done with
+        with Workers() as workers:
+            tasks = [(*run, form, children, begin, values, listed, matrix) for run in subtrees.runs]
+            for good, left, roots in workers.each(eliminate_run, tasks):
+                if not good:
+                    raise GraphError(OPEN)
+                for root, end in zip(roots.tolist(), np.cumsum(below[roots] ** 2).tolist(), strict=True):
+                    handed[root] = left[end - below[root] ** 2 : end].reshape(below[root], below[root]), 0
+            for node, own in zip(subtrees.top, subtrees.children, strict=True):
+                front = np.empty((wide[node] + below[node], wide[node] + below[node]))
+                fill(node, front, form, listed, matrix)
+                for child in reversed(own):
+                    to = rows_of_child(node, child, form, size)
+                    parts = workers.ranges(0, len(to), -(-SHARED // size), _BY_THREAD)
+                    workers.each(gather, [(front, to, size, *handed[child], *part) for part in parts])
+                    del handed[child]
+                if not eliminate_together(front, int(wide[node]), workers):
+                    raise GraphError(OPEN)
+                keep(front, values[begin[node] : begin[node + 1]])
+                if below[node]:
+                    handed[node] = front, int(wide[node])
+        return cls(shape, size, begin, values)
+
+    def solve(self, right: Floats) -> Floats:
+        """x (n, d, c) of R^T R x = right (n, d, c)."""
+        shape, subtrees = self.shape, self.shape.subtrees
+        moved = np.empty(right.shape)
+        moved[shape.place] = right
+        flat = moved.reshape(-1, right.shape[2])
+        root = (shape.form, self.begin, self.size, self.values, flat)
+        with Workers() as workers:
+            tasks = [(*run, after, *root) for run, after in zip(subtrees.runs, subtrees.after, strict=True)]
+            for after, more in zip(subtrees.after, workers.each(forward_run, tasks), strict=True):
+                add_rows(flat, after, self.size, more)
+            for node in subtrees.top:
+                after = shape.rows[shape.start[node] : shape.start[node + 1]]
+                add_rows(flat, after, self.size, forward_run(node, node + 1, after, *root))
+            for node in reversed(subtrees.top):
+                back_run(node, node + 1, *root)
+            workers.each(back_run, [(low, end, *root) for low, end in subtrees.runs])
+        return moved[shape.place]

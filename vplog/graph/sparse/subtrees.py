@@ -1,0 +1,90 @@
+"""Which parts of an elimination tree are worked on side by side, and what is left above them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Ints
+    from vplog.graph.sparse.frontal import Form
+
+_PIECES = 64
+"""A run takes no more than this share of the work: 16 threads have four each, and few fronts are above them all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subtrees:
+    """Runs of supernodes that need nothing of each other, each one or more whole subtrees; the same for any threads."""
+
+    runs: list[tuple[int, int]]
+    """First supernode and the one after the last, the run of most work first."""
+    roots: list[Ints]
+    """Of each run, those of its subtrees."""
+    after: list[Ints]
+    """Rows after each run that it has a say in."""
+    top: list[int]
+    """Supernodes above all runs, in order of elimination."""
+    children: list[list[int]]
+    """Of each of the top."""
+
+    @classmethod
+    def of(cls, shape: Form) -> Subtrees:
+        parent, wide, below = shape.parent, np.diff(shape.first), np.diff(shape.start)
+        work = wide * (wide + below).astype(float) ** 2
+        total = _with_those_below(parent, work)
+        limit = work.sum() / _PIECES
+        high = total > limit
+        runs, load = _runs(parent, total, high, limit)
+        runs = runs[np.argsort(-load, kind="stable")]
+        ends = np.flatnonzero((parent < 0) | high[parent])  # of subtrees, and the top
+        roots = [ends[np.searchsorted(ends, low) : np.searchsorted(ends, end)] for low, end in runs]
+        # what a supernode has a say in is its parent's columns, or its parent has a say in it, too
+        after = [
+            np.unique(np.concatenate([shape.rows[shape.start[root] : shape.start[root + 1]] for root in own]))
+            for own in roots
+        ]
+        top = np.flatnonzero(high)
+        handing = ends[parent[ends] >= 0]
+        handing = handing[np.argsort(parent[handing], kind="stable")]
+        begin = np.searchsorted(parent[handing], top)
+        end = np.searchsorted(parent[handing], top, "right")
+        children = [handing[one:two].tolist() for one, two in zip(begin, end, strict=True)]
+        return cls([(int(low), int(end)) for low, end in runs], roots, after, top.tolist(), children)
+
+
+@numba.njit(cache=True, nogil=True)
+def _with_those_below(parent: Ints, work: Floats) -> Floats:
+    """Work (S,) of each supernode and of all below it."""
+    total = work.copy()
+    for node in range(len(parent)):
+        if parent[node] >= 0:
+            total[parent[node]] += total[node]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _runs(parent: Ints, total: Floats, high: np.ndarray, limit: float) -> tuple[Ints, Floats]:
+    """First and one after last (K, 2) of the runs, and their work (K,): neighbouring subtrees up to the limit."""
+    ends = np.empty((len(parent), 2), np.int64)
+    load = np.empty(len(parent))
+    count, begun, taken = 0, 0, 0.0
+    open_from = 0  # first supernode of the subtree that the next root ends
+    for node in range(len(parent)):
+        root = not high[node] and (parent[node] < 0 or high[parent[node]])
+        if (high[node] or (root and taken + total[node] > limit)) and open_from > begun:
+            ends[count, 0], ends[count, 1], load[count] = begun, open_from, taken
+            count += 1
+            begun, taken = open_from, 0.0
+        if high[node]:
+            begun = open_from = node + 1
+        elif root:
+            taken += total[node]
+            open_from = node + 1
+    if open_from > begun:
+        ends[count, 0], ends[count, 1], load[count] = begun, open_from, taken
+        count += 1
+    return ends[:count].copy(), load[:count].copy()

@@ -1,0 +1,39 @@
+"""Threads for what is compiled and lets go of Python's lock. The results never depend on how many there are."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.execution.cores import allowed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+
+class Workers:
+    """A few threads, while the `with` lasts: as many as `vplog.execution.cores` allows."""
+
+    def __enter__(self) -> Workers:
+        self.count = allowed()
+        self._pool = ThreadPoolExecutor(self.count) if self.count > 1 else None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def each(self, work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """What `work` returns for each of these arguments, in their order; begun in that order, too."""
+        if self._pool is None or len(tasks) < 2:
+            return [work(*task) for task in tasks]
+        return [future.result() for future in [self._pool.submit(work, *task) for task in tasks]]
+
+    def ranges(self, low: int, high: int, at_least: int, by_thread: int = 1) -> list[tuple[int, int]]:
+        """low:high in about equal ranges, some for each thread, none shorter than `at_least` unless it is all."""
+        count = max(min((high - low) // at_least, self.count * by_thread), 1)
+        ends = np.linspace(low, high, count + 1).astype(int).tolist()
+        return list(pairwise(ends))

@@ -1,0 +1,176 @@
+"""The chunks of a file, unpacked: those to come by other threads, those gone by kept as long as there is room."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+import time
+import weakref
+from collections import OrderedDict, deque
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+from vplog.execution.cores import allowed
+from vplog.logs.formats.compression import BadChunkError
+from vplog.logs.formats.container import part_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable, Iterator
+    from concurrent.futures import Future
+    from typing import BinaryIO
+
+    from vplog.logs.formats.container import Octets
+
+MOST_BYTES = 64 * 2**20
+"""Bytes of unpacked chunks that a process keeps, whatever their number: drives of a few minutes are unpacked once, and
+in longer ones image and depth, which lie in neighbouring chunks, do not unpack their chunks twice."""
+_THREADS = 2
+"""Threads that read ahead, where there may be as many: each unpacks about 1 GB/s, and images are gone through twice as
+fast. More cost more time of the processor than they save."""
+_ALONE_S = 0.02
+"""Seconds of unpacking before other threads help. To start them and to hand over costs a few ms; what takes long to
+unpack, by its size or its packing, is there soon."""
+_LEAST_BYTES = 64 * 2**10
+"""Size of a chunk from which another thread unpacks it: handing over takes as long as some 50 kB."""
+_AHEAD_BYTES = 32 * 2**20
+"""Bytes of unpacked chunks that wait to be gone through; a chunk larger than that is unpacked when its turn comes."""
+
+
+class _Kept:
+    """The chunks last used by any file of the process: a drive may have a hundred files, and each of them chunks."""
+
+    def __init__(self) -> None:
+        self._chunks: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[int, int]) -> bytes | None:
+        with self._lock:
+            if key in self._chunks:
+                self._chunks.move_to_end(key)
+            return self._chunks.get(key)
+
+    def put(self, key: tuple[int, int], data: bytes) -> None:
+        with self._lock:
+            self._bytes += len(data) - len(self._chunks.pop(key, b""))
+            self._chunks[key] = data
+            while self._bytes > MOST_BYTES and len(self._chunks) > 1:
+                self._bytes -= len(self._chunks.popitem(last=False)[1])
+
+    def forget(self, file: int) -> None:
+        with self._lock:
+            for key in [key for key in self._chunks if key[0] == file]:
+                self._bytes -= len(self._chunks.pop(key))
+
+
+_KEPT = _Kept()
+_FILES = itertools.count()
+
+
+class Chunks:
+    """The chunks of one file by number; a damaged one is empty."""
+
+    def __init__(
+        self,
+        load: Callable[[int], bytes],
+        damaged: Callable[[int, BadChunkError], None],
+        size: Callable[[int], int],
+        packed: Callable[[int], bool],
+        threads: bool,
+    ) -> None:
+        """`load` reads and unpacks one, in any thread where `threads`; it raises BadChunkError, which `damaged` is told
+        in the thread that asks. `size` says how many bytes there will be, `packed` whether to keep them."""
+        self._load, self._damaged, self._size, self._packed = load, damaged, size, packed
+        self._threads = min(_THREADS, allowed()) if threads else 0
+        self._file = next(_FILES)
+        weakref.finalize(self, _KEPT.forget, self._file)
+
+    def __call__(self, number: int) -> bytes:
+        kept = _KEPT.get((self._file, number))
+        return self._take(number, lambda: self._load(number)) if kept is None else kept
+
+    def part(self, number: int, start: int, stop: int) -> Octets:
+        """Bytes of a chunk, as `part_of`."""
+        return part_of(self(number), start, stop)
+
+    def in_turn(
+        self, numbers: Iterable[int], stays: Callable[[int], bool] | None = None
+    ) -> Generator[tuple[int, bytes | None]]:
+        """Each number with its chunk, None where it `stays` in the file. Those that follow are unpacked meanwhile once
+        that saves time; who only looks for the first message of a topic starts no thread."""
+        numbers, spent_s = iter(numbers), 0.0
+        for number in numbers:
+            if stays and stays(number):
+                yield number, None
+                continue
+            began_s = time.perf_counter()
+            data = self(number)
+            spent_s += time.perf_counter() - began_s
+            yield number, data
+            if spent_s >= _ALONE_S and self._threads:
+                break
+        else:
+            return
+        with ThreadPoolExecutor(self._threads, "vplog-read-ahead") as pool:
+            yield from self._ahead(numbers, stays, pool)
+
+    def _ahead(
+        self, numbers: Iterator[int], stays: Callable[[int], bool] | None, pool: ThreadPoolExecutor
+    ) -> Iterator[tuple[int, bytes | None]]:
+        waiting: deque[tuple[int, Future[bytes] | None]] = deque()
+        waiting_bytes = 0
+        following = next(numbers, None)
+        try:
+            while waiting or following is not None:
+                while following is not None and len(waiting) < 2 * self._threads:
+                    size = self._size(following)
+                    if waiting and waiting_bytes + size > _AHEAD_BYTES:
+                        break
+                    handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not (stays and stays(following))
+                    handed = handed and _KEPT.get((self._file, following)) is None
+                    waiting.append((following, pool.submit(self._load, following) if handed else None))
+                    waiting_bytes += size
+                    following = next(numbers, None)
+                number, future = waiting.popleft()
+                waiting_bytes -= self._size(number)
+                if future is not None:
+                    yield number, self._take(number, future.result)
+                else:
+                    yield number, None if stays and stays(number) else self(number)
+        finally:
+            for _, future in waiting:
+                if future is not None:
+                    future.cancel()
+
+    def _take(self, number: int, loaded: Callable[[], bytes]) -> bytes:
+        try:
+            data = loaded()
+        except BadChunkError as error:
+            self._damaged(number, error)
+            data = b""
+        if self._packed(number):
+            _KEPT.put((self._file, number), data)
+        return data
+
+
+def reader_at(file: BinaryIO, local: bool) -> Callable[[int, int], bytes]:
+    """What reads `length` bytes from `start` on of a file: of a local one in several threads at once."""
+    if local and hasattr(os, "pread"):
+        number = file.fileno()
+
+        def read_at(start: int, length: int) -> bytes:
+            data = os.pread(number, length, start)
+            while len(data) < length and (more := os.pread(number, length - len(data), start + len(data))):
+                data += more  # one call gives at most 2 GB
+            return data
+
+        return read_at
+    lock = threading.Lock()
+
+    def seek_and_read(start: int, length: int) -> bytes:
+        with lock:
+            file.seek(start)
+            return file.read(length)
+
+    return seek_and_read

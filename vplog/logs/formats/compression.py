@@ -1,0 +1,100 @@
+"""Chunks unpacked with bounded memory, and as far as a cut one goes."""
+
+from __future__ import annotations
+
+import bz2
+import io
+import threading
+from typing import TYPE_CHECKING
+
+import lz4.frame
+import zstandard
+
+if TYPE_CHECKING:
+    from vplog.logs.formats.container import Octets
+
+MAX_RATIO = 200
+"""Output bytes a chunk may claim per input byte, above the free allowance; images and numbers pack 1 to 20 fold."""
+FREE_BYTES = 64 * 2**20
+"""A chunk may unpack to this much whatever its ratio (64 MiB: one large raw image of a single grey)."""
+KINDS = ("", "none", "lz4", "zstd", "bz2")
+
+
+class BadChunkError(Exception):
+    """A chunk's bytes do not unpack as its header says; the message holds the reason."""
+
+    def __init__(self, reason: str, data: bytes = b"") -> None:
+        """`data` is what it unpacked to all the same."""
+        super().__init__(reason)
+        self.data = data
+
+
+def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
+    """The `size` bytes that `data` holds under `kind` (one of KINDS); fewer where `partial` and the data are cut.
+
+    Raises BadChunkError where the kind is not known, the size claimed is beyond what the data justify, or the data
+    are damaged.
+    """
+    if kind not in KINDS:
+        raise BadChunkError(f"unknown compression {kind[:20]!r}")
+    if kind in ("", "none"):
+        result = data
+    elif size < 0 or size > max(FREE_BYTES, MAX_RATIO * len(data)):
+        raise BadChunkError(f"{len(data)} bytes claim to unpack to {size}")
+    else:
+        try:
+            result = _DECODERS[kind](data, size + 1)  # one more, so that one that holds more than that shows
+        except (RuntimeError, OSError, ValueError, EOFError, zstandard.ZstdError) as error:
+            raise BadChunkError(str(error).splitlines()[0] if str(error) else type(error).__name__) from None
+    if len(result) != size and not partial:
+        raise BadChunkError(f"{len(result)} bytes instead of {size}")
+    return result
+
+
+def _zstd(data: bytes, most: int) -> bytes:
+    try:
+        # One frame, as most writers make it; -1 where it does not say its size, as those that stream leave it.
+        if zstandard.frame_content_size(data) in (most - 1, -1):
+            result = _zstd_decompressor().decompress(data, max_output_size=most)
+            if len(result) == most - 1:
+                return result
+    except zstandard.ZstdError:
+        pass  # what there is of a cut one comes out below
+    parts, left = [], most
+    with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
+        while left and (part := stream.read(min(left, 2**20))):
+            parts.append(part)
+            left -= len(part)
+    return b"".join(parts)
+
+
+def _zstd_decompressor() -> zstandard.ZstdDecompressor:
+    """One for each thread: to set up its tables takes as long as to unpack 0.5 MB."""
+    if not hasattr(_OF_THREAD, "zstd"):
+        _OF_THREAD.zstd = zstandard.ZstdDecompressor()
+    return _OF_THREAD.zstd
+
+
+_OF_THREAD = threading.local()
+
+
+def _lz4(data: bytes, most: int) -> bytes:
+    return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most)
+
+
+def _bz2(data: bytes, most: int) -> bytes:
+    return bz2.BZ2Decompressor().decompress(data, max_length=most)
+
+
+_DECODERS = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}
+
+
+def unpack_zstd_message(data: Octets) -> bytes:
+    """One zstd frame with its own length, bounded like a chunk. Raises BadChunkError."""
+    try:
+        size = zstandard.frame_content_size(data)
+    except zstandard.ZstdError as error:
+        raise BadChunkError(str(error)) from None
+    if size < 0:
+        raise BadChunkError("a message's zstd frame does not say its length")
+    return unpack("zstd", bytes(data), size)

@@ -1,0 +1,185 @@
+"""What every kind of file offers: raw messages by topic in file order, and any one of them again by its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from vplog.logs.formats.loss_account import Account
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping
+
+Octets = bytes | memoryview
+"""Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
+Place = tuple[int, ...]
+"""Where a message lies in its container; only the container that gave it out can read it."""
+
+
+class Channel(NamedTuple):
+    """A topic with one type in one encoding."""
+
+    topic: str
+    type: str
+    """As the file names it: `sensor_msgs/msg/Image`, `sensor_msgs/Image`, `foxglove.RawImage`."""
+    encoding: str
+    """`cdr`, `ros1`, `protobuf`, `json`, or another that vplog lists but does not decode."""
+
+
+class Message(NamedTuple):
+    """One message as the file holds it."""
+
+    channel: Channel
+    log_ns: int
+    data: Octets
+    place: Place
+
+
+class Block(NamedTuple):
+    """Messages that lie in the same bytes, in file order: a chunk's, or one alone. All lists are as long."""
+
+    data: Octets
+    channels: list[Channel]
+    log_ns: list[int]
+    starts: list[int]
+    stops: list[int]
+    places: list[Place]
+
+    def messages(self) -> Iterator[Message]:
+        return map(self.message, range(len(self.channels)))
+
+    def message(self, row: int) -> Message:
+        start, stop = self.starts[row], self.stops[row]
+        data = self.data if stop - start < _COPIED else memoryview(self.data)
+        return Message(self.channels[row], self.log_ns[row], data[start:stop], self.places[row])
+
+
+def part_of(data: Octets, start: int, stop: int) -> Octets:
+    """Bytes of a chunk where they lie, which keeps all of it; a copy of those of a large one."""
+    return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
+
+
+_VIEWED = 4 * 2**20
+"""Bytes of a chunk up to which its images are not copied: each that waits to be decoded may keep another."""
+_COPIED = 4096
+"""Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
+_TOGETHER = 256
+"""Small messages of one block, at most; they take about as long to go through as one call does to set up."""
+
+
+def in_blocks(messages: Iterable[Message]) -> Iterator[Block]:
+    """Blocks of messages that lie in no chunk: small ones together, up to the next large one, which is one alone."""
+    waiting: list[Message] = []
+    for message in messages:
+        large = len(message.data) >= _COPIED
+        if waiting and (large or len(waiting) == _TOGETHER):
+            yield _joined(waiting)
+            waiting.clear()
+        if large:
+            yield _joined([message])
+        else:
+            waiting.append(message)
+    if waiting:
+        yield _joined(waiting)
+
+
+def _joined(messages: list[Message]) -> Block:
+    data = messages[0].data if len(messages) == 1 else b"".join(message.data for message in messages)
+    stops = list(accumulate(len(message.data) for message in messages))
+    channels, log_ns, _, places = (list(column) for column in zip(*messages, strict=True))
+    return Block(data, channels, log_ns, [0, *stops[:-1]], stops, places)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What is in a container: its channels with their counts, in order of their names."""
+
+    counts: dict[Channel, int]
+    start_ns: int
+    """First log time; 0 where there is no message."""
+    end_ns: int
+
+    @property
+    def messages(self) -> int:
+        return sum(self.counts.values())
+
+
+@dataclass
+class Notes:
+    """What is said of a log: remarks, each once, in the order they were found, and the account of what is lost."""
+
+    account: Account = field(default_factory=Account)
+    _said: list[str] = field(default_factory=list)
+
+    def add(self, line: str) -> None:
+        if line not in self._said:
+            self._said.append(line)
+
+    def extend(self, other: Notes) -> None:
+        self.account.extend(other.account)
+        for line in other._said:
+            self.add(line)
+
+    @property
+    def lines(self) -> list[str]:
+        """The losses first."""
+        return [*self.account.sentences, *self._said]
+
+
+class Container(Protocol):
+    """A file or folder of raw messages. Damage is skipped and noted; what cannot be opened at all raises LogError."""
+
+    def contents(self) -> Contents: ...
+
+    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        """The messages of these channels in file order, one in memory at a time."""
+        ...
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        """The same by the bytes they lie in, one block in memory at a time. Of large messages of `brief` channels, in
+        the encodings of ROS, only the header's stamp is there: what follows it, up to their stop and beyond the end of
+        the block, are bytes of others. `read` gives them whole."""
+        ...
+
+    def read(self, place: Place) -> Octets:
+        """The bytes of one message, from any place that `messages` gave."""
+        ...
+
+
+def ordered(counts: dict[Channel, int]) -> dict[Channel, int]:
+    """The same counts in an order that does not depend on the file."""
+    return dict(sorted(counts.items()))
+
+
+def plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
+    """Counts of topics, whatever the types under one name."""
+    result: dict[str, int] = {}
+    for channel, count in counts.items():
+        result[channel.topic] = result.get(channel.topic, 0) + count
+    return result
+
+
+def topics_of(counts: Mapping[int, int], channels: Mapping[int, Channel]) -> dict[str, int]:
+    """Counts by topic of counts by channel number, zero and less left out; those that nothing defines of no topic."""
+    result: dict[str, int] = {}
+    for number, count in counts.items():
+        if count > 0:
+            topic = channels[number].topic if number in channels else ""
+            result[topic] = result.get(topic, 0) + count
+    return result
+
+
+def count_messages(messages: Iterable[Message], channels: Iterable[Channel]) -> Contents:
+    """Contents by reading every message; `channels` may turn out to be empty."""
+    counts: dict[Channel, int] = {}
+    start_ns, end_ns = 2**64, 0
+    for message in messages:
+        counts[message.channel] = counts.get(message.channel, 0) + 1
+        start_ns, end_ns = min(start_ns, message.log_ns), max(end_ns, message.log_ns)
+    counts = dict.fromkeys(channels, 0) | counts
+    return Contents(ordered(counts), min(start_ns, end_ns), end_ns)

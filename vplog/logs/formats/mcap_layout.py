@@ -1,0 +1,387 @@
+"""Where the chunks of an MCAP file lie (mcap.dev/spec): found by walking it record by record, over damage too.
+
+Chunks are stepped over, so the walk reads a few kB per MB. A record says its length twice, before its fields and by
+them: where the two differ, the one with a record behind it holds. Where neither has, the walk goes on at the next chunk
+that the file's own index names, or else at the next bytes that can be a record.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from mcap.opcode import Opcode
+
+from vplog.errors import LogError
+from vplog.logs.formats.checksum import crc32
+from vplog.logs.formats.compression import KINDS
+from vplog.logs.formats.resync import MOST_GAPS, Search
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import BinaryIO
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD = struct.Struct("<BQ")
+"""Opcode and length before every record."""
+_CHUNK_HEAD = struct.Struct("<QQQII")
+"""Start, end, unpacked size, CRC, length of the compression's name: the head of a chunk record."""
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Channel id, sequence, log time, publish time: the head of a message record."""
+_FOOTER = struct.Struct("<BQQQI")
+"""Opcode 2, length 20, starts of the summary and of its offsets, CRC; the magic follows it, and the file ends."""
+_ENTRY = 16
+"""Bytes of an entry of a message index: time and offset, 8 each."""
+_MAX_DEFINITION = 16 * 2**20
+"""Bytes of a schema or channel record that are read; the largest real schemas are some 100 kB."""
+_MAX_SUMMARY = 64 * 2**20
+"""Bytes of a summary whose checksum is tried; one of 100,000 chunks has some 10 MB."""
+_RUN = 2**20
+"""Bytes up to which neighbouring messages outside chunks are kept as one run."""
+_FARTHEST_NS = 10 * 365 * 86_400 * 10**9
+"""ns between two messages of a log above which bytes that look like a message are none: ten years."""
+_PRIVATE = 0x80
+"""Opcodes from here on are an application's own and stepped over, as the specification asks."""
+_U32, _U64 = -4, -8
+"""Bytes behind a length of 4 or 8 bytes, in _SHAPES."""
+_SHAPES: dict[int, tuple[int, ...]] = {
+    Opcode.HEADER: (_U32, _U32),
+    Opcode.FOOTER: (20,),
+    Opcode.SCHEMA: (2, _U32, _U32, _U32),
+    Opcode.CHANNEL: (4, _U32, _U32, _U32),
+    Opcode.CHUNK: (28, _U32, _U64),
+    Opcode.MESSAGE_INDEX: (2, _U32),
+    Opcode.CHUNK_INDEX: (32, _U32, 8, _U32, 16),
+    Opcode.ATTACHMENT: (16, _U32, _U32, _U64, 4),
+    Opcode.ATTACHMENT_INDEX: (40, _U32, _U32),
+    Opcode.STATISTICS: (42, _U32),
+    Opcode.METADATA: (_U32, _U32),
+    Opcode.METADATA_INDEX: (16, _U32),
+    Opcode.SUMMARY_OFFSET: (17,),
+    Opcode.DATA_END: (4,),
+}
+"""Fields of each kind of record but messages: bytes of numbers, or _U32, _U64."""
+_OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
+"""The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
+_UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
+"""The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
+
+
+@dataclass(slots=True)
+class Chunk:
+    """A chunk of messages; or, with compression None, message records outside any chunk."""
+
+    start: int
+    """Offset of its records in the file."""
+    stop: int
+    compression: str | None
+    size: int
+    crc: int
+    first_ns: int
+    last_ns: int
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages per channel id, from the message indexes behind it; empty where the writer left none."""
+    cut: bool = False
+    record: int = -1
+    """Offset of its record."""
+    doubtful: bool = False
+    """Damage lies between its message indexes, so that they may not be all."""
+
+
+@dataclass
+class Layout:
+    """What the walk found."""
+
+    chunks: list[Chunk] = field(default_factory=list)
+    missing: list[Chunk] = field(default_factory=list)
+    """Chunks that lie in damaged bytes, as the index at the end or their own message indexes tell of them."""
+    recorded: dict[int, int] = field(default_factory=dict)
+    """Messages per channel id by the file's statistics; empty where it has none."""
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+    """Where damage may begin, and where the walk goes on."""
+    cut_at: int | None = None
+    """Byte behind which nothing can be read, where messages may have been."""
+    unknown_at: int | None = None
+    """The first record of an unknown kind that would be a message if that byte were damaged."""
+    spare: list[tuple[int, bytes]] = field(default_factory=list)
+    """Schemas and channels of a summary whose checksum is wrong, for those that no other place defines."""
+    index_cut_at: int | None = None
+    """Byte behind which nothing can be read, where the messages had ended."""
+
+
+def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None], name: str) -> Layout:
+    """Walk the file; `define` gets every schema and channel record outside the chunks. Raises LogError."""
+    walk = _Walk(file, length, define)
+    if walk.at(0, len(MAGIC)) != MAGIC:
+        raise LogError(f"{name} is not an MCAP file: it does not start with MCAP's magic bytes.")
+    walk.check_summary()
+    walk.records(len(MAGIC))
+    walk.finish()
+    return walk.layout
+
+
+class _Walk:
+    def __init__(self, file: BinaryIO, length: int, define: Callable[[int, bytes], None]) -> None:
+        self._length, self._define = length, define
+        self.layout = Layout()
+        self._indexed: dict[int, tuple[Chunk, dict[int, int]]] = {}
+        """By offset: chunks as the summary's index lists them, and where the message index of each channel lies."""
+        self._chunked = False
+        self._indexing: Chunk | None = None
+        """The chunk whose message indexes come by."""
+        self._search = Search(file, length)
+        self.at = self._search.at
+        self._summary_start: int | None = None
+        self._summary_sound: bool | None = None
+        """By its checksum; None where it has none."""
+
+    def records(self, position: int) -> None:
+        """Every record from here on, to the footer or the end."""
+        before, data_ended = position, False
+        while True:
+            opcode, stop = self._bounds(position)
+            if not opcode:
+                if data_ended:
+                    self.layout.index_cut_at = min(position, self._length)
+                    return
+                resumed = self._resume(before, position) if len(self.layout.gaps) < MOST_GAPS else None
+                if resumed is None:
+                    self.layout.cut_at = min(position, self._length)
+                    return
+                before = position = resumed
+                continue
+            self._record(opcode, position, min(stop, self._length), cut=stop > self._length)
+            if opcode == Opcode.FOOTER or (opcode == Opcode.DATA_END and self._summary_sound):  # read before
+                return
+            if stop > self._length:
+                self.layout.cut_at = self._length
+                return
+            data_ended = data_ended or opcode in (Opcode.DATA_END, Opcode.STATISTICS, Opcode.CHUNK_INDEX)
+            if opcode not in _SHAPES and opcode != Opcode.MESSAGE and self._is_message_head(position, opcode):
+                self.layout.unknown_at = self.layout.unknown_at or position
+            before, position = position, stop
+
+    def finish(self) -> None:
+        """Hold the chunks that were found against those that the index at the end lists."""
+        found = {chunk.record: chunk for chunk in self.layout.chunks if chunk.compression is not None}
+        for offset, (listed, indexes) in sorted(self._indexed.items()):
+            if (chunk := found.get(offset)) is not None:
+                if chunk.counts and chunk.counts.keys() != indexes.keys():
+                    listed.counts = self._counts(indexes)
+                    chunk.doubtful |= chunk.counts != {i: n for i, n in listed.counts.items() if n}
+            elif (bounds := self._bounds(offset))[0] == Opcode.CHUNK and bounds[
+                1
+            ] <= self._length:  # it was jumped over
+                self._add_chunk(offset + RECORD.size, bounds[1], cut=False)
+                self.layout.chunks[-1].counts = self._counts(indexes)
+            elif any(start <= offset < stop for start, stop in self.layout.gaps):  # else the index is what is damaged
+                listed.counts = self._counts(indexes)
+                self.layout.missing.append(listed)
+        self.layout.chunks.sort(key=lambda chunk: chunk.start)
+        for chunk in self.layout.chunks:
+            chunk.counts = {} if chunk.doubtful else chunk.counts
+        if found and self._indexed:  # they tell of every chunk in the gaps
+            self.layout.gaps = []
+
+    def _counts(self, indexes: dict[int, int]) -> dict[int, int]:
+        """Messages per channel id by message indexes at these offsets; empty where one is not there."""
+        counts: dict[int, int] = {}
+        for channel_id, position in indexes.items():
+            opcode, stop = self._bounds(position)
+            if opcode != Opcode.MESSAGE_INDEX or self.at(position + RECORD.size, 2) != channel_id.to_bytes(2, "little"):
+                return {}
+            counts[channel_id] = (stop - position - RECORD.size - 6) // _ENTRY
+        return counts
+
+    def _bounds(self, position: int) -> tuple[int, int]:
+        """Opcode of the record at `position` and where it stops, either as what it must have been where one of them is
+        damaged; opcode 0, which the specification has as invalid, where there is none. A chunk may go on behind the end
+        of the file."""
+        head = self.at(position, RECORD.size)
+        if len(head) < RECORD.size:
+            return 0, 0
+        opcode, length = RECORD.unpack(head)
+        start = position + RECORD.size
+        stop = start + length
+        if opcode == Opcode.MESSAGE and length >= _MESSAGE_HEAD.size and stop <= self._length and not self._chunked:
+            return opcode, stop
+        for kind in (opcode, Opcode.CHUNK, Opcode.MESSAGE_INDEX):  # of which damage may have changed the opcode
+            agrees = self._length_by_fields(kind, start) == length
+            if agrees and (self._is_chunk(position, length) if kind == Opcode.CHUNK else stop <= self._length):
+                return kind, stop
+        by_fields = start + (self._length_by_fields(opcode, start) or 0)
+        for end in sorted({stop, by_fields}):
+            if ((opcode in _SHAPES and end > start) or end == stop) and self._is_record(end, behind=opcode):
+                return opcode, end
+        if (0 < by_fields < stop or opcode >= _PRIVATE) and self._is_record(stop, behind=opcode, longer=True):
+            return opcode, stop  # with fields of a later version, which are ignored
+        return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
+
+    def _length_by_fields(self, opcode: int, start: int) -> int | None:
+        """Bytes of a record whose fields begin at `start`, as the lengths among them say."""
+        if opcode not in _SHAPES:
+            return None
+        position = start
+        for step in _SHAPES[opcode]:
+            if step > 0:
+                position += step
+            else:
+                position += int.from_bytes(self.at(position, -step), "little") - step
+        return position - start
+
+    def _is_record(self, position: int, behind: int = 0, longer: bool = False) -> bool:
+        """Whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of the
+        file. Behind a chunk it is none of those that lie in chunks."""
+        head = self.at(position, RECORD.size)
+        if len(head) < RECORD.size:
+            return position == self._length or (head == MAGIC and position + len(head) == self._length)
+        opcode, length = RECORD.unpack(head)
+        inside = opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+        if position + RECORD.size + length > self._length or (behind == Opcode.CHUNK and inside):
+            return False
+        if opcode == Opcode.MESSAGE:
+            return length >= _MESSAGE_HEAD.size
+        by_fields = self._length_by_fields(opcode, position + RECORD.size)
+        return by_fields == length or (longer and by_fields is not None and by_fields < length)
+
+    def _record(self, opcode: int, position: int, stop: int, cut: bool) -> None:
+        start = position + RECORD.size
+        length = stop - start
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            data = self.at(start, min(length, _MAX_DEFINITION))
+            if self._summary_sound is False and position >= (self._summary_start or 0):
+                self.layout.spare.append((opcode, data))
+            else:
+                self._define(opcode, data)
+        elif opcode == Opcode.CHUNK:
+            self._add_chunk(start, stop, cut)
+        elif opcode == Opcode.MESSAGE:
+            self._add_message(start, stop)
+        elif opcode == Opcode.MESSAGE_INDEX and self._indexing is not None and length >= 6:
+            chunk, channel_id = self._indexing, int.from_bytes(self.at(start, 2), "little")
+            chunk.doubtful |= channel_id in chunk.counts or (length - 6) % _ENTRY > 0
+            if length > 6:
+                chunk.counts[channel_id] = (length - 6) // _ENTRY
+        elif opcode == Opcode.STATISTICS and 46 <= length <= _MAX_DEFINITION:  # 42 bytes of totals, then id and count
+            data = self.at(start, length)
+            total, size = struct.unpack_from("<Q34xI", data)
+            entries = struct.iter_unpack("<HQ", data[46 : 46 + min(size, length - 46) // 10 * 10])
+            counts = {channel_id: count for channel_id, count in entries if count}
+            self.layout.recorded = counts if sum(counts.values()) == total <= self._length else {}
+        elif opcode == Opcode.CHUNK_INDEX and 64 <= length <= _MAX_DEFINITION:
+            self._add_index(self.at(start, length))
+
+    def _add_chunk(self, start: int, stop: int, cut: bool) -> None:
+        head = self.at(start, _CHUNK_HEAD.size)
+        if len(head) < _CHUNK_HEAD.size:
+            return
+        first_ns, last_ns, size, crc, name_length = _CHUNK_HEAD.unpack(head)
+        named = self.at(start + _CHUNK_HEAD.size, 4 + 8)
+        kind = named[: min(name_length, 4)].decode("latin-1")
+        if name_length > 4 or kind not in KINDS:  # the length of the data tells where its own length is
+            rest = stop - start - _CHUNK_HEAD.size - 8
+            lengths = {
+                k: int.from_bytes(named[len(k) : len(k) + 8], "little") for k in KINDS if named.startswith(k.encode())
+            }
+            kind = next((k for k, length in lengths.items() if length == rest - len(k)), kind)
+        data = min(start + _CHUNK_HEAD.size + len(kind) + 8, stop)
+        self._indexing = Chunk(data, stop, kind, size, crc, first_ns, last_ns, cut=cut, record=start - RECORD.size)
+        self._chunked = True
+        self.layout.chunks.append(self._indexing)
+
+    def _add_message(self, start: int, stop: int) -> None:
+        chunks = self.layout.chunks
+        last = chunks[-1] if chunks else None
+        head = self.at(start, _MESSAGE_HEAD.size)
+        log_ns = _MESSAGE_HEAD.unpack(head)[2] if len(head) == _MESSAGE_HEAD.size else 0
+        if last and last.compression is None and last.stop == start - RECORD.size and stop - last.start < _RUN:
+            last.stop, last.first_ns, last.last_ns = stop, min(last.first_ns, log_ns), max(last.last_ns, log_ns)
+        else:
+            chunks.append(Chunk(start - RECORD.size, stop, None, 0, 0, log_ns, log_ns))
+
+    def _add_index(self, data: bytes) -> None:
+        first_ns, last_ns, offset, _, size = struct.unpack_from("<QQQQI", data)
+        entries = data[36 : 36 + min(size, len(data) - 36) // 10 * 10]  # channel id and offset of its message index
+        chunk = Chunk(offset, offset, "", 0, 0, first_ns, last_ns)
+        self._indexed[offset] = chunk, dict(struct.iter_unpack("<HQ", entries))
+
+    def _resume(self, before: int, position: int) -> int | None:
+        """The next record to go on with, where there is none at `position`. In a file without chunks the message
+        before, at `before`, may be the one whose length is damaged, and is dropped."""
+        if self._summary_start is not None and not self._indexed:
+            self._read_summary(self._summary_start)
+        chunks, found = self.layout.chunks, None
+        if not self._chunked and chunks and chunks[-1].stop > before and not self._is_message_head(position):
+            chunks[-1].stop, position = before, before
+            if chunks[-1].start == before:
+                chunks.pop()
+        if self._indexed:
+            behind = (offset for offset in sorted(self._indexed) if offset > position)
+            found = next((offset for offset in behind if self._bounds(offset)[0] == Opcode.CHUNK), None)
+        elif self._chunked:
+            found = self._search.first(_OUTSIDE_CHUNKS, position + 1, self._is_record)
+        else:
+            found = self._search.first(_UNCHUNKED, position + 1, self._is_likely)
+        found = self._summary_start if found is None else found
+        if found is None or found <= position:
+            return None
+        self._indexing = None
+        if chunks and chunks[-1].record >= 0:
+            chunks[-1].doubtful = True
+        if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
+            self._indexing = Chunk(position, found, "", 0, 0, 0, 0)
+            self.layout.missing.append(self._indexing)
+        self.layout.gaps.append((position, found))
+        return found
+
+    def check_summary(self) -> None:
+        """Find the summary at the end of the file, and read it where its checksum is right."""
+        size = _FOOTER.size + len(MAGIC)
+        tail = self.at(max(self._length - size, 0), size)
+        if len(tail) < size or not tail.endswith(MAGIC):
+            return
+        opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
+        if (opcode, length) != (Opcode.FOOTER, 20) or not 0 < start < self._length:
+            return
+        self._summary_start = start
+        length = self._length - len(MAGIC) - 4 - start
+        if crc and length <= _MAX_SUMMARY:
+            self._summary_sound = crc32(self.at(start, length)) == crc
+        if self._summary_sound:
+            self._read_summary(start)
+
+    def _read_summary(self, position: int) -> None:
+        while position + RECORD.size <= self._length - _FOOTER.size - len(MAGIC):
+            opcode, stop = self._bounds(position)
+            if stop > self._length or opcode in (0, Opcode.CHUNK, Opcode.MESSAGE, Opcode.FOOTER):
+                return
+            self._record(opcode, position, stop, cut=False)
+            position = stop
+
+    def _is_chunk(self, position: int, length: int) -> bool:
+        """Whether the lengths that the head of a chunk holds agree: with that of the record, and with each other."""
+        head = self.at(position + RECORD.size, _CHUNK_HEAD.size + 4 + 8)
+        if len(head) < _CHUNK_HEAD.size:
+            return False
+        name_length = _CHUNK_HEAD.unpack_from(head)[4]
+        start = _CHUNK_HEAD.size + name_length
+        if name_length > 4 or len(head) < start + 8 or head[_CHUNK_HEAD.size : start].decode("latin-1") not in KINDS:
+            return False
+        return struct.unpack_from("<Q", head, start)[0] + start + 8 == length
+
+    def _is_message_head(self, position: int, opcode: int = Opcode.MESSAGE) -> bool:
+        """Whether a message of a time near those found begins here, whatever its length."""
+        head = self.at(position, RECORD.size + _MESSAGE_HEAD.size)
+        if len(head) < RECORD.size + _MESSAGE_HEAD.size or head[0] != opcode:
+            return False
+        chunks, log_ns = self.layout.chunks, _MESSAGE_HEAD.unpack_from(head, RECORD.size)[2]
+        return not chunks or abs(log_ns - chunks[-1].last_ns) <= _FARTHEST_NS
+
+    def _is_likely(self, position: int) -> bool:
+        """Whether a record of a file without chunks can lie here, with another or the end behind it."""
+        opcode, length = RECORD.unpack(self.at(position, RECORD.size))
+        if opcode == Opcode.MESSAGE and not self._is_message_head(position):
+            return False
+        return self._is_record(position) and self._is_record(position + RECORD.size + length)

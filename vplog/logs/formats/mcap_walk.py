@@ -1,0 +1,156 @@
+"""The messages of one chunk of an MCAP file (mcap.dev/spec), found by walking it record by record."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from mcap.opcode import Opcode
+
+from vplog.logs.formats.container import Block
+from vplog.logs.formats.mcap_layout import RECORD
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from vplog.logs.formats.container import Channel, Place
+
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
+_IS_MESSAGE, _IS_SCHEMA, _DEFINES = int(Opcode.MESSAGE), int(Opcode.SCHEMA), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
+_OUTSIDE = frozenset({0, *map(int, Opcode)}.difference(_DEFINES, [_IS_MESSAGE]))
+"""Opcodes that no record in a chunk has; those not known yet are stepped over, as the specification asks."""
+_WINDOW = 4096
+"""Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
+_BRIEF = 16
+"""Bytes of a message that are there where it is only wanted briefly: up to the stamp in a header of ROS."""
+
+
+class Walk:
+    """What has been found so far in chunk `number`, from its first byte to `position`."""
+
+    def __init__(
+        self,
+        number: int,
+        end: int,
+        channels: dict[int, Channel],
+        define: Callable[[int, bytes], None],
+        wanted: Collection[Channel] | None,
+        brief: Collection[Channel] = (),
+        cut: bool = False,
+    ) -> None:
+        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are kept (None: on
+        all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
+        `channels`."""
+        self.position = 0
+        self.unknown = 0
+        """Messages of channels that nothing defined so far."""
+        self.last_ns: int | None = None
+        """Log time of the last message, on whatever channel."""
+        self.number, self.end, self._channels, self._define = number, end, channels, define
+        self._wanted, self._brief, self._cut = wanted, brief, cut
+        self._used = self._wanted_ids()
+        self._ids: list[int] = []
+        self._found: list[Channel] = []
+        self._log_ns: list[int] = []
+        self._starts: list[int] = []
+        self._stops: list[int] = []
+        self._places: list[Place] = []
+
+    @property
+    def seen(self) -> Counter[int]:
+        """Messages by channel id."""
+        return Counter(self._ids)
+
+    def whole(self, data: bytes) -> Block:
+        """The messages of the chunk, of which `data` are all bytes."""
+        self._go(data, 0)
+        self._drop_doubtful()
+        return Block(data, self._found, self._log_ns, self._starts, self._stops, self._places)
+
+    def in_place(self, read: Callable[[int, int], bytes]) -> Block:
+        """The same of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
+        parts: list[bytes] = []
+        size = 0
+        while (left := self.end - self.position) >= RECORD.size:
+            before = self.position
+            data = read(before, min(_WINDOW, left))
+            self._go(data, size)
+            if self.position == before:
+                length = RECORD.size + RECORD.unpack_from(data)[1] if len(data) >= RECORD.size else left + 1
+                if not len(data) < length <= left:
+                    break
+                data = read(before, length)
+                self._go(data, size)
+                if self.position == before:
+                    break
+            parts.append(data)
+            size += len(data)
+        self._drop_doubtful()
+        return Block(b"".join(parts), self._found, self._log_ns, self._starts, self._stops, self._places)
+
+    def _drop_doubtful(self) -> None:
+        """Leave out the message before damage: its length may be what is damaged."""
+        if self.position == self.end or self._cut or not self._ids:
+            return
+        if self._ids.pop() in self._used:
+            for column in (self._found, self._log_ns, self._starts, self._stops, self._places):
+                column.pop()
+
+    def _go(self, data: bytes, shift: int) -> None:
+        """On through `data`, which lie at `position` in the chunk and at `shift` in the block, up to the first record
+        that more is needed of."""
+        base, at, size, left = self.position, 0, len(data), self.end - self.position
+        used = self._used
+        while at + _MESSAGE.size <= size:
+            opcode, length, channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, at)
+            start, stop = at + _MESSAGE.size, at + RECORD.size + length
+            if stop < start if opcode == _IS_MESSAGE else opcode in _OUTSIDE:
+                break
+            if stop > size and (
+                opcode != _IS_MESSAGE or stop > left or self._is_needed(used.get(channel_id), size - start, length)
+            ):
+                break
+            if opcode == _IS_MESSAGE:
+                self._ids.append(channel_id)
+                self.last_ns = log_ns
+                if channel_id in used:
+                    self._found.append(used[channel_id])
+                    self._log_ns.append(log_ns)
+                    self._starts.append(shift + start)
+                    self._stops.append(shift + stop)
+                    self._places.append((self.number, base + start, base + stop))
+                elif channel_id not in self._channels:
+                    self.unknown += 1
+            elif opcode in _DEFINES:
+                self._learn(opcode, data[at + RECORD.size : stop])
+            at = stop
+        while at + RECORD.size <= size:  # too short for a message
+            opcode, length = RECORD.unpack_from(data, at)
+            stop = at + RECORD.size + length
+            if stop > size or opcode == _IS_MESSAGE or opcode in _OUTSIDE:
+                break
+            if opcode in _DEFINES:
+                self._learn(opcode, data[at + RECORD.size : stop])
+            at = stop
+        self.position = base + at
+
+    def _learn(self, opcode: int, data: bytes) -> None:
+        """Take a definition; it may be of a wanted channel, and a log may have ten thousands of them."""
+        self._define(opcode, data)
+        number = int.from_bytes(data[:2], "little")  # of a schema or channel record, its first field
+        channel = self._channels.get(number)
+        if opcode != _IS_SCHEMA and channel is not None:
+            if self._wanted is None or channel in self._wanted:
+                self._used[number] = channel
+            else:
+                self._used.pop(number, None)
+
+    def _wanted_ids(self) -> dict[int, Channel]:
+        wanted = self._wanted
+        return {i: channel for i, channel in self._channels.items() if wanted is None or channel in wanted}
+
+    def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
+        """Whether more of a message is needed than the bytes that are there."""
+        return channel is not None and (channel not in self._brief or there < _BRIEF or length < _WINDOW)

@@ -1,0 +1,293 @@
+"""Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): found by walking it, over damage too.
+
+A record is believed where another lies behind it. Where none does, the walk goes on at the next bytes that can be the
+head of a chunk, or of a record of an index; what lay between is held against the index at the end.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from vplog.errors import LogError
+from vplog.logs.formats.resync import MOST_GAPS, Search
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import BinaryIO
+
+MAGIC = b"#ROSBAG V2.0\n"
+MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+"""Values of the field `op`."""
+_MAX_HEADER = 2**20
+"""Bytes of a record header that are believed; real ones are some 100 bytes."""
+_MAX_CONNECTION = 16 * 2**20
+"""Bytes of a connection record that are read: its message definition, 100 kB at most in practice."""
+_FIELDS = {
+    _BAG: {b"index_pos", b"conn_count", b"chunk_count"},
+    _INDEX: {b"ver", b"conn", b"count"},
+    _CHUNK: {b"compression", b"size"},
+    _CHUNK_INFO: {b"ver", b"chunk_pos", b"start_time", b"end_time", b"count"},
+    CONNECTION: {b"conn", b"topic"},
+}
+"""What the header of each kind of record outside the chunks has."""
+_ENTRY = {_INDEX: 12, _CHUNK_INFO: 8}
+"""Bytes of each of the `count` entries of a record: time and offset of a message; a connection and its count."""
+_FIRST = re.compile(rb"(?:op|compression|size|ver|conn|count|chunk_pos|start_time|end_time)=")
+"""Names in the headers of chunks and of indexes."""
+_RECORD_START = re.compile(rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=%s)" % _FIRST.pattern, re.DOTALL)
+"""Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
+_HEAD = 256
+"""Bytes in which the head of a record ends, but for a connection's of a long topic."""
+_NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn_count|chunk_count|chunk_pos)=")
+"""Names in the header of a chunk, and those that no chunk has."""
+
+
+_Head = tuple[dict[bytes, bytes] | None, int, int]
+"""Header of a record, None where it is damaged, and where its data start and stop."""
+
+
+@dataclass(slots=True)
+class Chunk:
+    start: int
+    """Offset of its data in the file."""
+    stop: int
+    compression: str
+    size: int
+    cut: bool
+    record: int = -1
+    """Offset of its record."""
+    doubtful: bool = False
+    """Damage lies between the index records behind it, so that they may not be all."""
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages per connection, from the index records behind it; empty where there are none."""
+    first_ns: int = 0
+    """From the indexes; 0 where there are none."""
+    last_ns: int = 0
+
+
+@dataclass
+class Layout:
+    """What the walk found."""
+
+    chunks: list[Chunk] = field(default_factory=list)
+    missing: list[Chunk] = field(default_factory=list)
+    """Chunks that lie in damaged bytes, as the bag's index or the index records behind them tell."""
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+    """Bytes without a record, from and to."""
+    cut_at: int | None = None
+    """Byte behind which nothing can be read, where messages may have been."""
+    index_cut_at: int | None = None
+    """The same where all chunks that the bag had were found before."""
+
+
+def read_layout(file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None], name: str) -> Layout:
+    """Walk the bag; `connect` gets header and data of every connection record outside the chunks. Raises LogError."""
+    walk = _Walk(file, length, connect)
+    if walk.at(0, len(MAGIC)) != MAGIC:
+        raise LogError(f"{name} is not a ROS 1 bag of format 2.0: it does not start with its magic bytes.")
+    walk.records(len(MAGIC))
+    walk.finish()
+    return walk.layout
+
+
+class _Walk:
+    def __init__(self, file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None]) -> None:
+        self._length, self._connect = length, connect
+        self.layout = Layout()
+        self._infos: dict[int, Chunk] = {}
+        """By offset of their record: chunks as the bag's index lists them."""
+        self._indexing: Chunk | None = None
+        """The chunk whose index records come by."""
+        self._index_at = self._chunk_count = 0
+        self._search = Search(file, length)
+        self.at = self._search.at
+        self._last: tuple[int, _Head] = -1, (None, 0, 0)
+
+    def records(self, position: int) -> None:
+        while position < self._length or position == len(MAGIC):
+            header, start, stop = self._head(position)
+            inside = header is not None and number(header, b"op") == _CHUNK
+            if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
+                found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
+                if header is None or not self._is_sound(header):
+                    if found is None:
+                        if self._indexing is not None:
+                            self._indexing.doubtful = True
+                        self.layout.cut_at = position
+                        return
+                    self._skip(position, found)
+                    position = found
+                    continue
+                stop = self._stop(header, start, stop, found)
+            self._record(number(header, b"op"), header, position, start, stop)
+            position = stop
+        if position > self._length or (self._index_at > self._length and not self._infos):
+            self.layout.cut_at = self._length
+
+    def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> int:
+        """Where a record stops that has none behind it: by its header, or else where the next one is found if its
+        length is what is damaged."""
+        length = self._length_by_header(header)
+        if length is not None and self._is_record(start + length):
+            return start + length
+        if found is None or (stop < found and self._is_damaged_head(stop)):
+            return stop
+        self.layout.gaps.append((stop, found))
+        return found
+
+    def _is_damaged_head(self, position: int) -> bool:
+        """Whether two of three signs are there of a header: its length, and length and name of its first field."""
+        data = self.at(position, 8 + 16)
+        header, first = (int.from_bytes(data[at : at + 4], "little") for at in (0, 4))
+        return (header <= _MAX_HEADER) + (first < _HEAD) + bool(_FIRST.match(data, 8)) >= 2
+
+    def _skip(self, position: int, found: int) -> None:
+        """Take note of bytes without a record, and of the chunk that may lie in them."""
+        self.layout.gaps.append((position, found))
+        named = _NAME.search(self.at(position, min(_HEAD, found - position)))
+        if self._indexing is not None and named is not None and named[1] is None:
+            self._indexing.doubtful = True
+        if named is None or named[1] is not None:
+            self._indexing = Chunk(position, found, "", 0, False, record=position)
+            self.layout.missing.append(self._indexing)
+
+    def finish(self) -> None:
+        """Hold what was found against the bag's index."""
+        layout = self.layout
+        found = {chunk.record: chunk for chunk in layout.chunks}
+        skipped = {chunk.record: chunk for chunk in layout.missing}
+        listed = len(self._infos) == self._chunk_count
+        for offset, info in sorted(self._infos.items()):
+            if (chunk := found.get(offset)) is not None:
+                chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
+                chunk.doubtful |= bool(chunk.counts) and chunk.counts != info.counts
+                chunk.counts = chunk.counts or info.counts
+            elif self._is_chunk(offset):  # it was jumped over
+                header, start, stop = self._head(offset)
+                self._record(_CHUNK, header or {}, offset, start, stop)
+                layout.chunks[-1].counts = info.counts
+            elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
+                skipped.pop(gaps[0], None)  # by the index records behind it, the last chunk in the gap
+                skipped[offset] = info
+            else:
+                listed = False
+        layout.chunks.sort(key=lambda chunk: chunk.start)
+        for chunk in layout.chunks:
+            chunk.counts = {} if chunk.doubtful else chunk.counts
+        layout.missing = [
+            chunk
+            for offset, chunk in sorted(skipped.items())
+            if offset in self._infos or not self._infos or (chunk.counts and not listed)
+        ]
+        if layout.cut_at is not None and self._index_at and layout.cut_at >= self._index_at and not layout.missing:
+            layout.cut_at, layout.index_cut_at = None, layout.cut_at
+
+    def _head(self, position: int) -> _Head:
+        """Header of the record at `position`, and where its data start and stop."""
+        if position == self._last[0]:  # just looked at from the record before
+            return self._last[1]
+        self._last = position, self._parsed(position)
+        return self._last[1]
+
+    def _parsed(self, position: int) -> _Head:
+        head = self.at(position, 4)
+        size = int.from_bytes(head, "little")
+        if len(head) < 4 or size > _MAX_HEADER:
+            return None, 0, 0
+        data = self.at(position + 4, size + 4)
+        start = position + 8 + size
+        if len(data) < size + 4:
+            return None, 0, 0
+        return fields(data[:size]), start, start + int.from_bytes(data[size:], "little")
+
+    def _is_sound(self, header: dict[bytes, bytes]) -> bool:
+        return header.keys() >= _FIELDS.get(number(header, b"op"), {b""})
+
+    def _length_by_header(self, header: dict[bytes, bytes]) -> int | None:
+        """Bytes of a record's data, where its header tells."""
+        op = number(header, b"op")
+        if op == _CHUNK:
+            return number(header, b"size") if header[b"compression"] == b"none" else None
+        return _ENTRY[op] * number(header, b"count") if op in _ENTRY else None
+
+    def _is_record(self, position: int, behind_chunk: bool = True) -> bool:
+        """Whether the head of a record lies here, or the end of the file. Connections lie in chunks too, but behind one
+        only where the index begins."""
+        header, _, _ = self._head(position)
+        if header is None or not self._is_sound(header):
+            return position == self._length
+        return not behind_chunk or number(header, b"op") != CONNECTION or 0 < self._index_at <= position
+
+    def _is_chunk(self, position: int) -> bool:
+        header, _, stop = self._head(position)
+        return (
+            header is not None and number(header, b"op") == _CHUNK and self._is_sound(header) and self._is_record(stop)
+        )
+
+    def _next_record(self, position: int) -> int | None:
+        """The next chunk, or record of an index, behind `position`; connections may as well lie in a chunk."""
+        return self._search.first(_RECORD_START, position + 1, self._is_record)
+
+    def _record(self, op: int, header: dict[bytes, bytes], position: int, start: int, stop: int) -> None:
+        if op == _CHUNK:
+            kind = header[b"compression"].decode("ascii", "replace")
+            cut, stop = stop > self._length, min(stop, self._length)
+            size = stop - start if kind == "none" and not cut else number(header, b"size")
+            self._indexing = Chunk(start, stop, kind, size, cut, record=position)
+            self.layout.chunks.append(self._indexing)
+        elif op == _INDEX and self._indexing is not None:
+            chunk, connection, count = self._indexing, number(header, b"conn"), (stop - start) // 12
+            chunk.doubtful |= connection in chunk.counts or (stop - start) % 12 > 0 or stop > self._length
+            if count and stop <= self._length:
+                chunk.counts[connection] = count
+                for at in (start, start + 12 * (count - 1)):
+                    seconds, nanoseconds = struct.unpack("<II", self.at(at, 8))
+                    log_ns = seconds * 1_000_000_000 + nanoseconds
+                    chunk.first_ns = min(chunk.first_ns or log_ns, log_ns)
+                    chunk.last_ns = max(chunk.last_ns, log_ns)
+        elif op == _CHUNK_INFO:
+            self._add_info(header, self.at(start, min(stop - start, _MAX_CONNECTION)))
+        elif op == CONNECTION:
+            self._connect(header, self.at(start, min(stop - start, _MAX_CONNECTION)))
+        elif op == _BAG:
+            self._index_at = max(number(header, b"index_pos"), 0)
+            self._chunk_count = number(header, b"chunk_count")
+
+    def _add_info(self, header: dict[bytes, bytes], data: bytes) -> None:
+        position, span = number(header, b"chunk_pos"), (time_ns(header, b"start_time"), time_ns(header, b"end_time"))
+        info = Chunk(position, position, "", 0, False, position, first_ns=span[0], last_ns=span[1])
+        for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
+            if 0 < count <= self._length:
+                info.counts[connection] = count
+        self._infos[position] = info
+
+
+def fields(data: bytes) -> dict[bytes, bytes] | None:
+    """The `name=value` fields of a header; None where it is damaged."""
+    found: dict[bytes, bytes] = {}
+    position = 0
+    while position < len(data):
+        stop = position + 4 + int.from_bytes(data[position : position + 4], "little")
+        name, equals, value = data[position + 4 : stop].partition(b"=")
+        if stop > len(data) or not equals:
+            return None
+        found[name] = value
+        position = stop
+    return found
+
+
+def number(header: dict[bytes, bytes], name: bytes) -> int:
+    """A little-endian field of 1 to 8 bytes; -1 where it is missing."""
+    return int.from_bytes(header[name][:8], "little") if name in header else -1
+
+
+def time_ns(header: dict[bytes, bytes], name: bytes) -> int:
+    """Nanoseconds of a ROS time field: u32 seconds, u32 nanoseconds."""
+    value = header.get(name, b"")
+    if len(value) != 8:
+        return 0
+    seconds, nanoseconds = struct.unpack("<II", value)
+    return seconds * 1_000_000_000 + nanoseconds

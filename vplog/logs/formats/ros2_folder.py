@@ -1,0 +1,231 @@
+"""ROS 2 bag folders: one or more storage files, in the order metadata.yaml gives."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import yaml
+import zstandard
+
+from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
+from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, ordered
+from vplog.logs.formats.loss_account import Runs
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.logs.formats.container import Block, Channel, Container, Octets, Place
+
+_MAX_METADATA = 4 * 2**20
+"""Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
+
+
+_MOST_MESSAGES = 2**48
+"""Messages of a topic that are believed: more than a recorder writes in its life."""
+_DEEPEST = 64
+"""Levels of lists and maps in metadata.yaml; rosbag2 writes 8."""
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+_TRIED = 10
+"""Messages that are looked at for whether each is packed: a damaged one does not decide it."""
+
+
+class MetadataError(Exception):
+    """metadata.yaml is damaged, or names no file that exists; the message is a sentence."""
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What metadata.yaml says of a bag."""
+
+    files: list[Path]
+    """The storage files that are there, in order."""
+    missing: list[str]
+    """Names of those that are not."""
+    mode: str
+    """Compression: ``, `file` or `message`."""
+    recorded: dict[str, int]
+    """Messages by topic; empty where it does not say."""
+    start_ns: int
+    """When the recording began; 0 where it does not say."""
+    end_ns: int
+
+
+class Chain:
+    """A Container over several, one after the other."""
+
+    def __init__(self, parts: Sequence[Container]) -> None:
+        self._parts = parts
+
+    def contents(self) -> Contents:
+        counts: dict[Channel, int] = {}
+        spans: list[tuple[int, int]] = []
+        for part in self._parts:
+            contents = part.contents()
+            for channel, count in contents.counts.items():
+                counts[channel] = counts.get(channel, 0) + count
+            if contents.messages:
+                spans.append((contents.start_ns, contents.end_ns))
+        start_ns = min((start for start, _ in spans), default=0)
+        return Contents(ordered(counts), start_ns, max((end for _, end in spans), default=0))
+
+    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        for number, part in enumerate(self._parts):
+            for message in part.messages(channels):
+                yield message._replace(place=(number, *message.place))
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        for number, part in enumerate(self._parts):
+            for block in part.blocks(channels, brief):
+                yield block._replace(places=[(number, *place) for place in block.places])
+
+    def read(self, place: Place) -> Octets:
+        return self._parts[place[0]].read(place[1:])
+
+
+class Counted:
+    """A Container whose metadata say how much was recorded, so that what is lost can be counted."""
+
+    def __init__(self, found: Container, metadata: Metadata, files: Collection[str], notes: Notes) -> None:
+        self._found, self._metadata, self._files, self._notes = found, metadata, files, notes
+
+    def contents(self) -> Contents:
+        contents, known = self._found.contents(), self._metadata
+        account, found = self._notes.account, by_topic(contents.counts)
+        unexplained = account.settle(self._files, known.recorded, found, known.end_ns or None)
+        if unexplained:
+            more = sum(unexplained.values())
+            self._notes.add(f"metadata.yaml counts {more} messages more than its undamaged storage files hold.")
+        elif account.losses:
+            for file in self._files:
+                account.know(file, {}, contents.start_ns)
+            account.know("metadata.yaml", known.recorded, contents.start_ns or known.start_ns)
+        return contents
+
+    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        return self._found.messages(channels)
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return self._found.blocks(channels, brief)
+
+    def read(self, place: Place) -> Octets:
+        return self._found.read(place)
+
+
+class ZstdMessages:
+    """A Container whose messages are each a zstd frame (rosbag2's compression mode MESSAGE)."""
+
+    def __init__(self, packed: Container, notes: Notes) -> None:
+        self._packed, self._notes = packed, notes
+
+    def contents(self) -> Contents:
+        return self._packed.contents()
+
+    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        lost: dict[str, Runs] = {}
+        reason = ""
+        for message in self._packed.messages(channels):
+            topic = message.channel.topic
+            try:
+                yield message._replace(data=unpack_zstd_message(message.data))
+            except BadChunkError as error:
+                reason = reason or f"The first does not unpack: {error}."
+                lost.setdefault(topic, Runs()).lost(message.log_ns)
+                self._notes.account.add("packed", {topic: lost[topic].messages}, (topic, 0), lost[topic].spans, reason)
+            else:
+                if topic in lost:
+                    lost[topic].sound()
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return in_blocks(self.messages(channels))
+
+    def read(self, place: Place) -> bytes:
+        try:
+            return unpack_zstd_message(self._packed.read(place))
+        except BadChunkError:
+            return b""
+
+
+def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
+    """The container, or one that unpacks its messages where each is a zstd frame: a storage file of rosbag2's
+    compression mode MESSAGE, given without the metadata that say so. No CDR begins as a frame of zstd does."""
+    channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
+    firsts = islice(container.messages(channels), _TRIED) if channels else ()
+    packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)
+    return ZstdMessages(container, notes) if packed else container
+
+
+def read_metadata(folder: Path) -> Metadata:
+    """What metadata.yaml says. Raises MetadataError where it is damaged or names no file that exists."""
+    tree = _metadata(folder)
+    listed = tree.get("relative_file_paths")
+    names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+    # Names only: the first writers put the folder before them, and a stranger's list must not lead elsewhere.
+    files = [folder / name.replace("\\", "/").rpartition("/")[2] for name in names]
+    missing = [file.name for file in files if not file.is_file()]
+    files = [file for file in files if file.is_file()]
+    if not files:
+        named = ", ".join(missing[:3]) or "no storage file"
+        raise MetadataError(f"{folder / 'metadata.yaml'} names {named}, and no such file is in the folder.")
+    mode = str(tree.get("compression_mode") or "").lower()
+    start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
+    end_ns = start_ns + length_ns if start_ns and length_ns else 0
+    return Metadata(files, missing, mode if mode in ("file", "message") else "", _recorded(tree), start_ns, end_ns)
+
+
+def _recorded(tree: dict) -> dict[str, int]:
+    """Messages by topic; empty where the list is not one."""
+    result: dict[str, int] = {}
+    topics = tree.get("topics_with_message_count")
+    for topic in topics if isinstance(topics, list) else []:
+        about = topic.get("topic_metadata") if isinstance(topic, dict) else None
+        name = about.get("name") if isinstance(about, dict) else None
+        count = topic.get("message_count") if isinstance(topic, dict) else None
+        if isinstance(name, str) and isinstance(count, int) and 0 <= count < _MOST_MESSAGES:
+            result[name] = result.get(name, 0) + count
+    return result
+
+
+def _nanoseconds(tree: Any) -> int:
+    values = tree.values() if isinstance(tree, dict) else ()
+    return next((value for value in values if isinstance(value, int) and 0 < value < 2**63), 0)
+
+
+def split_parts(files: list[Path]) -> list[Path] | None:
+    """The files in order where they are NAME_0, NAME_1, ... of one bag; else None."""
+    matches = [re.fullmatch(r"(.*)_(\d+)", file.stem) for file in files]
+    numbers = sorted((int(m[2]), file) for m, file in zip(matches, files, strict=True) if m)
+    one_name = len({m[1] for m in matches if m}) == 1 and len({file.suffix for file in files}) == 1
+    if not one_name or [number for number, _ in numbers] != list(range(len(files))):
+        return None
+    return [file for _, file in numbers]
+
+
+def _check_depth(text: str) -> None:
+    """Raises ValueError for what nests deeper than any bag's metadata: libyaml's loader would use up the C stack."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise ValueError(f"its YAML has more than {_DEEPEST} nested levels")
+
+
+def _metadata(folder: Path) -> dict:
+    path = folder / "metadata.yaml"
+    try:
+        if path.stat().st_size > _MAX_METADATA:
+            raise MetadataError(f"{path} is larger than {_MAX_METADATA >> 20} MiB, so it is not a bag's metadata.")
+        text = path.read_text(encoding="utf-8")
+        _check_depth(text)
+        tree = yaml.load(text, Loader=_LOADER)  # noqa: S506 - both choices are safe loaders
+        tree = tree["rosbag2_bagfile_information"]
+    except (OSError, UnicodeDecodeError, RecursionError, TypeError, KeyError, ValueError, yaml.YAMLError):
+        tree = None
+    if not isinstance(tree, dict):
+        raise MetadataError(f"{path} is not the metadata of a ROS 2 bag.")
+    return tree

@@ -1,0 +1,259 @@
+"""ROS 2 bags in SQLite (rosbag2_storage_sqlite3), every schema version."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vplog.errors import LogError
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks, ordered
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+
+    from vplog.logs.formats.container import Block, Place
+
+MAGIC = b"SQLite format 3\x00"
+_DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
+"""What reading a damaged file raises."""
+_MOST_TRIED = 20_000
+"""Rows that are looked for one by one behind damage: a second's work."""
+_MOST_MISSED = 2_000
+"""Rows that may be missing in a row where the last one is not known."""
+_LONGEST = 2**28
+"""Bytes of a message that is read: an image of as many pixels as are decoded, of four bytes each."""
+
+
+class _OrderError(sqlite3.DatabaseError):
+    """Rows come again, or one of them has a wrong number."""
+
+
+class SqliteBag:
+    """A Container over one .db3 file."""
+
+    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
+        """`name` is what the file is called where something is said of it."""
+        self._path, self._name, self._notes = path, name or path.name, notes
+        self._damaged = False
+        self._holes: dict[int, int] = {}
+        """The row behind each hole, by the row before it."""
+        self._last_row: int | None = None
+        """The last that can be read, once that is known to be less than all."""
+        log = Path(f"{path}-wal")
+        pending = log.is_file() and log.stat().st_size > 0
+        try:
+            self._db = self._connect("mode=ro" if pending else "immutable=1")  # immutable: no lock, no -shm file
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            if not pending:
+                raise LogError(f"{path} is not a readable ROS 2 bag: {error}.") from None
+            notes.add(f"{log.name} (write-ahead log) holds messages that cannot be read here; they are left out.")
+            self._db = self._connect("immutable=1")
+        self._topics = self._read_topics()
+
+    def contents(self) -> Contents:
+        counts = dict.fromkeys(self._topics.values(), 0)
+        times: list[int] = []
+        unknown = 0
+        query = "SELECT topic_id, count(*), min(timestamp), max(timestamp), max(rowid) FROM messages GROUP BY topic_id"
+        try:
+            found = self._db.execute(query).fetchall()
+            last = max((row[4] for row in found), default=0)
+            if sum(row[1] for row in found) > last:  # rows are numbered from 1: damage made the tree a circle
+                raise sqlite3.DatabaseError("rows repeat")
+            rows: Iterable[tuple] = [row[:4] for row in found]
+        except _DAMAGE:
+            rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
+        for topic, count, first, last in rows:
+            if topic not in self._topics:
+                unknown += count
+                continue
+            counts[self._topics[topic]] += count
+            times = [min(*times, _integer(first)), max(*times, _integer(last))] if times else [first, last]
+            times = [_integer(time_ns) for time_ns in times]
+        start_ns, end_ns = times or (0, 0)
+        account, name = self._notes.account, self._name
+        missing = 0 if self._damaged else self._missing_by_index(sum(counts.values()) + unknown)
+        if missing:
+            self._damaged = True
+            detail = f"{name} is damaged: an index of its messages lists more of them."
+            account.add("damaged_bytes", {"": missing}, (name, 0), [], detail)
+        if unknown:
+            account.add("unknown_channel", {"": unknown}, (name, 0), [])
+        account.know(name, {} if self._damaged else by_topic(counts), start_ns)
+        return Contents(ordered(counts), start_ns, end_ns)
+
+    def _missing_by_index(self, rows: int) -> int:
+        """Messages that an index of the table lists and the table, in which `rows` are found, has not."""
+        table = "SELECT rowid FROM messages"
+        for name in self._indexes():
+            listed = f"{table} INDEXED BY {name}"
+            try:
+                number = self._db.execute(f"SELECT count(*) FROM ({listed})").fetchone()[0]  # noqa: S608 - quoted
+                if number > rows:
+                    missing = f"SELECT count(*) FROM ({listed} WHERE rowid <= ? EXCEPT {table} NOT INDEXED)"  # noqa: S608
+                    return self._db.execute(missing, [number]).fetchone()[0]
+            except _DAMAGE:
+                continue  # the index is what is damaged
+        return 0
+
+    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+        ids = [topic for topic, channel in self._topics.items() if channel in channels]
+        for row, topic, time_ns, data in self._salvaged("rowid, topic_id, timestamp, data", ids):
+            if isinstance(data, bytes) and isinstance(time_ns, int):
+                yield Message(self._topics[topic], time_ns, data, (row, time_ns))
+            else:
+                self._lose_data(row, f"{self._name} is damaged: row {row} holds no message.")
+
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return in_blocks(self.messages(channels))
+
+    def read(self, place: Place) -> bytes:
+        try:
+            query = "SELECT data FROM messages WHERE rowid = ? AND timestamp = ?"
+            found = self._db.execute(query, list(place)).fetchone()
+        except _DAMAGE:
+            return b""
+        return found[0] if found and isinstance(found[0], bytes) else b""
+
+    def _salvaged(self, columns: str, topics: list[int] | None = None) -> Iterator[tuple]:
+        """Rows of the table of messages in its order: row id, topic, time, and more columns; over damage, row by row.
+
+        Recorders number the rows without a gap, so that a number that is not there is a message that is lost. A row
+        before one of a lower number is taken to have a wrong one, and looked for again by the numbers between.
+        """
+        last, last_ns, tried = 0, 0, 0
+        while True:
+            waiting = None
+            try:
+                for row in self._in_order(columns, topics, last):
+                    if waiting:
+                        last, last_ns = waiting[0], _integer(waiting[2])
+                        yield waiting
+                    waiting = row
+                if waiting:
+                    yield waiting
+                return
+            except _DAMAGE as error:
+                again = isinstance(error, _OrderError)
+                detail = f"{self._name} is damaged: {error}."
+            if waiting and (not again or waiting[0] == last + 1):  # else it may be the one with a wrong number
+                last, last_ns = waiting[0], _integer(waiting[2])
+                yield waiting
+            self._damaged, before, found, missing = True, last, None, 0
+            least = last + 2 if again else 0  # the row with a wrong number may have that of the one before it
+            end, is_listed = self._end_behind(last)
+            while tried < _MOST_TRIED and last < end and (found is None or last < least):
+                step = max(last + 1, self._holes.get(last, 0))
+                tried, missing, last = tried + 1, missing + step - last - 1, step
+                row = self._row(last, columns)
+                if row is None:
+                    missing += topics is None or not self._lose_data(last, detail)
+                    continue
+                found = row
+                if topics is None or row[1] in topics:
+                    yield row
+            if found is None:
+                if topics is None or self._last_row is None:
+                    self._cut(last_ns, missing if is_listed and last >= end else None, detail)
+                self._last_row = before
+                return
+            if topics is None and not again:
+                self._holes[before] = last
+            before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
+            self._lose_rows(before, missing, (before_ns, last_ns), detail)
+
+    def _lose_rows(self, before: int, missing: int, span: tuple[int, int], detail: str) -> None:
+        if missing:
+            self._notes.account.add("damaged_bytes", {"": missing}, (self._name, before), [span], detail)
+
+    def _cut(self, last_ns: int, missing: int | None, detail: str) -> None:
+        span = [(last_ns, last_ns)] if last_ns else []
+        self._notes.account.add("cut", None if missing is None else {"": missing}, (self._name, 0), span, detail)
+
+    def _in_order(self, columns: str, topics: list[int] | None, last: int) -> Iterator[tuple]:
+        """Rows behind row `last`. Raises _OrderError where one is not behind the one before it, and _DAMAGE."""
+        chosen = "1" if topics is None else f"topic_id IN ({','.join('?' * len(topics))})"
+        behind = " AND rowid > ?" if last else ""
+        query = f"SELECT {columns} FROM messages WHERE {chosen}{behind} ORDER BY rowid"  # noqa: S608 - names of ours
+        for row in self._db.execute(query, [*(topics or []), *([last] if last else [])]):
+            if row[0] <= last:
+                raise _OrderError("its row numbers do not increase")
+            last = row[0]
+            yield row
+
+    def _end_behind(self, row: int) -> tuple[int, bool]:
+        """The last row to look for, where none is found behind `row`, and whether an index of the table lists it."""
+        if self._last_row is not None:
+            return self._last_row, False
+        for table in (*(f"messages INDEXED BY {name}" for name in self._indexes()), "messages"):
+            try:
+                last = self._db.execute(f"SELECT max(rowid) FROM (SELECT rowid FROM {table})").fetchone()[0]  # noqa: S608
+            except _DAMAGE:
+                continue
+            if isinstance(last, int):
+                return last, table != "messages"
+        return row + _MOST_MISSED, False
+
+    def _indexes(self) -> list[str]:
+        """Quoted names of the indexes of the table of messages."""
+        try:
+            found = self._db.execute("PRAGMA index_list(messages)").fetchall()
+        except _DAMAGE:
+            return []
+        return ['"' + name.replace('"', '""') + '"' for _, name, *_ in found]
+
+    def _row(self, row: int, columns: str) -> tuple | None:
+        try:
+            return self._db.execute(f"SELECT {columns} FROM messages WHERE rowid = ?", [row]).fetchone()  # noqa: S608
+        except _DAMAGE:
+            return None
+
+    def _lose_data(self, row: int, detail: str) -> bool:
+        """A message whose topic and time can be read, but not the rest; others were missed when they were counted."""
+        found = self._row(row, "rowid, topic_id, timestamp")
+        if found is not None and found[1] in self._topics:
+            span, lost = (_integer(found[2]), _integer(found[2])), {self._topics[found[1]].topic: 1}
+            self._notes.account.add("damaged_chunk", lost, (self._name, row), [span], detail)
+            return True
+        return False
+
+    def _connect(self, mode: str) -> sqlite3.Connection:
+        db = sqlite3.connect(f"{self._path.resolve().as_uri()}?{mode}", uri=True)
+        db.text_factory = lambda text: text.decode("utf-8", "replace")
+        db.execute("PRAGMA trusted_schema = OFF")  # a stranger's file runs nothing
+        longest = min(max(self._path.stat().st_size, 2**16), _LONGEST)  # no value exceeds its file
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
+        try:
+            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        except sqlite3.DatabaseError:
+            db.execute("PRAGMA writable_schema = ON")  # else SQLite reads no file shorter than its header says
+            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        return db
+
+    def _read_topics(self) -> dict[int, Channel]:
+        tables = {name for (name,) in self._rows("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:
+            raise LogError(
+                f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages."
+            )
+        # All columns, as SQLite holds the lengths of a row's against its own only where it reads the last.
+        rows = (row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics"))
+        # damage may have put anything, or nothing, in any column
+        rows = sorted(row for row in rows if [type(value) for value in row] == [int, str, str, str])
+        times = Counter(row[0] for row in rows)  # of two topics of one number, none can be told from the other
+        rows = [row for row in rows if times[row[0]] == 1]
+        return {number: Channel(name, kind, encoding) for number, name, kind, encoding in rows}
+
+    def _rows(self, query: str, values: list[int] | None = None) -> Iterator[tuple]:
+        """Rows as far as the file is sound; a note where it is not."""
+        try:
+            yield from self._db.execute(query, values or [])
+        except _DAMAGE as error:
+            self._damaged = True
+            self._notes.add(f"{self._name}: the list of topics is damaged, read as far as it goes: {error}.")
+
+
+def _integer(value: object) -> int:
+    return value if isinstance(value, int) else 0

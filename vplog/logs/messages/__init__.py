@@ -1,0 +1,1 @@
+"""Raw messages to images, calibrations, poses and fixes."""

@@ -1,0 +1,225 @@
+"""Foxglove messages, protobuf, JSON and FlatBuffers (docs.foxglove.dev/docs/sdk/schemas), through Foxglove's classes.
+
+The file's descriptors are not built: these types are fixed by their names, and a stranger's schema runs nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+
+from vplog.logs.messages.flatbuffers import fill_flat
+from vplog.logs.messages.records import (
+    BadMessageError,
+    CalibrationMessage,
+    FixMessage,
+    ImageMessage,
+    PoseMessage,
+    TransformMessage,
+    nanoseconds,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from google.protobuf.message import Message as Proto
+
+    from vplog.data import Floats
+    from vplog.logs.formats.container import Octets
+    from vplog.logs.messages.records import Record
+
+_LENGTH = 2
+"""Wire type of protobuf's fields that are bytes behind their length (protobuf.dev/programming-guides/encoding)."""
+_FIXED = {1: 8, 5: 4}
+"""Bytes of the wire types that have always as many."""
+
+
+def decode_foxglove(kind: str, encoding: str, data: bytes) -> Record:
+    """A record of type `foxglove.RawImage` and so on. Raises BadMessageError or what the parsers raise."""
+    make, read = _READERS[kind]
+    message = make()
+    if encoding == "json":
+        _fill(message, json.loads(data))
+    elif encoding == "flatbuffer":
+        fill_flat(message, data)
+    else:
+        message.ParseFromString(data)
+    return read(message)
+
+
+def head_reader(kind: str) -> Callable[[Octets], tuple[Any, int, int] | None]:
+    """What reads a protobuf image without its pixels: the message, its `data` empty, and where those start and stop.
+
+    It gives None for bytes that are no such message, or hold `data` more than once.
+    """
+    make, _ = _READERS[kind]
+    tag_of_data = make.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH
+
+    def read(data: Octets) -> tuple[Any, int, int] | None:
+        at, stop = 0, len(data)
+        while at < len(data) and (tag := data[at]) != tag_of_data:
+            at = _skipped(data, at + 1, tag)
+        start, head = at, bytes(data[:at])
+        if at < len(data):
+            length, start = _varint(data, at + 1)
+            stop = start + length
+            head += bytes(data[stop:])
+        message: Any = make()
+        try:
+            message.ParseFromString(head)
+        except DecodeError:
+            return None
+        return None if start > stop or stop > len(data) or message.data else (message, start, stop)
+
+    return read
+
+
+def _skipped(data: Octets, at: int, tag: int) -> int:
+    """Where the value of a field ends that begins at `at`. Raises IndexError where that cannot be told."""
+    if tag >= 0x80:  # a field number above 15, which none of these types has
+        raise IndexError
+    if tag & 7 == _LENGTH:
+        length, at = _varint(data, at)
+        return at + length
+    if tag & 7 == 0:
+        return _varint(data, at)[1]
+    return at + _FIXED[tag & 7]
+
+
+def _varint(data: Octets, at: int) -> tuple[int, int]:
+    """A number in groups of 7 bits, the lowest first, and where it ends. Raises IndexError where it does not."""
+    value = shift = 0
+    for position in range(at, at + 10):  # 64 bits
+        byte = data[position]
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position + 1
+        shift += 7
+    raise IndexError
+
+
+def _fill(message: Proto, tree: Any) -> None:
+    """Set a message from Foxglove's JSON: times as {sec, nsec}, bytes as base64, enums as numbers."""
+    if not isinstance(tree, dict):
+        raise BadMessageError(f"{message.DESCRIPTOR.name} is not a JSON object")
+    if message.DESCRIPTOR.full_name == "google.protobuf.Timestamp":
+        tree = {"seconds": tree.get("sec", 0), "nanos": tree.get("nsec", tree.get("nanosec", 0))}
+    for descriptor in message.DESCRIPTOR.fields:
+        value = tree.get(descriptor.name)
+        if value is None:
+            continue
+        if descriptor.is_repeated:
+            if not isinstance(value, list):
+                raise BadMessageError(f"{descriptor.name} is not a JSON array")
+            field = getattr(message, descriptor.name)
+            if descriptor.message_type:
+                for item in value:
+                    _fill(field.add(), item)
+            else:
+                field.extend(value)
+        elif descriptor.message_type:
+            _fill(getattr(message, descriptor.name), value)
+        elif descriptor.type == descriptor.TYPE_BYTES:
+            setattr(message, descriptor.name, _bytes(value))
+        else:
+            setattr(message, descriptor.name, value)
+
+
+def _bytes(value: Any) -> bytes:
+    try:
+        return base64.b64decode(value, validate=True)
+    except (binascii.Error, TypeError, ValueError):
+        raise BadMessageError("its data are not base64") from None
+
+
+def _stamp(message: Any) -> int:
+    return nanoseconds(message.timestamp.seconds, message.timestamp.nanos)
+
+
+def _raw(m: Any) -> Record:
+    return ImageMessage(_stamp(m), m.frame_id, m.encoding, m.data, False, m.width, m.height, m.step)
+
+
+def _compressed(m: Any) -> Record:
+    return ImageMessage(_stamp(m), m.frame_id, m.format, m.data, True)
+
+
+def _calibration(m: Any) -> Record:
+    matrix, projection = _matrix(m.K, (3, 3)), _matrix(m.P, (3, 4))
+    distortion = np.array(m.D, np.float64)
+    return CalibrationMessage(
+        _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, distortion, matrix, projection,
+        _matrix(m.R, (3, 3)),
+    )  # fmt: skip
+
+
+def _pose(m: Any) -> Record:
+    pose = m.pose
+    p, q = pose.position, pose.orientation
+    return PoseMessage(_stamp(m), m.frame_id, "", (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), None)
+
+
+def _odometry(m: Any) -> Record:
+    covariance = _matrix(m.pose_covariance, (6, 6)).ravel().tolist()
+    p, q = m.pose.position, m.pose.orientation
+    position, quaternion = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+    return PoseMessage(_stamp(m), m.frame_id, m.body_frame_id, position, quaternion, covariance)
+
+
+def _fix(m: Any) -> Record:
+    known = m.position_covariance_type != LocationFix.PositionCovarianceType.UNKNOWN
+    covariance = _matrix(m.position_covariance, (3, 3)) if known else np.full((3, 3), np.nan)
+    return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance, m.frame_id)
+
+
+def _transform(m: Any) -> TransformMessage:
+    position, quaternion = _xyz(m.translation), _xyzw(m.rotation)
+    return TransformMessage(m.parent_frame_id, m.child_frame_id, position, quaternion, _stamp(m))
+
+
+def _one_transform(m: Any) -> Record:
+    return [_transform(m)]
+
+
+def _transforms(m: Any) -> Record:
+    return [_transform(t) for t in m.transforms]
+
+
+def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
+    """Zeros where the field was left out."""
+    return np.array(values, np.float64).reshape(shape) if len(values) else np.zeros(shape)
+
+
+def _xyz(v: Any) -> Floats:
+    return np.array([v.x, v.y, v.z])
+
+
+def _xyzw(q: Any) -> Floats:
+    return np.array([q.x, q.y, q.z, q.w])
+
+
+_READERS: dict[str, tuple[type[Proto], Callable[[Any], Record]]] = {
+    "foxglove.RawImage": (RawImage, _raw),
+    "foxglove.CompressedImage": (CompressedImage, _compressed),
+    "foxglove.CompressedVideo": (CompressedVideo, _compressed),
+    "foxglove.CameraCalibration": (CameraCalibration, _calibration),
+    "foxglove.PoseInFrame": (PoseInFrame, _pose),
+    "foxglove.Odometry": (Odometry, _odometry),
+    "foxglove.LocationFix": (LocationFix, _fix),
+    "foxglove.FrameTransform": (FrameTransform, _one_transform),
+    "foxglove.FrameTransforms": (FrameTransforms, _transforms),
+}

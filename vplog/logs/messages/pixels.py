@@ -1,0 +1,242 @@
+"""Pixels: an ImageMessage becomes a grey uint8 image or a depth image in metres."""
+
+from __future__ import annotations
+
+import struct
+from contextlib import suppress
+from functools import lru_cache
+from itertools import chain
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from vplog.logs.messages.records import BadMessageError
+from vplog.storage.image_file import PNG, BadImageError, decode_image, image_size
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from vplog.data import Bytes, Float32s
+    from vplog.logs.formats.container import Octets
+    from vplog.logs.messages.records import ImageMessage
+
+_DEPTH_HEADER = 12
+"""Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""
+_CLIPPED = 0.002
+"""Share of pixels beyond black, and beyond white: hot and dead ones and glints, of 1000 px two."""
+_SAMPLED = 16
+"""Images that tell the levels of a drive: day and night, sun and tunnel are among them."""
+_LEAST_UNKNOWN = 0.001
+"""Share of px without measurement that depth images have at least; a camera has a few dead ones in a million."""
+_INVALID_MM = (0, 65535)
+"""Depth values in mm that mean no measurement: 0 in ROS REP 118 and cameras' firmware, 65535 in 7-Scenes."""
+_LAYOUTS: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8UC1": ("u1", 1, None),
+    "rgb8": ("u1", 3, cv2.COLOR_RGB2GRAY),
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2GRAY),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2GRAY),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2GRAY),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2GRAY),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2GRAY),
+    "mono16": ("u2", 1, None),
+    "16UC1": ("u2", 1, None),
+    "rgb16": ("u2", 3, cv2.COLOR_RGB2GRAY),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2GRAY),
+    "rgba16": ("u2", 4, cv2.COLOR_RGBA2GRAY),
+    "bgra16": ("u2", 4, cv2.COLOR_BGRA2GRAY),
+    "16SC1": ("i2", 1, None),
+    "32FC1": ("f4", 1, None),
+    "64FC1": ("f8", 1, None),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
+    "nv12": ("u1", 1, None),
+    "nv21": ("u1", 1, None),
+    "nv24": ("u1", 1, None),
+}
+"""ROS encoding: type of a channel, channels, OpenCV's conversion to grey (8UC3 is BGR, as cv_bridge has it). Of nv12,
+nv21 and nv24 the luma comes first, and it is the grey image; what follows is not read."""
+_MOSAICS = {
+    "rggb": cv2.COLOR_BayerBG2GRAY,
+    "bggr": cv2.COLOR_BayerRG2GRAY,
+    "gbrg": cv2.COLOR_BayerGR2GRAY,
+    "grbg": cv2.COLOR_BayerGB2GRAY,
+}
+"""ROS names a mosaic by its first two rows, OpenCV by the second and third px of its second row."""
+_LAYOUTS |= {f"bayer_{name}{8 * size}": (f"u{size}", 1, code) for name, code in _MOSAICS.items() for size in (1, 2)}
+_COLOURS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+"""As OpenCV decodes them."""
+_DEPTH_ENCODINGS = ("16UC1", "16SC1", "32FC1", "64FC1")
+_SIXTEEN_BITS = "16UC1"
+"""Depth in mm, or what a thermal camera counts."""
+
+
+def is_depth(message: ImageMessage) -> bool:
+    """By encoding: one of _DEPTH_ENCODINGS, raw or in the format of compressedDepth (`16UC1; compressedDepth png`)."""
+    if message.compressed:
+        return "compresseddepth" in message.encoding.lower() or message.encoding.startswith(_DEPTH_ENCODINGS)
+    return message.encoding in _DEPTH_ENCODINGS
+
+
+def is_image(message: ImageMessage) -> bool:
+    """Whether `grey` knows the encoding: of raw pixels those of _LAYOUTS that are not depth alone."""
+    known = message.encoding == _SIXTEEN_BITS or message.encoding in _LAYOUTS.keys() - set(_DEPTH_ENCODINGS)
+    return message.compressed or known
+
+
+def may_be_thermal(message: ImageMessage) -> bool:
+    """Whether it has 16 bits that may be depth in mm or a thermal camera's counts: depth has px without measurement
+    (ROS REP 118), where nothing reflects, in shadow of the emitter and at edges; every px of a camera counts."""
+    if not message.encoding.startswith(_SIXTEEN_BITS) or "compresseddepth" in message.encoding.lower():
+        return False
+    try:
+        unknown = np.isnan(depth_m(message)).mean()
+    except BadMessageError:
+        return False
+    return bool(unknown < _LEAST_UNKNOWN)
+
+
+class Levels(NamedTuple):
+    """Values of 16 bits that become black and white: cameras of 10 to 14 bits fill the low ones, thermal ones a few."""
+
+    black: int
+    white: int
+
+    def apply(self, pixels: Any) -> Bytes:
+        """uint8 of uint16: linear from black to white, and clipped."""
+        return _grey_table(self)[pixels]
+
+
+@lru_cache(maxsize=16)
+def _grey_table(levels: Levels) -> Bytes:
+    """(65536,) uint8."""
+    spread = (np.arange(2**16) - levels.black) * (255 / (levels.white - levels.black))
+    return np.clip(np.rint(spread), 0, 255).astype(np.uint8)
+
+
+def sixteen_bits(message: ImageMessage) -> bool:
+    """Whether its pixels have 16 bits, told without decoding them."""
+    if not message.compressed:
+        return message.encoding in _LAYOUTS and _LAYOUTS[message.encoding][0] == "u2"
+    return message.data[:8] == PNG and bytes(message.data[24:25]) == b"\x10"
+
+
+def levels_of(messages: Iterable[ImageMessage]) -> Levels | None:
+    """The levels that all but _CLIPPED of the pixels lie within; a grey is one value at least, so that noise is not
+    stretched. None where no image decodes to 16 bits."""
+    counts = np.zeros(2**16, np.int64)
+    for message in messages:
+        with suppress(BadMessageError):
+            pixels, _ = _pixels(message)
+            if pixels.dtype == np.uint16:
+                counts += np.bincount(pixels.ravel(), minlength=2**16)
+    if not counts.any():
+        return None
+    share = np.cumsum(counts) / counts.sum()
+    black, white = (int(np.searchsorted(share, at)) for at in (_CLIPPED, 1 - _CLIPPED))
+    return Levels(black, max(white, black + 255))
+
+
+def spread(count: int) -> int:
+    """The step at which _SAMPLED images, about, lie over a drive of `count`."""
+    return max(-(-count // _SAMPLED), 1)
+
+
+def drive_levels(messages: Iterator[ImageMessage]) -> Levels | None:
+    """The levels of images that speak for a drive; None, and only the first whole one is looked at, where it has not
+    16 bits."""
+    first = next((message for message in messages if not message.compressed or image_size(message.data)), None)
+    return levels_of(chain([first], messages)) if first is not None and sixteen_bits(first) else None
+
+
+def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
+    """(H, W) uint8; of 16 bits by the `levels` of the topic, or by its own. Raises BadMessageError."""
+    pixels, conversion = _pixels(message)
+    if pixels.dtype == np.uint16:
+        pixels = (levels or levels_of([message]) or Levels(0, 2**16 - 1)).apply(pixels)
+    if pixels.dtype != np.uint8:
+        raise BadMessageError(f"encoding {message.encoding[:40]!r} is depth, not an image")
+    try:
+        return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion), np.uint8)
+    except cv2.error:  # a mosaic or a row of shared colours of one px
+        raise BadMessageError(f"{message.encoding[:40]!r} with {pixels.shape[1]} x {pixels.shape[0]} px") from None
+
+
+def _pixels(message: ImageMessage) -> tuple[Any, int | None]:
+    """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion to grey."""
+    if not message.compressed:
+        return _raw(message)
+    mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
+    pixels = _imdecode(message.data, unchanged=mosaic is not None)
+    if mosaic is None:
+        return pixels, None
+    return pixels, mosaic[2] if pixels.ndim == 2 else _COLOURS[pixels.shape[2]]  # some transports compress the mosaic
+
+
+def depth_m(message: ImageMessage) -> Float32s:
+    """(H, W) float32 m, NaN where unknown: 16UC1 and 16SC1 hold mm, 32FC1 and 64FC1 m (ROS REP 118).
+
+    Raises BadMessageError.
+    """
+    if not message.compressed:
+        pixels, _ = _raw(message)
+        return _metres(pixels, message.encoding)
+    if message.data[:8] == PNG:
+        return _metres(_imdecode(message.data, unchanged=True), message.encoding)
+    if "rvl" in message.encoding.lower():
+        from vplog.logs.messages.rvl import decode_rvl  # numba loads here
+
+        pixels = decode_rvl(bytes(message.data[_DEPTH_HEADER:]))
+    else:
+        pixels = _imdecode(message.data[_DEPTH_HEADER:], unchanged=True)
+    if not message.encoding.startswith("32FC1"):
+        return _metres(pixels, message.encoding)
+    # 32FC1 is stored as quantised inverse depth: raw = a / depth + b (compressed_depth_image_transport, codec.cpp).
+    _, a, b = struct.unpack_from("<iff", message.data)
+    if pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise BadMessageError("its PNG is not a 16-bit image")
+    raw = pixels.astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth = np.float32(a) / (raw - np.float32(b))
+    return np.where((pixels != 0) & np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan)).astype(np.float32)
+
+
+def _metres(pixels: Any, encoding: str) -> Float32s:
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.int16, np.float32, np.float64):
+        raise BadMessageError(f"{encoding[:40]!r} with {pixels.ndim} dimensions of {pixels.dtype} is not a depth image")
+    if pixels.dtype == np.uint16:
+        unknown = np.logical_or.reduce([pixels == value for value in _INVALID_MM])  # np.isin takes ten times as long
+        return np.where(unknown, np.float32(np.nan), pixels * np.float32(0.001)).astype(np.float32)
+    if pixels.dtype == np.int16:
+        return np.where(pixels > 0, pixels * np.float32(0.001), np.float32(np.nan)).astype(np.float32)
+    known = np.isfinite(pixels) & (pixels > 0)
+    return np.where(known, pixels, np.nan).astype(np.float32)
+
+
+def _raw(message: ImageMessage) -> tuple[Any, int | None]:
+    """(H, W) or (H, W, C) pixels in native byte order without row padding, and the conversion to grey."""
+    if message.encoding not in _LAYOUTS:
+        raise BadMessageError(f"encoding {message.encoding[:40]!r} is not supported; these are: {', '.join(_LAYOUTS)}")
+    kind, channels, conversion = _LAYOUTS[message.encoding]
+    width, height = message.width, message.height
+    row = width * channels * int(kind[1])
+    step = message.step or row
+    # The last row may come without its padding.
+    if not (width and height) or step < row or step * (height - 1) + row > len(message.data):
+        raise BadMessageError(f"{len(message.data)} bytes do not hold {width} x {height} px of {message.encoding}")
+    dtype = np.dtype(kind).newbyteorder(">" if message.big_endian else "<")
+    data = np.frombuffer(message.data, np.uint8)
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
+    return (pixels if channels == 1 else pixels.reshape(height, width, channels)), conversion
+
+
+def _imdecode(data: Octets, unchanged: bool = False) -> Any:
+    """The pixels of an image file, as `decode_image` gives them. Raises BadMessageError."""
+    try:
+        return decode_image(data, unchanged)
+    except BadImageError as error:
+        raise BadMessageError(str(error)) from None

@@ -1,0 +1,150 @@
+"""The five records that messages of known types become, whatever their encoding."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vplog.data import Floats
+    from vplog.logs.formats.container import Channel, Octets
+
+
+class BadMessageError(Exception):
+    """A message's bytes are not what its type says."""
+
+
+class ImageMessage(NamedTuple):
+    """A tuple, which is made in no time: one is for every image."""
+
+    stamp_ns: int
+    frame: str
+    encoding: str
+    """ROS name of the pixel layout (`mono8`, `16UC1`, ...); the format string where compressed."""
+    data: Octets
+    """A view only where it was asked for."""
+    compressed: bool
+    width: int = 0
+    height: int = 0
+    step: int = 0
+    """Bytes per row, padding included; 0 where compressed."""
+    big_endian: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationMessage:
+    stamp_ns: int
+    frame: str
+    width: int
+    height: int
+    model: str
+    distortion: Floats
+    matrix: Floats
+    """(3, 3) of the image as the sensor gives it; all zero where uncalibrated."""
+    projection: Floats
+    """(3, 4) of the rectified image; all zero where unknown."""
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+    """(3, 3) rectified_from_camera of a stereo pair; the identity or all zero without one."""
+
+    def equals(self, other: CalibrationMessage) -> bool:
+        """Whether all but the stamp is equal."""
+        mine, theirs = vars(self) | {"stamp_ns": 0}, vars(other) | {"stamp_ns": 0}
+        return all(np.array_equal(mine[name], theirs[name]) for name in mine)
+
+    @property
+    def is_set(self) -> bool:
+        """Not so where a driver has no calibration: ROS has zeros then (sensor_msgs/CameraInfo), others NaN."""
+        return any(np.isfinite(k).all() and k[0, 0] > 0 for k in (self.matrix, self.projection))
+
+
+class PoseMessage(NamedTuple):
+    """A tuple of plain numbers: drives have more of these than of anything else."""
+
+    stamp_ns: int
+    frame: str
+    child: str
+    """The frame that moves; empty where the type has none."""
+    position: Sequence[float]
+    """x y z in m."""
+    quaternion: Sequence[float]
+    """x y z w, as logged."""
+    covariance: Sequence[float] | None
+    """The 36 numbers of a (6, 6) as logged: translation first, axes of `frame`; None where the type has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class FixMessage:
+    stamp_ns: int
+    valid: bool
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    covariance: Floats
+    """(3, 3) m^2 east-north-up; NaN where its type says unknown."""
+    frame: str
+    """Of the antenna."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransformMessage:
+    """One edge of the frame tree."""
+
+    parent: str
+    child: str
+    position: Floats
+    quaternion: Floats
+    stamp_ns: int = 0
+
+
+Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[TransformMessage]
+
+_KINDS = {
+    "sensor_msgs/Image": "image",
+    "sensor_msgs/CompressedImage": "image",
+    "foxglove.CompressedImage": "image",
+    "foxglove.RawImage": "image",
+    "foxglove.CompressedVideo": "image",
+    "foxglove_msgs/CompressedVideo": "image",
+    "ffmpeg_image_transport_msgs/FFMPEGPacket": "image",
+    "sensor_msgs/CameraInfo": "camera_info",
+    "foxglove.CameraCalibration": "camera_info",
+    "nav_msgs/Odometry": "odometry",
+    "geometry_msgs/PoseStamped": "odometry",
+    "geometry_msgs/PoseWithCovarianceStamped": "odometry",
+    "geometry_msgs/TransformStamped": "odometry",
+    "foxglove.PoseInFrame": "odometry",
+    "foxglove.Odometry": "odometry",
+    "sensor_msgs/NavSatFix": "gps",
+    "foxglove.LocationFix": "gps",
+    "tf2_msgs/TFMessage": "tf",
+    "tf/tfMessage": "tf",
+    "foxglove.FrameTransform": "tf",
+    "foxglove.FrameTransforms": "tf",
+}
+ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxglove", "flatbuffer": "foxglove"}
+
+
+def kind_of(channel: Channel) -> str:
+    """`image`, `camera_info`, `odometry`, `gps`, `tf`, or `` for what vplog has no use for or cannot decode."""
+    family = ENCODINGS.get(channel.encoding)
+    name = short_type(channel.type)
+    if family is None or name.startswith("foxglove.") != (family == "foxglove"):
+        return ""
+    return _KINDS.get(name, "")
+
+
+def short_type(name: str) -> str:
+    """`sensor_msgs/msg/Image` as ROS 1 wrote it: `sensor_msgs/Image`."""
+    return name.replace("/msg/", "/")
+
+
+def nanoseconds(seconds: int, nanos: int) -> int:
+    """One stamp. Raises BadMessageError where it is negative or does not fit 64 bits."""
+    stamp_ns = seconds * 1_000_000_000 + nanos
+    if not 0 <= stamp_ns < 2**63:
+        raise BadMessageError(f"stamp {seconds}.{nanos:09d} s is out of range")
+    return stamp_ns

@@ -1,0 +1,247 @@
+"""Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
+
+foxglove.CompressedVideo, ffmpeg_image_transport's packets, and sensor_msgs/CompressedImage with such a format. Decoding
+runs forward only: asked for frames in order of time, every packet between two key frames is decoded at most once, and
+stretches between key frames without a frame of interest not at all. Behind a damaged or missing packet nothing is
+decoded up to the next key frame, since the pictures would be wrong; VP9 and AV1 do not tell a missing one.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from vplog.errors import LogError
+from vplog.logs.messages.h264 import FrameNumbers
+from vplog.logs.messages.records import BadMessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.data import Bytes
+
+_CODECS = {
+    "264": ("h264", "H.264"),
+    "avc": ("h264", "H.264"),
+    "265": ("hevc", "H.265"),
+    "hevc": ("hevc", "H.265"),
+    "vp9": ("vp9", "VP9"),
+    "av1": ("av1", "AV1"),
+}
+"""What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
+_DECODERS = {"av1": "libdav1d"}
+"""FFmpeg's decoder where that of the codec's own name needs hardware: its `av1` is for graphics cards alone."""
+MAX_PIXELS = 2**25
+"""px of a video frame that is decoded: 8K (7680 x 4320); a decoder keeps up to 16 of them."""
+_DELAY = 64
+"""Packets behind a frame that are given to the decoder before the frame counts as lost: H.264 and H.265 reorder 16."""
+_BROKEN = "a video packet between its key frame and it is damaged or missing"
+_START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
+_UNSEEN, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
+"""What a packet is: not looked at; needs those before it; parameter sets alone; a key frame without, or with them."""
+
+
+def codec_of(encoding: str) -> str:
+    """FFmpeg's codec for a compressed image message's format; empty where it is no video."""
+    first = encoding.split(";", maxsplit=1)[0].lower()
+    return next((codec for word, (codec, _) in _CODECS.items() if word in first), "")
+
+
+class VideoStream:
+    """The frames of one topic, by their row in the order of the file."""
+
+    def __init__(self, codec: str, topic: str, packet: Callable[[int], bytes], count: int) -> None:
+        """`packet` gives the payload of a row, empty where its message is damaged."""
+        self._codec, self._topic, self._packet, self._count = codec, topic, packet, count
+        self._kinds = bytearray(count)
+        self._av: Any = None
+        self._decoder: Any = None
+        self._numbers: FrameNumbers | None = None
+        self._asked = 0
+        """The last row asked for: frames behind it that came out since are ready."""
+        self._next = 0
+        """The first row that the decoder has not been given."""
+        self._damaged = -1
+        """The last row that did not decode: none decodes from there to the next key frame."""
+        self._ready: dict[int, Bytes] = {}
+
+    def first_key(self) -> int | None:
+        """The first row from which decoding can start; None where there is none."""
+        return next((row for row in range(self._count) if self._kind(row) >= _KEY), None)
+
+    def frame(self, row: int) -> Bytes:
+        """(H, W) uint8 grey; rows are best asked for in increasing order.
+
+        Raises BadMessageError where it cannot be decoded, and LogError where PyAV is not installed.
+        """
+        if row not in self._ready:
+            self._advance(row)
+        self._asked = row
+        found = self._ready.get(row)
+        self._ready = {later: image for later, image in self._ready.items() if later >= row}
+        if found is None:
+            raise BadMessageError("its video packet decodes to no frame")
+        return found
+
+    def _advance(self, row: int) -> None:
+        """Give the decoder packets until the frame of this row comes out."""
+        running = self._decoder is not None and self._asked <= row
+        key = self._key_before(row, self._next + 1 if running else 0)  # at a key frame that is next, it runs on
+        if key is None and not running:
+            raise BadMessageError("no key frame comes before it")
+        if key is not None:
+            if key <= self._damaged <= row:
+                raise BadMessageError(_BROKEN)
+            self._restart(key)
+        self._run(row)
+        if row not in self._ready and key and self._codec == "hevc":
+            # pictures behind a key frame that are shown before it may refer to what comes before it (RASL, H.265 3.114)
+            earlier = self._key_before(key - 1, 0)
+            if earlier is not None and not earlier <= self._damaged <= row:
+                self._restart(earlier)
+                self._run(row)
+
+    def _run(self, row: int) -> None:
+        while row not in self._ready and self._next < min(self._count, row + _DELAY):
+            self._feed(self._packet(self._next), self._next, row)
+            self._next += 1
+        if row not in self._ready and self._next == self._count:
+            self._keep(None, row, row)  # what the decoder held back
+            self._decoder = None
+
+    def _restart(self, key: int) -> None:
+        self._av = _av(self._codec, self._topic)
+        name = _DECODERS.get(self._codec, self._codec)
+        try:
+            self._decoder = self._av.CodecContext.create(name, "r")
+        except ValueError:  # PyAV's UnknownCodecError
+            raise LogError(
+                f"{self._topic} is {_name(self._codec)} video, and the FFmpeg of this PyAV lacks its decoder, {name}. "
+                "Install PyAV's own wheel (pip install --force-reinstall av), or choose another topic with "
+                "--image-topic."
+            ) from None
+        # a wrong picture is no picture
+        self._decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
+        self._decoder.thread_count = 1  # with more, what damage does is a matter of chance
+        self._next = key
+        self._numbers = FrameNumbers() if self._codec == "h264" else None
+        if self._kind(key) == _KEY:  # its parameter sets came in a packet of their own
+            before = (r for r in range(key - 1, -1, -1) if self._kind(r) in (_PARAMETERS, _WHOLE_KEY))
+            if (row := next(before, None)) is not None:
+                self._feed(self._packet(row), row, key)
+
+    def _feed(self, data: bytes, number: int, row: int) -> None:
+        follows = self._numbers is None or self._numbers.follows(data)
+        if not data or not follows:  # FFmpeg takes an empty packet for the end
+            return self._fail(number, row)
+        packet = self._av.Packet(data)
+        packet.pts = packet.dts = number
+        return self._keep(packet, number, row)
+
+    def _keep(self, packet: Any, number: int, row: int) -> None:
+        """Decode one packet, None at the end, and keep what comes out from this row on."""
+        try:
+            for frame in self._decoder.decode(packet):
+                if frame.is_corrupt:
+                    return self._fail(number, row)
+                if frame.pts is not None and frame.pts >= row:
+                    self._ready[frame.pts] = _grey(frame)
+        except self._av.error.FFmpegError:
+            return self._fail(number, row)
+        return None
+
+    def _fail(self, number: int, row: int) -> None:
+        """Give the decoder up at this packet, with what it held back of those before."""
+        decoder, self._decoder, self._damaged = self._decoder, None, number
+        try:
+            for frame in decoder.decode(None) if decoder is not None else ():
+                if frame.pts is not None and row <= frame.pts < number and not frame.is_corrupt:
+                    self._ready[frame.pts] = _grey(frame)
+        except self._av.error.FFmpegError:
+            pass  # it held nothing
+        if row not in self._ready:
+            raise BadMessageError(_BROKEN)
+
+    def _key_before(self, row: int, first: int) -> int | None:
+        """The last key frame of rows first..row."""
+        return next((r for r in range(row, first - 1, -1) if self._kind(r) >= _KEY), None)
+
+    def _kind(self, row: int) -> int:
+        if self._kinds[row] == _UNSEEN:
+            self._kinds[row] = packet_kind(self._codec, self._packet(row))
+        return self._kinds[row]
+
+
+def packet_kind(codec: str, data: bytes) -> int:
+    """Whether decoding can start at a packet: by its first unit that holds a picture."""
+    if codec == "vp9":  # uncompressed header, VP9 bitstream 6.2: marker 10, profile, show_existing_frame, frame_type
+        return _WHOLE_KEY if data and data[0] >> 6 == 2 and not data[0] & 0b1100 else _PLAIN
+    if codec == "av1":  # a sequence header, OBU type 1, comes with every key frame: AV1 bitstream 7.5
+        return _WHOLE_KEY if 1 in _obu_types(data) else _PLAIN
+    parameters = False
+    for unit in _START_CODE.finditer(data):
+        header = unit[1][0]
+        kind = header & 0x1F if codec == "h264" else header >> 1 & 0x3F
+        if kind == (7 if codec == "h264" else 33):  # SPS: ITU-T H.264 table 7-1, H.265 table 7-1
+            parameters = True
+        if (1 <= kind <= 5) if codec == "h264" else kind <= 31:  # a slice
+            key = kind == 5 if codec == "h264" else 16 <= kind <= 21  # IDR; BLA, IDR, CRA
+            return (_WHOLE_KEY if parameters else _KEY) if key else _PLAIN
+    return _PARAMETERS if parameters else _PLAIN
+
+
+def _obu_types(data: bytes) -> set[int]:
+    """Types of the units of an AV1 packet (AV1 bitstream 5.3), up to the first that says no size."""
+    found, position = set(), 0
+    while position < len(data):
+        header = data[position]
+        found.add(header >> 3 & 0xF)
+        position += 2 if header & 4 else 1
+        if not header & 2:
+            break
+        size = 0
+        for i in range(8):  # leb128
+            if position >= len(data):
+                return found
+            byte = data[position]
+            position += 1
+            size |= (byte & 0x7F) << (7 * i)
+            if not byte & 0x80:
+                break
+        position += size
+    return found
+
+
+_FULL_RANGE = 2
+"""AVCOL_RANGE_JPEG: luma runs over 0..255; else, by convention, over 16..235 (ITU-R BT.601)."""
+_EIGHT_BITS = re.compile(r"(yuvj?4[0-9]{2}p|nv12|nv16|nv21|gray)$")
+_STRETCH = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+
+
+def _grey(frame: Any) -> Bytes:
+    """(H, W) uint8: the luma as JPEG and PNG have it."""
+    if not _EIGHT_BITS.match(frame.format.name):
+        return np.asarray(cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY), np.uint8)
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    full = int(frame.color_range) == _FULL_RANGE or frame.format.name.startswith("yuvj")
+    return rows.copy() if full else _STRETCH[rows]
+
+
+def _name(codec: str) -> str:
+    return next(name for known, name in _CODECS.values() if known == codec)
+
+
+def _av(codec: str, topic: str) -> Any:
+    """PyAV, an extra. Raises LogError where it is not installed."""
+    try:
+        import av
+    except ImportError:
+        raise LogError(
+            f"{topic} is {_name(codec)} video, and PyAV, which decodes it, is not installed. Install vplog[video] "
+            "(pip install 'vplog[video]'), or choose another topic with --image-topic."
+        ) from None
+    return av

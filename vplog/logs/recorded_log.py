@@ -1,0 +1,260 @@
+"""A Log over any container: topics are chosen when it is opened, everything else is read when it is first asked for."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from vplog.data import LogInfo, Topic
+from vplog.errors import LogError
+from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
+from vplog.logs.content import read_content
+from vplog.logs.formats.container import Notes
+from vplog.logs.formats.ros2_folder import messages_unpacked
+from vplog.logs.frames import RecordedFrame, size_of
+from vplog.logs.pictures import Pictures
+from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
+from vplog.logs.sidecar_files import Beside
+from vplog.logs.stamps import rows_of
+from vplog.logs.topic_candidates import read_candidates
+from vplog.logs.topic_selection import TopicChoice, select
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.data import Bytes, Camera, Gps, Ints, Odometry
+    from vplog.logs.content import Content
+    from vplog.logs.formats.container import Channel, Container, Contents
+    from vplog.logs.formats.loss_account import Account, Loss
+    from vplog.logs.messages.records import CalibrationMessage
+    from vplog.logs.rectification import Pair
+
+_LISTED = 8
+"""Topics that an error lists."""
+
+
+class RecordedLog:
+    """A drive in a container, as `vplog.stages.Log`."""
+
+    def __init__(
+        self, path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice
+    ) -> None:
+        self._path, self._name, self._kind, self._notes = path, name, kind, notes
+        self._contents: Contents = container.contents()
+        self._container = messages_unpacked(container, self._contents, notes)
+        self._candidates = read_candidates(self._container, self._contents)
+        self._selection = select(self._candidates, choice, path.name)
+        self._beside_log = Beside(choice, notes)
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def warnings(self) -> list[str]:
+        return list(self._notes.lines)
+
+    @property
+    def account(self) -> Account:
+        """Of what could not be used so far."""
+        return self._notes.account
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What could not be used so far, counted; complete once the log was read."""
+        return self._notes.account.losses
+
+    def info(self) -> LogInfo:
+        """Reads the chosen topics once, so that the warnings are complete."""
+        content = self._content
+        topics = [self._topic(channel, count) for channel, count in self._contents.counts.items()]
+        if self._selection.image is not None:
+            self._check_images()
+        stamps = [content.stamp_ns] + [track.stamp_ns for track in (content.odometry, content.gps) if track is not None]
+        stamps = [stamp_ns for stamp_ns in stamps if len(stamp_ns)]
+        start_ns = min((int(s[0]) for s in stamps), default=self._contents.start_ns)
+        end_ns = max((int(s[-1]) for s in stamps), default=self._contents.end_ns)
+        messages = self._contents.messages
+        frames = [frame for frame in content.frames if frame]
+        return LogInfo(
+            str(self._path), self._kind, start_ns, end_ns, messages, topics, self.warnings, frames, content.skew_ms,
+            content.sources,
+        )  # fmt: skip
+
+    def _topic(self, channel: Channel, count: int) -> Topic:
+        part, rate_hz = self._content.chosen.parts.get(channel, ""), self._content.rates_hz.get(channel)
+        known = next((c for c in self._candidates if c.channel == channel), None)
+        if known is None:
+            return Topic(channel.topic, channel.type, channel.encoding, count, "", bool(part), part, rate_hz=rate_hz)
+        calibrated = known.calibrated if known.role == "camera_info" else None
+        return Topic(
+            channel.topic, channel.type, channel.encoding, count, known.role, bool(part), part, known.encoding,
+            *known.size, known.frame, calibrated, rate_hz,
+        )  # fmt: skip
+
+    def camera(self) -> Camera:
+        """Raises LogError where the log has no images."""
+        return self._camera
+
+    def stamps(self) -> Ints:
+        self._image_channel()
+        return self._content.stamp_ns
+
+    def frames(self, stamp_ns: Ints) -> Iterator[RecordedFrame]:
+        """Raises LogError where a stamp is not one of `stamps()`."""
+        camera = self.camera()
+        for row in rows_of(self._content.stamp_ns, stamp_ns, self._name):
+            yield self._frame(row, camera)
+
+    def odometry(self) -> Odometry | None:
+        return self._beside_log.odometry or self._content.odometry
+
+    def gps(self) -> Gps | None:
+        return self._content.gps
+
+    def _check_images(self) -> None:
+        """Everything that decoding the first image and depth would warn of, for info."""
+        try:
+            self.camera()
+            _ = self._depth
+            _ = self._pair
+        except LogError as error:
+            self._notes.add(str(error))
+
+    def _image_channel(self) -> Channel:
+        if self._selection.image is None:
+            names = list(dict.fromkeys(channel.topic for channel in self._contents.counts))
+            listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+            depth = [c.channel.topic for c in self._candidates if c.role == "depth" and c.encoding.startswith("16UC1")]
+            hint = f" If {depth[0]} is a thermal camera's, take it with --image-topic {depth[0]}." if depth else ""
+            raise LogError(f"No camera images in {self._path.name}. Topics: {listed or 'none'}.{hint}")
+        if not len(self._content.stamp_ns):
+            raise LogError(f"No image of {self._selection.image.topic} can be read. Choose another with --image-topic.")
+        return self._selection.image
+
+    def _frame(self, row: int, camera: Camera) -> RecordedFrame:
+        content, pictures, pair = self._content, self._pictures, self._pair
+        right = None if pair is None else pictures.beside(self._selection.right, content.right_places, row)
+        depth = pictures.beside(self._depth, content.depth_places, row)
+        stamp_ns, image = int(content.stamp_ns[row]), pictures.image(row)
+        own = self._calibration_at(stamp_ns)
+        return RecordedFrame(stamp_ns, camera, image, depth, right, pair, self._notes, own)
+
+    def _calibration_at(self, stamp_ns: int) -> CalibrationMessage | None:
+        """The calibration in force at a stamp, where it is another than the camera's."""
+        found = self._later_calibrations
+        row = bisect_right(found, stamp_ns, key=lambda calibration: calibration.stamp_ns)
+        return found[row - 1] if row else None
+
+    @cached_property
+    def _later_calibrations(self) -> list[CalibrationMessage]:
+        """Those that change the camera's, by stamp: a lens in focus has one for every image."""
+        if self._beside_log.camera(self._image_channel().topic) is not None:
+            return []
+        return sorted(self._content.calibrations[1:], key=lambda calibration: calibration.stamp_ns)
+
+    def _codec(self, channel: Channel | None) -> str:
+        return next((candidate.codec for candidate in self._candidates if candidate.channel == channel), "")
+
+    @cached_property
+    def _depth(self) -> Channel | None:
+        """The depth topic, or None, with a note, where its first images do not decode or do not fit the camera's."""
+        depth = self._selection.depth
+        if depth is None:
+            return None
+        try:
+            first = self._pictures.first_depth(depth)
+        except LogError as error:
+            self._notes.add(f"Depth is not used: {error}")
+            return None
+        if first is None:
+            return None
+        if first.shape != (self._camera.height, self._camera.width):
+            size = f"{self._camera.width} x {self._camera.height}"
+            self._notes.add(f"Depth is not used: {depth.topic} has {size_of(first)} px, the images {size}.")
+            return None
+        return depth
+
+    @cached_property
+    def _pictures(self) -> Pictures:
+        image = self._selection.image
+        codec = self._codec(image)
+        content = read_content(self._container, self._selection, self._notes)
+        return Pictures(self._container, image, codec, content, self._notes)
+
+    @property
+    def _content(self) -> Content:
+        return self._pictures.content
+
+    @cached_property
+    def _camera(self) -> Camera:
+        return self._left[0] if self._pair is None else self._pair.camera
+
+    @cached_property
+    def _left(self) -> tuple[Camera, str]:
+        """The camera of the images as they come, and its frame."""
+        image = self._image_channel()
+        content, notes = self._content, self._notes
+        frame, size = self._pictures.first(image, [*content.places], self._path.name)
+        known = self._beside_log.camera(image.topic)
+        calibration = known.calibration if known else next(iter(content.calibrations), None)
+        camera = camera_of(image.topic, calibration, size, notes)
+        named = content.body and frame and content.tree.between(content.body, frame) is not None
+        if known is not None and known.body_from_camera is not None and not named:
+            camera = replace(camera, body_from_camera=known.body_from_camera)
+        elif self.odometry() is not None:
+            placed = body_from_camera(content.tree, content.body, frame, notes)
+            camera = replace(camera, body_from_camera=placed)
+        return camera, frame
+
+    @cached_property
+    def _pair(self) -> Pair | None:
+        """The left and right images as a rectified pair, or None, with a note where a right topic was there."""
+        image, right, content = self._selection.image, self._selection.right, self._content
+        if image is None or right is None:
+            return None
+        left, frame = self._left
+        if left.matrix is None:  # warned of as such: it costs more than the depth
+            return None
+        try:
+            if self._codec(right):
+                raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
+            known = [self._beside_log.camera(channel.topic) for channel in (image, right)]
+            calibrations = [camera.calibration if camera else None for camera in known]
+            if known[0] is None:
+                calibrations = [next(iter(content.calibrations), None), content.right_calibration]
+            if calibrations[0] is None or calibrations[1] is None:
+                raise NoPairError(f"{right.topic} has no calibration")
+            other, size = self._pictures.first(right, content.right_places, self._path.name)
+            camera = camera_of(right.topic, calibrations[1], size, self._notes)
+            left_side = Side(left, calibrations[0], is_rectified(image.topic))
+            right_side = Side(camera, calibrations[1], is_rectified(right.topic))
+            apart = content.tree.between(other, frame) if other and frame else None
+            apart = self._beside_log.right_from_left(image.topic, right.topic) if known[0] else apart
+            pair = pair_of(left_side, right_side, apart)
+            error_px = row_error_px(self._rectified(pair, right))
+            if error_px is not None and error_px > MOST_ROWS_PX:
+                raise NoPairError(
+                    f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
+                )
+            return pair
+        except (NoPairError, LogError) as error:
+            self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")
+            return None
+
+    def _rectified(self, pair: Pair, right: Channel) -> Iterator[tuple[Bytes, Bytes]]:
+        """Images of a few frames; what does not decode is left out."""
+        content, pictures, camera = self._content, self._pictures, self._left[0]
+        rows = [row for row, place in enumerate(content.right_places) if place is not None]
+        for row in rows[:: max(len(rows) // CHECKED_FRAMES, 1)][:CHECKED_FRAMES]:
+            image, beside = pictures.image(row), pictures.beside(right, content.right_places, row)
+            stamp_ns = int(content.stamp_ns[row])
+            try:  # nothing of a trial is counted
+                frame = RecordedFrame(stamp_ns, camera, image, None, beside, pair, Notes()).decode()
+            except LogError:
+                continue
+            if frame.right is not None:
+                yield frame.image, frame.right

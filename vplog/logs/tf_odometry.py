@@ -1,0 +1,172 @@
+"""Frames that move: the transforms of tf topics become an odometry, by the chain from its root to the body.
+
+Those of a tf topic that never change are static transforms: logs older than tf_static have no others.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Odometry
+from vplog.geometry import se3
+from vplog.logs.stamps import Stamps
+from vplog.logs.static_transforms import are_usable, clean
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Ints
+    from vplog.logs.formats.container import Notes
+    from vplog.logs.messages.records import TransformMessage
+    from vplog.logs.static_transforms import FrameTree
+
+_BODIES = ("base_link", "base_footprint")
+"""Names of the body, ROS REP 105 and 120, in order of preference."""
+_ROOTS = ("odom", "map", "world")
+"""Names of frames that stand still (ROS REP 105): odom first, whose poses do not jump."""
+Edge = tuple[str, str]
+"""Parent and child."""
+
+
+@dataclass
+class _Link:
+    """One edge of the frame tree over time."""
+
+    first: TransformMessage
+    times_ns: list[tuple[int, int, int]] = field(default_factory=list)
+    """Stamp, log time and position in the file of the first and the last sample before it moved."""
+    moves: bool = False
+    travels: bool = False
+    """Its position changes, not its rotation alone."""
+    stamps: Stamps = field(default_factory=Stamps)
+    values: array[float] = field(default_factory=lambda: array("d"))
+    """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
+
+    def keep(self, transform: TransformMessage, time_ns: tuple[int, int, int]) -> None:
+        if not self.moves:
+            self.times_ns[1:] = [time_ns]  # the first stays
+            return
+        for before_ns in self.times_ns:
+            self._append(self.first, before_ns)
+        self.times_ns.clear()
+        self._append(transform, time_ns)
+
+    def _append(self, transform: TransformMessage, time_ns: tuple[int, int, int]) -> None:
+        self.stamps.add(*time_ns)
+        self.values.extend((*transform.position, *transform.quaternion))
+
+
+class MovingFrames:
+    """Collects the transforms of tf topics."""
+
+    def __init__(self, keep: bool) -> None:
+        self._keep = keep
+        """Keep every sample, for odometry; else only what tells whether a frame moves."""
+        self._links: dict[Edge, _Link] = {}
+
+    def add(self, transforms: list[TransformMessage], log_ns: int, position: int) -> None:
+        for transform in transforms:
+            edge = clean(transform.parent), clean(transform.child)
+            link = self._links.get(edge)
+            if link is None:
+                link = self._links[edge] = _Link(transform)
+            link.travels = link.travels or not np.array_equal(link.first.position, transform.position)
+            link.moves = link.travels or link.moves or not np.array_equal(link.first.quaternion, transform.quaternion)
+            if self._keep:
+                link.keep(transform, (transform.stamp_ns, log_ns, position))
+
+    def still(self) -> list[TransformMessage]:
+        """Transforms that were the same whenever they were sent."""
+        return [link.first for _, link in sorted(self._links.items()) if not link.moves]
+
+    def stamps(self) -> list[Stamps]:
+        """Of every link that is followed over time."""
+        return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
+
+    def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:
+        """The poses of the body in the frame that stands still, and the frames from there down to the body.
+
+        None and no frames where no chain moves.
+        """
+        chain = self._chain(tree, topic, notes)
+        moving = [edge for edge in chain if edge in self._links and self._links[edge].moves]
+        if not moving:
+            return None, []
+        frames = [chain[0][0], *(child for _, child in chain)]
+        names = " -> ".join(frames)
+        tracks = {edge: self._track(edge, topic, notes) for edge in moving}
+        pace = max(moving, key=lambda edge: len(tracks[edge][0]))
+        first_ns = max((stamps[0] for stamps, _ in tracks.values() if len(stamps)), default=0)
+        last_ns = min((stamps[-1] for stamps, _ in tracks.values() if len(stamps)), default=0)
+        at_ns = tracks[pace][0]
+        at_ns = at_ns[(at_ns >= first_ns) & (at_ns <= last_ns)]
+        if not len(at_ns) or not all(len(stamps) for stamps, _ in tracks.values()):
+            notes.add(f"{topic}: the transforms {names} have no time in common; there is no odometry.")
+            return None, []
+        poses = np.tile(np.eye(4), (len(at_ns), 1, 1))
+        for edge in chain:
+            if edge in tracks:
+                stamps, samples = tracks[edge]
+                poses = poses @ (samples if len(stamps) == 1 else se3.interpolate_at(stamps, samples, at_ns))
+            else:
+                still = tree.between(*edge)
+                poses = poses @ (np.eye(4) if still is None else still)
+        notes.add(f"Odometry is {names} of {topic}, which carries no covariance; its noise is that of the drift model.")
+        return Odometry(at_ns, poses, None), frames
+
+    def _chain(self, tree: FrameTree, topic: str, notes: Notes) -> list[Edge]:
+        """Edges from the frame that stands still down to the body; empty where nothing moves but joints."""
+        edges = [*tree.edges, *sorted(self._links)]
+        moving = {edge for edge, link in self._links.items() if link.moves}
+        by_root = sorted(edges, key=lambda edge: -_ROOTS.index(_name(edge[0])) if _name(edge[0]) in _ROOTS else -9)
+        parents = {child: parent for parent, child in by_root}  # of several parents the root that does not jump
+        up = {frame: _upwards(frame, parents) for edge in edges for frame in edge}
+        bodies = [body for name in _BODIES for body in sorted(up) if _name(body) == name]
+        body = next((body for body in bodies if moving.intersection(up[body])), None)
+        if body is None:
+            body = "" if bodies else self._unnamed(moving, up)  # on a body that stands, only its parts move
+        chain = up.get(body, [])[::-1]
+        for root in _ROOTS:
+            below = [i for i, (parent, _) in enumerate(chain) if _name(parent) == root]
+            if below and moving.intersection(chain[below[0] :]):
+                return chain[below[0] :]
+        if chain and chain[0][0] in parents:
+            notes.add(f"{topic}: the transforms above {body} form a loop without odom, map or world; no odometry.")
+            return []
+        return chain
+
+    def _unnamed(self, moving: set[Edge], up: dict[str, list[Edge]]) -> str:
+        """The body of a log that names none: what travels in a frame that stands still, with the fewest links between
+        (an arm moves on the body), then the most samples, then the name. Joints turn about one point."""
+        travels = [edge for edge in sorted(moving) if self._links[edge].travels]
+        children = [child for _, child in travels if _name(child) not in _ROOTS]
+        rooted = [child for child in children if any(_name(parent) in _ROOTS for parent, _ in up[child])] or children
+        samples = {child: len(self._links[parent, child].values) for parent, child in moving}
+        return min(rooted, key=lambda c: (len(moving.intersection(up[c])), -samples[c], c), default="")
+
+    def _track(self, edge: Edge, topic: str, notes: Notes) -> tuple[Ints, Floats]:
+        """Increasing stamps of one link and its poses (T, 4, 4), those out of range left out."""
+        link = self._links[edge]
+        values = np.array(link.values).reshape(-1, 7)
+        stamp_ns, rows = link.stamps.order(f"{topic} {edge[0]} -> {edge[1]}", notes)
+        usable = are_usable(values[rows])
+        values = values[rows[usable]]
+        return stamp_ns[usable], se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
+
+
+def _upwards(frame: str, parents: dict[str, str]) -> list[Edge]:
+    """Edges from a frame to the top of its tree; in a circle, up to the frame that comes twice."""
+    result: list[Edge] = []
+    passed = {frame}
+    while frame in parents and parents[frame] not in passed:
+        result.append((parents[frame], frame))
+        frame = parents[frame]
+        passed.add(frame)
+    return result
+
+
+def _name(frame: str) -> str:
+    """A frame's name without its namespace: `robot1/odom` is an odom."""
+    return frame.rsplit("/", 1)[-1]

@@ -1,0 +1,79 @@
+"""The topics of a log that could play a part, and what the first message of each says of it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from vplog.logs.messages.decode import decode
+from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
+from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
+from vplog.logs.messages.video import codec_of
+from vplog.logs.static_transforms import clean
+from vplog.logs.topic_selection import Candidate
+from vplog.storage.image_file import image_size
+
+if TYPE_CHECKING:
+    from vplog.logs.formats.container import Channel, Container, Contents
+
+
+_THERMAL = re.compile(r"therm|infra|lwir|flir|boson|lepton|(?<![a-z])ir(?![a-z])")
+"""Words for thermal cameras: their kind, their band, and the most common makes."""
+
+
+def read_candidates(container: Container, contents: Contents) -> list[Candidate]:
+    """Every topic that could play a part; the first message of each tells depth from grey, its frame and its codec."""
+    kinds = {channel: kind_of(channel) for channel in contents.counts}
+    asked = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
+    firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
+    left = set(asked)
+    for message in container.messages(asked) if asked else ():
+        if message.channel not in left:
+            continue
+        try:
+            record = decode(message.channel, message.data)
+        except BadMessageError:
+            continue  # the next one may be sound
+        if isinstance(record, ImageMessage | CalibrationMessage):
+            firsts[message.channel] = record
+            left.discard(message.channel)
+        if not left:
+            break
+    found = [
+        _candidate(channel, contents.counts[channel], kind, firsts.get(channel))
+        for channel, kind in kinds.items()
+        if kind
+    ]
+    return [replace(c, role="image") if _is_thermal(c, firsts.get(c.channel), found) else c for c in found]
+
+
+def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | CalibrationMessage | None) -> Candidate:
+    role, codec, encoding, size = kind, "", "", None
+    if kind == "tf" and channel.topic.rstrip("/").endswith("static"):
+        role = "tf_static"
+    if isinstance(first, ImageMessage):
+        codec, encoding = codec_of(first.encoding) if first.compressed else "", first.encoding
+        size = image_size(first.data) if first.compressed else (first.width, first.height)
+        if not codec and (is_depth(first) or _named_depth(channel.topic, first)):
+            role = "depth"
+    calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
+    frame = clean(first.frame) if first else ""
+    supported = not isinstance(first, ImageMessage) or is_image(first)
+    return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0), supported)
+
+
+def _is_thermal(candidate: Candidate, first: object, candidates: list[Candidate]) -> bool:
+    """Whether images of 16UC1 are a thermal camera's, not depth: by the words of topic and frame; else where no camera
+    has their frame, to which depth would be registered, and every px has a value."""
+    if candidate.role != "depth" or not isinstance(first, ImageMessage) or not may_be_thermal(first):
+        return False
+    words = f"{candidate.channel.topic} {candidate.frame}".lower()
+    if "depth" in words or _THERMAL.search(words):
+        return "depth" not in words
+    return not any(c.role == "image" and c.frame == candidate.frame for c in candidates)
+
+
+def _named_depth(topic: str, first: ImageMessage) -> bool:
+    """Where the encoding leaves it open: old compressedDepth says only `png`, RealSense records depth as mono16."""
+    return topic.endswith("/compressedDepth") or (first.encoding == "mono16" and "depth" in topic.lower())

@@ -1,0 +1,244 @@
+"""Which topic of a log plays which part.
+
+An image topic is depth where its encoding is 16UC1, 16SC1, 32FC1 or 64FC1, or compressedDepth, or mono16 under a name
+with `depth`; 16UC1 without px that lack a measurement is a thermal camera's, where its name says so or no camera shares
+its frame.
+Static transforms are those of all topics whose name ends in `static`. Of several topics that could play one of the
+other parts the first by these rules does, unless TopicChoice names another:
+- image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
+  right one of a pair, then most messages, then name;
+- right: the topic named like the image's with `right` for `left` (or another of _PAIRS), where no depth is used;
+- depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
+- camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
+  those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
+- odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
+  chain from its root to the body is taken;
+- gps: most messages, then name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vplog.errors import LogError, nearest
+from vplog.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.logs.formats.container import Channel
+
+
+class TopicChoice(Settings):
+    """Topics to use instead of those the rules pick."""
+
+    image: str | None = None
+    """Topic of the camera's images."""
+    depth: str | None = None
+    """Topic of the depth images; an empty string uses none."""
+    right: str | None = None
+    """Topic of the right images of a stereo pair, whose left ones are `image`; an empty string uses none."""
+    camera_info: str | None = None
+    """Topic of the camera's calibration; an empty string uses none."""
+    odometry: str | None = None
+    """Topic of the odometry; an empty string uses none."""
+    odometry_file: Path | None = None
+    """TUM file of poses beside the log that is the odometry: of the body, or of the camera where the log's static
+    transforms have no base_link; its clock is that of the images' stamps."""
+    calibration_file: Path | None = None
+    """YAML file beside the log that calibrates the camera, or both of a pair: ROS camera_info, a Kalibr camchain or
+    EuRoC's sensor.yaml."""
+    gps: str | None = None
+    """Topic of the satellite fixes; an empty string uses none."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A topic that could play a part, with what its first message says."""
+
+    channel: Channel
+    count: int
+    role: str
+    frame: str = ""
+    calibrated: bool = False
+    """A camera_info whose matrix is set."""
+    codec: str = ""
+    """FFmpeg's decoder where the images are a video."""
+    encoding: str = ""
+    """Pixel layout of the images, or their format where compressed, as the first message names it."""
+    size: tuple[int, int] = (0, 0)
+    """Width and height in px of the first image, 0 where it is not told without decoding it."""
+    supported: bool = True
+    """Whether images of its encoding can be decoded to grey."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The topics in use, None where no topic plays the part."""
+
+    image: Channel | None = None
+    depth: Channel | None = None
+    camera_info: Channel | None = None
+    odometry: Channel | None = None
+    """As asked for, or as chosen among `sources` once these are read."""
+    sources: tuple[Channel, ...] = ()
+    """Topics that may be the odometry; the transforms over time are one source, named by the largest topic."""
+    gps: Channel | None = None
+    tf_static: tuple[Channel, ...] = ()
+    tf: tuple[Channel, ...] = ()
+    """Transforms over time: read where odometry may come from them, or where no topic is of static ones alone."""
+    right: Channel | None = None
+    right_info: Channel | None = None
+
+    @property
+    def parts(self) -> dict[Channel, str]:
+        """What each topic in use is used as, in the words of `vplog.data.Topic.part`."""
+        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info")
+        many = [(channel, name) for name in ("tf_static", "tf") for channel in getattr(self, name)]
+        one = [(channel, name) for name in named if (channel := getattr(self, name)) is not None]
+        return dict(many) | dict(one)
+
+    @property
+    def channels(self) -> list[Channel]:
+        return list(dict.fromkeys((*self.parts, *self.sources)))
+
+    def with_odometry(self, odometry: Channel | None) -> Selection:
+        """The selection once the source of odometry is known."""
+        tf = self.tf if odometry in self.tf or not self.tf_static else ()
+        return replace(self, odometry=odometry, sources=(), tf=tf)
+
+
+_NAMES = {
+    "image": "Image",
+    "depth": "Depth",
+    "right": "Image",
+    "camera_info": "Calibration",
+    "odometry": "Odometry",
+    "gps": "GPS",
+}
+_ROLES = {"right": "image"}
+"""What a topic of a part is taken for before parts are given out, where it is called otherwise."""
+_PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"))
+"""Words that tell the topics of a stereo pair apart: most drivers', RealSense's, and EuRoC's."""
+
+
+def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
+    """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
+
+    def pick(
+        role: str, key: Callable[[Candidate], tuple], also: str = "", taken: Candidate | None = None
+    ) -> Candidate | None:
+        wanted = getattr(choice, role)
+        found = sorted((c for c in candidates if c.role == _ROLES.get(role, role) and c.count), key=key)
+        found = [c for c in found if c is not taken]
+        if wanted is None:
+            return found[0] if found else None
+        if wanted == "":
+            return None
+        named = [c for c in candidates if c.channel.topic == wanted]
+        fitting = sorted((c for c in named if c.role in (_ROLES.get(role, role), also)), key=key)
+        if not fitting:
+            raise LogError(_refusal(named, wanted, role, [c.channel.topic for c in found], log))
+        return fitting[0]
+
+    def by_size(c: Candidate) -> tuple:
+        return -c.count, c.channel
+
+    def calibrations(image: Candidate) -> list[Candidate]:
+        return _calibrations(image, [c for c in candidates if c.role == "camera_info" and c.count])
+
+    def as_image(c: Candidate) -> tuple:
+        uncalibrated = not any(info.calibrated for info in calibrations(c)[:1])
+        sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
+        return not c.supported, sixteen_bits, uncalibrated, _partner(c, candidates, back=True) is not None, *by_size(c)
+
+    image = pick("image", as_image, "depth")
+    depth = calibration = right = right_info = None
+    if image is not None:
+        if choice.depth is not None or not choice.right:
+            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *by_size(c)), "image", image)
+        right = pick("right", by_size) if choice.right is not None else _partner(image, candidates)
+        if right is not None and depth is not None:
+            if choice.right and choice.depth:
+                raise LogError(
+                    f"{log}: depth comes from {choice.depth} or from the pair {image.channel.topic} and "
+                    f"{choice.right}, not both. Leave out --depth-topic or --right-topic."
+                )
+            right = None
+        right_info = next(iter(calibrations(right)), None) if right is not None else None
+        calibration = next(iter(calibrations(image)), None)
+        if choice.calibration_file is not None:
+            if choice.camera_info:
+                raise LogError(_two("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic"))
+            calibration = right_info = None
+        elif choice.camera_info is not None:
+            calibration = pick("camera_info", by_size)
+    if choice.odometry_file is not None:
+        if choice.odometry:
+            raise LogError(_two("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
+        choice = choice.model_copy(update={"odometry": ""})
+    asked = pick("odometry", by_size, "tf") if choice.odometry is not None else None
+    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=by_size)
+    sources = [asked] if asked else []
+    if choice.odometry is None:
+        sources = [*sorted((c for c in candidates if c.role == "odometry" and c.count), key=by_size), *moving[:1]]
+    gps = pick("gps", by_size)
+    static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
+    parts = {
+        "image": image, "depth": depth, "camera_info": calibration, "odometry": asked, "gps": gps,
+        "right": right, "right_info": right_info,
+    }  # fmt: skip
+    found = {name: part.channel for name, part in parts.items() if part is not None}
+    tf = tuple(c.channel for c in moving) if not static or any(c.role == "tf" for c in sources) else ()
+    return Selection(**found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf)
+
+
+def _partner(image: Candidate, candidates: list[Candidate], back: bool = False) -> Candidate | None:
+    """The right image topic of a pair whose left one is `image`, or back, the left one of the right."""
+    for left, right in _PAIRS:
+        here, there = (right, left) if back else (left, right)
+        name = image.channel.topic.replace(here, there)
+        if here in image.channel.topic:
+            found = [c for c in candidates if c.channel.topic == name and c.role == "image" and c.count]
+            return min(found, key=lambda c: c.channel, default=None)
+    return None
+
+
+def _calibrations(image: Candidate, infos: list[Candidate]) -> list[Candidate]:
+    """The calibrations that belong to an image, the most likely first."""
+    same_frame = [c for c in infos if c.frame and c.frame == image.frame]
+    unplaced = [
+        c for c in infos if not c.frame and "/" not in c.channel.topic.strip("/")
+    ]  # `/camera_info`, no frame_id
+    best = [c for c in infos if _above(c, image)] or same_frame or unplaced
+    return sorted(
+        best, key=lambda c: (-_shared(c, image), c.frame != image.frame, not c.calibrated, -c.count, c.channel)
+    )
+
+
+def _above(info: Candidate, image: Candidate) -> bool:
+    """The image lies in the calibration's namespace: `/cam0/camera_info` and `/cam0/image_raw/compressed`."""
+    space = info.channel.topic.strip("/").split("/")[:-1]
+    space = space[:-1] if space[-1:] == ["info"] else space  # RealSense: /Color_0/info/camera_info, /Color_0/image/data
+    return bool(space) and _shared(info, image) >= len(space)
+
+
+def _shared(a: Candidate, b: Candidate) -> int:
+    """Levels of the namespace that two topics have in common, their own names left out."""
+    x, y = (c.channel.topic.strip("/").split("/")[:-1] for c in (a, b))
+    return next((i for i, (p, q) in enumerate(zip(x, y, strict=False)) if p != q), min(len(x), len(y)))
+
+
+def _two(what: str, topic: str, file: Path, option: str) -> str:
+    return f"The {what} is either {topic} or {file}. Leave out --{option} or the file."
+
+
+def _refusal(named: list[Candidate], wanted: str, role: str, found: list[str], log: str) -> str:
+    what = f"No topic {wanted!r} in {log}." if not named else f"Topic {wanted!r} in {log} is {named[0].channel.type}."
+    if not found:
+        return f"{what} {_NAMES[role]} topics: none."
+    option = role.replace("_", "-")
+    near = nearest(wanted, sorted(found), key=lambda topic: topic.strip("/"), cutoff=0.5)
+    return f"{what}{near} {_NAMES[role]} topics: {', '.join(sorted(set(found)))}. Choose one with --{option}-topic."

@@ -1,0 +1,91 @@
+"""Where on earth the drives of a map are."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.figures.run_figures import earth_of
+from vplog.results import mcap_read, run_record, tables
+from vplog.results.geo import on_earth
+from vplog.results.shown import Earth
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Floats
+
+    Box = tuple[float, float, float, float]
+    """South, west, north, east in degrees; west of more than east crosses the antimeridian."""
+
+
+_DECIMALS = 7
+"""Of a degree: a centimetre."""
+
+
+def earth_of_run(folder: Path) -> Earth | None:
+    """As the solve found it where the run used GPS, else by the fixes that result.mcap keeps; None without three.
+
+    Raises ResultError where a file of the run is damaged.
+    """
+    known = run_record.read_run_json(folder / "run.json").get("gps")
+    fixes = (
+        mcap_read.read_fixes(folder / "result.mcap") if known is None and (folder / "result.mcap").is_file() else None
+    )
+    if known is None and fixes is None:
+        return None
+    trajectory, _ = tables.read_trajectory(folder / "trajectory.parquet")
+    return earth_of(trajectory, fixes, known)
+
+
+def earth_as_plain(earth: Earth | None, world_from_body: Floats) -> dict[str, Any] | None:
+    """As drive.json has it; with the bounds of a drive's poses (N, 4, 4), south, west, north, east in degrees."""
+    if earth is None:
+        return None
+    told = {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
+    if not len(world_from_body):
+        return told
+    where = on_earth(earth, world_from_body)[:, [1, 0]]
+    return {**told, "bounds": np.round([*where.min(0), *where.max(0)], _DECIMALS).tolist()}
+
+
+def earth_of_made(folder: Path) -> dict[str, Any] | None:
+    """Of a finished run folder what its drive.json says. Raises ResultError."""
+    earth = earth_of_run(folder)
+    return None if earth is None else earth_as_plain(earth, tables.read_keyframes(folder / "keyframes.parquet")[1])
+
+
+def bounds_of(told: Any) -> list[float] | None:
+    """South, west, north, east by drive.json; None where it does not say."""
+    bounds = told.get("bounds") if isinstance(told, dict) else None
+    return bounds if isinstance(bounds, list) and len(bounds) == 4 and all(map(is_finite, bounds)) else None
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value of a record is a number to reckon with."""
+    return isinstance(value, float | int) and abs(value) <= sys.float_info.max
+
+
+def earth_from_plain(told: Any) -> Earth | None:
+    """The way back; None where it tells none."""
+    if not isinstance(told, dict):
+        return None
+    try:
+        origin, enu_from_world = np.array(told["origin"], np.float64), np.array(told["enu_from_world"], np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    if origin.shape != (3,) or enu_from_world.shape != (4, 4) or not np.isfinite(enu_from_world).all():
+        return None
+    return Earth((float(origin[0]), float(origin[1]), float(origin[2])), enu_from_world)
+
+
+def inside(where: Floats, box: Box) -> NDArray[np.bool_]:
+    """(N,) which of the longitudes and latitudes (N, 2+) in degrees are in the box, its edges included."""
+    south, west, north, east = box
+    longitude, latitude = where[:, 0], where[:, 1]
+    along = (longitude >= west) & (longitude <= east) if west <= east else (longitude >= west) | (longitude <= east)
+    return (latitude >= south) & (latitude <= north) & along

@@ -1,0 +1,127 @@
+"""Places of an exported file, taken into a map: drives that can be found again, and no more than that.
+
+What the file does not hold stays empty: such a drive has no closures and no edges, its trajectory is that of its
+keyframes, and it is joined with no other drive, for which its log would be needed. `vplog batch` with the log makes it
+a whole one.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+from vplog.errors import LibraryError, ResultError
+from vplog.loops.verify import no_closures
+from vplog.maps.geo_bounds import earth_as_plain, earth_from_plain
+from vplog.maps.storage import drive_ids, map_store
+from vplog.pipeline import Pipeline
+from vplog.results import run_record, tables
+from vplog.results.places_map import about_map, read_drives
+from vplog.storage.remote_path import original
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    import pyarrow as pa
+
+    from vplog.maps.storage.map_store import Store
+    from vplog.results.places_map import AboutMap, DrivePlaces
+
+ALONE = "places_of"
+"""In drive.json of such a drive: the file that it is from."""
+
+
+def library_of_file(path: Path) -> str:
+    """The hash of the library that an exported file's places are described with. Raises ResultError."""
+    return about_map(path).library
+
+
+def drives_of_file(path: Path) -> dict[str, dict[str, Any]]:
+    """Of each drive in an exported file what its drive.json will say, but for its key, in order. Raises ResultError."""
+    about = about_map(path)
+    return {drive: _record(path, about, drive, told) for drive, told in about.drives.items()}
+
+
+def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[str]:
+    """Put the places of the drives that are `wanted`, by their IDs in the file, into the map under the IDs given; each
+    by its ID in the file when it is in. Raises ResultError."""
+    about, kind = about_map(path), _kind(store, path)
+    number = 0
+    for places in read_drives(path, kind):
+        if places.drive not in wanted:
+            continue
+        taken, number = wanted[places.drive], number + 1
+        made = store.staging / f"{os.getpid()}-import-{number}"
+        shutil.rmtree(made, ignore_errors=True)
+        made.mkdir()
+        record = _record(path, about, places.drive, about.drives.get(places.drive, {}))
+        _write_run(made, places, taken, about, kind)
+        earth = earth_as_plain(earth_from_plain(record["earth"]), places.world_from_body)
+        record = {**record, "drive": taken, "earth": earth}
+        run_record.write_run_json(made / "drive.json", {**record, "key": drive_ids.key_of(record | {"earth": None})})
+        map_store.publish(store, taken, made)
+        yield places.drive
+
+
+def _record(path: Path, about: AboutMap, drive: str, told: dict[str, Any]) -> dict[str, Any]:
+    inputs, topics = told.get("inputs"), told.get("topics")
+    return {
+        "drive": drive,
+        "log": f"{_where(path)}#{drive}",
+        "inputs": inputs if isinstance(inputs, dict) else {},
+        "topics": topics if isinstance(topics, dict) else {},
+        "settings": drive_ids.key_of(about.settings),
+        "library": about.library,
+        "earth": told.get("earth"),
+        ALONE: path.name,
+    }
+
+
+def _where(path: Path) -> str:
+    """Of a copy where it was."""
+    known = original(path)
+    return str(known.absolute() if known is path else known)
+
+
+def _kind(store: Store, path: Path) -> pa.DataType:
+    """The Arrow type of the descriptors of a map."""
+    library = store.head().library
+    for drive in store.drives():
+        return tables.descriptors_type(store.file(drive, "descriptors.parquet"))
+    if library is None:
+        raise LibraryError(f"{store} has no library yet, and {path} holds places alone. Add a drive first: vplog batch")
+    pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
+    return pipeline.places.load(store.library(library), 1).arrow_type
+
+
+def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap, kind: pa.DataType) -> None:
+    """The run folder of a drive of which the places alone are known."""
+    stamps, poses = places.stamp_ns, places.world_from_body
+    if not np.isfinite(poses).all() or np.any(np.diff(stamps) <= 0):
+        raise ResultError(f"{places.source}: {drive} has poses that are not finite, or stamps that do not increase.")
+    header, keyframes = tables.TableMetadata(about.settings, about.library), Keyframes(drive, stamps, poses)
+    none, kinds = np.empty(0), list[EdgeKind]()
+    rows = none.astype(np.int32)
+    graph = PoseGraph(poses, rows, rows, np.empty((0, 4, 4)), np.empty((0, 6, 6)), kinds)
+    solution = Solution(poses, none, 0.0, 0.0, 0, True, "Places alone were taken.")
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, [places.descriptors], kind, header)
+    tables.write_closures(folder / "closures.parquet", no_closures(), keyframes, header)
+    tables.write_edges(folder / "edges.parquet", graph, solution, none, header)
+    tables.write_trajectory(
+        folder / "trajectory.parquet", Trajectory(stamps, poses), Odometry(stamps, poses, None), header
+    )
+    account = {
+        "log": f"{_where(places.source)}#{drive}",
+        "finished": True,
+        "settings": about.settings,
+        "library": {"hash": about.library, "from": _where(places.source)},
+        "counts": {"keyframes": len(stamps), "candidates": 0, "verdicts": {}},
+        "warnings": [f"Places alone, from {places.source.name}."],
+    }
+    run_record.write_run_json(folder / "run.json", account)

@@ -1,0 +1,1 @@
+"""Drives of a map that share places, in one pose graph."""

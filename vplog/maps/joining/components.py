@@ -1,0 +1,174 @@
+"""The joint graph of the drives of a map that closures join, and the folder of its results.
+
+    MAP/joint.json                                     which of the folders below count; replaced as a whole
+    MAP/joint/component=KEY/component.json             drives, what holds them together, what was learned of odometry
+    MAP/joint/component=KEY/graph.g2o                  the graph, solved; keyframes drive after drive
+    MAP/joint/component=KEY/joins.parquet              the ledger of all candidates between its drives, as judged
+    MAP/joint/component=KEY/drive=ID/keyframes.parquet, trajectory.parquet
+                                                       of each drive, in the frame of the component's first
+
+KEY stands for all that the folder is made from, so one that a new drive does not touch stays as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.cache.code_hash import code_of
+from vplog.errors import ResultError
+from vplog.graph.build import parts
+from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.drive_ids import key_of
+from vplog.results import g2o, run_record, tables
+from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from vplog.data import Closures, Odometry
+    from vplog.graph.refine import Refined
+    from vplog.pipeline import Pipeline
+
+
+@dataclass(frozen=True)
+class Tie:
+    """A pair of drives with a ledger."""
+
+    later: str
+    earlier: str
+    path: Path
+    """Table of the ledger."""
+    key: str
+    """sha256 over all that the ledger depends on."""
+    verified: int
+
+
+@dataclass(frozen=True)
+class Group:
+    """Drives that verified closures join, if the solve does not think otherwise."""
+
+    drives: tuple[str, ...]
+    """In the map's order."""
+    ties: tuple[Tie, ...]
+    """All between them, those of few closures too."""
+    key: str
+    """sha256 over all that the solve depends on."""
+
+
+def _settings(pipeline: Pipeline) -> dict[str, Any]:
+    """Those that the solve of a group depends on."""
+    chosen = {name: getattr(pipeline, name).model_dump(mode="json") for name in ("solve", "refine")}
+    return {**chosen, "join": pipeline.join.model_dump(mode="json", include={"least_closures", "spacing"})}
+
+
+def groups_of(order: Sequence[str], keys: dict[str, str], ties: Sequence[Tie], pipeline: Pipeline) -> list[Group]:
+    """The groups of two drives and more, in the order of their first ones. `keys` are those of drive.json."""
+    at = {drive: number for number, drive in enumerate(order)}
+    good = [tie for tie in ties if tie.verified >= pipeline.join.least_closures]
+    number = parts(
+        len(order), np.array([at[t.earlier] for t in good], np.int64), np.array([at[t.later] for t in good], np.int64)
+    )
+    code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
+    found = []
+    for one, count in enumerate(np.bincount(number, minlength=1)):
+        if count < 2:
+            continue
+        drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
+        inside = set(drives)
+        own = tuple(
+            sorted(
+                (tie for tie in ties if tie.later in inside and tie.earlier in inside),
+                key=lambda tie: (at[tie.later], at[tie.earlier]),
+            )
+        )
+        made_from = {
+            "drives": [[drive, keys[drive]] for drive in drives],
+            "ledgers": [[tie.later, tie.earlier, tie.key] for tie in own],
+            "settings": _settings(pipeline),
+            "code": code,
+        }
+        found.append(Group(drives, own, key_of(made_from)))
+    return found
+
+
+def solve_group(
+    group: Group, runs: Mapping[str, Path], pipeline: Pipeline, library: str, staging: Path
+) -> dict[str, Any]:
+    """Solve a group, and make a folder in `staging` for each component that comes of it.
+
+    Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Raises GraphError
+    where it cannot be solved, and ResultError where a drive's folder is damaged.
+    """
+    drives = []
+    for drive in group.drives:
+        with reading_drive(drive):
+            drives.append(_drive(drive, runs[drive]))
+    at = {drive: number for number, drive in enumerate(group.drives)}
+    ledgers = {(at[tie.later], at[tie.earlier]): _ledger(tie) for tie in group.ties}
+    joined, ledgers = solve_drives(drives, ledgers, pipeline)
+    header, components = tables.TableMetadata(_settings(pipeline), library), []
+    for members, refined in joined.solved.items():
+        names = [group.drives[member] for member in members]
+        folder = f"component={key_of({'group': group.key, 'drives': names})[:16]}"
+        made = staging / folder
+        made.mkdir(parents=True, exist_ok=True)
+        g2o.write_g2o(made / "graph.g2o", refined.graph, refined.solution.world_from_body)
+        for name, member in zip(names, members, strict=True):
+            (made / runs[name].name).mkdir(exist_ok=True)
+            write_drive(made / runs[name].name, "", drives[member], joined.world_from_body[member], header)
+        inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
+        write_ledgers(made / "joins.parquet", drives, inside, header)
+        joins = [pair_record(group.drives[pair[0]], group.drives[pair[1]], one) for pair, one in inside.items()]
+        run_record.write_run_json(made / "component.json", _record(group, names, joins, refined))  # last: it is whole
+        components.append({"folder": folder, "drives": names})
+    apart = [
+        {"query_drive": group.ties[pair].later, "match_drive": group.ties[pair].earlier, "reason": reason.strip()}
+        for pair, reason in sorted(joined.apart.items())
+    ]
+    return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
+
+
+def _drive(name: str, run: Path) -> SolvedDrive:
+    """A drive from its run folder. Raises ResultError."""
+    keyframes, poses = tables.read_keyframes(run / "keyframes.parquet")
+    graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
+    odometry = run_record.read_run_json(run / "run.json").get("odometry")
+    factor = odometry.get("sigma_factor") if isinstance(odometry, dict) else None
+    if not isinstance(factor, int | float) or not factor > 0:
+        raise ResultError(f"{run}/run.json lacks odometry.sigma_factor. Run `vplog batch` with the drive's log again.")
+
+    def read_odometry() -> Odometry:
+        with reading_drive(name):
+            return tables.read_trajectory(run / "trajectory.parquet")[1]
+
+    own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"), float(factor))
+    return SolvedDrive(keyframes, own, read_odometry)
+
+
+def _ledger(tie: Tie) -> Closures:
+    ledger = tables.read_joins(tie.path).get((tie.later, tie.earlier))
+    if ledger is None:
+        raise ResultError(f"{tie.path} is not of {tie.later} in {tie.earlier}. Move it out of the map, and run again.")
+    return ledger
+
+
+def _record(group: Group, drives: Sequence[str], joins: Sequence[dict[str, Any]], refined: Refined) -> dict[str, Any]:
+    """component.json."""
+    solution = refined.solution
+    return {
+        "drives": drives,
+        "joins": joins,
+        "solution": {
+            "error_before": solution.error_before,
+            "error_after": solution.error_after,
+            "iterations": solution.iterations,
+            "converged": solution.converged,
+            "reason": solution.reason,
+        },
+        "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
+        "made_from": group.key,
+    }

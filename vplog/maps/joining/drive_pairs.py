@@ -1,0 +1,244 @@
+"""Closures between two drives of a map: a task that any process can do, and the file that keeps what came of it.
+
+    MAP/joins/drive=NEW/camera.json          the drive's camera, for those that come after it
+    MAP/joins/drive=NEW/features.parquet     the features of its keyframes for verification, likewise
+    MAP/joins/drive=NEW/match=OLD.parquet    the ledger of its keyframes in a drive before it
+    MAP/joins/drive=NEW/joins.json           after which drives it came, and which of them it was verified against
+
+What two drives have in common lies with the one that came later, so a new drive touches no folder but its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from vplog.cache.code_hash import code_of
+from vplog.data import Verdict
+from vplog.errors import ResultError
+from vplog.maps.joining.drive_features import CameraTrust, camera_trust, keep_features, opened_drive
+from vplog.maps.storage.drive_ids import key_of
+from vplog.maps.storage.layout import folder_name, quoted
+from vplog.results import run_record, tables
+from vplog.sessions.inter_session import closures_between, with_shared
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Closures, SharedReferences
+    from vplog.loops.propose import Proposals
+    from vplog.maps.joining.members import Member
+    from vplog.maps.storage.map_store import Store
+    from vplog.pipeline import Pipeline
+
+
+_CODE = ("vplog.sessions.inter_session", "vplog.features.extraction", "vplog.features.sift", "vplog.results.tables")
+"""Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
+less than another search of all drives is worth, and drive.json has them."""
+KEPT = ("camera.json", "features.parquet")
+"""Files that depend on the drive alone, not on its name or the other drives."""
+_SEARCH = "vplog.maps.joining.candidate_drives"
+"""The module that chooses the drives that one is searched in."""
+
+
+@dataclass(frozen=True)
+class PairTask:
+    """Candidates of one drive in another to verify, as they go to another process or machine."""
+
+    later: Member
+    earlier: Member
+    later_camera: CameraTrust
+    earlier_camera: CameraTrust
+    proposals: Proposals
+    shared: SharedReferences
+    """One row for each proposal."""
+    pipeline: Pipeline
+    library: str
+    threads: int
+
+    @property
+    def key(self) -> str:
+        """sha256 over all that the ledger depends on."""
+        proposed = [getattr(self.proposals, name).tolist() for name in ("query", "match", "rank", "score", "support")]
+        members = [
+            [one.drive, one.key, asdict(camera)]
+            for one, camera in ((self.later, self.later_camera), (self.earlier, self.earlier_camera))
+        ]
+        return key_of({"members": members, "proposed": proposed, **depends(self.pipeline)})
+
+
+def depends(pipeline: Pipeline) -> dict[str, Any]:
+    """The settings and the code that the closures between two drives depend on, beside the drives."""
+    settings = {name: getattr(pipeline, name).model_dump(mode="json") for name in ("propose", "sequence", "verify")}
+    settings["join"] = pipeline.join.model_dump(mode="json", exclude={"keep_features"})
+    return {"settings": settings, "code": code_of(*_CODE)["code"]}
+
+
+def compute_pair(task: PairTask) -> bytes:
+    """The table of the ledger, the same on any machine and any number of threads.
+
+    Raises LogError where features have to be extracted again and a log is gone or another one.
+    """
+    verify, threads = task.pipeline.verify, task.threads
+    with (
+        opened_drive(task.later, task.later_camera, verify, threads) as (later, of_later),
+        opened_drive(task.earlier, task.earlier_camera, verify, threads) as (earlier, of_earlier),
+    ):
+
+        def fetch(queries: Any, matches: Any) -> None:
+            of_later(queries)
+            of_earlier(matches)
+
+        share = max(task.later_camera.rotation_share, task.earlier_camera.rotation_share)
+        ledger = closures_between(
+            task.proposals, later, earlier, task.pipeline.join, share, threads, fetch=fetch
+        )  # fmt: skip
+        ledger = with_shared(ledger, task.proposals, task.shared)
+        header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
+        return tables.joins_as_bytes([(later.keyframes, earlier.keyframes, ledger)], header, task.key)
+
+
+def compute_camera(member: Member, pipeline: Pipeline, threads: int) -> CameraTrust:
+    """The camera of a drive, as a task; features in the cache of its run are stored for later drives."""
+    if pipeline.join.keep_features:
+        keep_features(member, pipeline.verify)
+    return camera_trust(member, pipeline.verify, threads)
+
+
+def folder_of(store: Store, drive: str) -> Path:
+    return store.root / "joins" / folder_name(drive)
+
+
+def ledger_path(store: Store, later: str, earlier: str) -> Path:
+    return folder_of(store, later) / f"match={quoted(earlier)}.parquet"
+
+
+def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
+    """Write the table of `compute_pair` as a whole. Raises ResultError."""
+    path = ledger_path(store, task.later.drive, task.earlier.drive)
+    _make(path.parent)
+    with replacing(path) as stream:
+        stream.write(data)
+
+
+def is_stored(store: Store, task: PairTask) -> bool:
+    """Whether the ledger is stored, made from the same."""
+    path = ledger_path(store, task.later.drive, task.earlier.drive)
+    try:
+        return path.is_file() and tables.read_metadata(path).get("vplog.made_from") == task.key
+    except ResultError:  # damaged: it is computed again
+        return False
+
+
+def read_ledger(store: Store, later: str, earlier: str) -> Closures | None:
+    """The ledger of a pair; None where it has no row. Raises ResultError."""
+    return tables.read_joins(ledger_path(store, later, earlier)).get((later, earlier))
+
+
+def made_from(store: Store, later: str, earlier: str) -> str:
+    """Key of the stored ledger of a pair. Raises ResultError."""
+    return tables.read_metadata(ledger_path(store, later, earlier)).get("vplog.made_from", "")
+
+
+def verified(ledger: Closures | None) -> int:
+    return 0 if ledger is None else sum(verdict is Verdict.ACCEPTED for verdict in ledger.verdict)
+
+
+def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrust | None:
+    """The stored camera of a drive, unless it was made from something else."""
+    record = _read(folder_of(store, member.drive) / "camera.json")
+    if record.get("made_from") != _camera_key(member, pipeline):
+        return None
+    try:
+        return CameraTrust(dict(record["camera"]), float(record["rotation_share"]))
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def put_camera(store: Store, member: Member, pipeline: Pipeline, camera: CameraTrust) -> None:
+    folder = folder_of(store, member.drive)
+    _make(folder)
+    record = {"drive": member.drive, **asdict(camera), "made_from": _camera_key(member, pipeline)}
+    run_record.write_run_json(folder / "camera.json", record, checksum=True)
+
+
+def _camera_key(member: Member, pipeline: Pipeline) -> str:
+    verify = pipeline.verify.model_dump(mode="json")
+    return key_of(
+        {
+            "member": member.key,
+            "verify": verify,
+            "code": code_of("vplog.loops.verify", "vplog.features.extraction")["code"],
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Joins:
+    """joins.json: after which drives one came, and which of them it was verified against."""
+
+    position: int
+    """Increases from drive to drive: by ID within a batch. It stays while the drive stays what it is."""
+    member: str
+    """Key of the drive that has it."""
+    made_from: str = ""
+    """sha256 over what the pairs depend on, beside the drives before it; empty as long as they are not all there."""
+    pairs: tuple[dict[str, Any], ...] = ()
+    """`match`, `match_key` (the drive's), `candidates`, `verified`, and `ledger`, its key, empty where it is
+    left out; `reason` then says why."""
+
+
+def search_code() -> str:
+    """sha256 over the code that chooses what is verified, and verifies it; read once, which takes half a second."""
+    return code_of(*_CODE, _SEARCH)["code"]
+
+
+def search_key(member: Member, pipeline: Pipeline) -> str:
+    """sha256 over what a drive's joins depend on, beside the drives before it."""
+    return key_of({"member": member.key, **depends(pipeline), "search": search_code()})
+
+
+def read_joins(store: Store, drive: str) -> Joins | None:
+    record = _read(folder_of(store, drive) / "joins.json")
+    position, member, made_from, pairs = (record.get(name) for name in ("position", "member", "made_from", "pairs"))
+    if not (isinstance(position, int) and isinstance(member, str) and isinstance(made_from, str)):
+        return None
+    wanted = {"match": str, "match_key": str, "candidates": int, "verified": int, "ledger": str}
+    if not isinstance(pairs, list) or any(
+        not isinstance(pair, dict) or any(not isinstance(pair.get(name), kind) for name, kind in wanted.items())
+        for pair in pairs
+    ):
+        return Joins(position, member)
+    return Joins(position, member, made_from, tuple(pairs))
+
+
+def put_joins(store: Store, drive: str, joins: Joins) -> None:
+    folder = folder_of(store, drive)
+    _make(folder)
+    run_record.write_run_json(folder / "joins.json", {"drive": drive, **asdict(joins)}, checksum=True)
+
+
+def forget(store: Store, drive: str, but: set[str]) -> None:
+    """Remove the ledgers of a drive in other drives than these, and files that a killed writer left."""
+    folder = folder_of(store, drive)
+    known = {ledger_path(store, drive, earlier) for earlier in but}
+    for path in set(folder.glob("match=*.parquet")) - known:
+        path.unlink(missing_ok=True)
+    for path in folder.glob(".*.part"):
+        path.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A record; empty where there is none or a damaged one, which is written again."""
+    try:
+        return run_record.read_run_json(path)
+    except ResultError:
+        return {}
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"Cannot make the folder {folder}: {error.strerror}.") from None

@@ -1,0 +1,1 @@
+"""Places of a map that look like a query, exactly and by index."""

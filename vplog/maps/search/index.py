@@ -1,0 +1,242 @@
+"""The index of a map on disk: segments, of which each holds the places of some drives.
+
+It grows as a log-structured index does: new drives make a new segment, which takes in those not larger than itself, so
+that there are few of them and a place is written again only as often as the map doubles. A segment says whose places
+it has, by content: which ones serve is told from what lies in MAP/index alone, and no list can be out of date. The
+folder may be removed at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+
+from vplog.errors import LibraryError, ResultError
+from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
+from vplog.maps.storage.damage import DamagedDriveError, reading_drive
+from vplog.maps.storage.layout import ADD_AGAIN
+from vplog.maps.storage.map_store import other_library
+from vplog.results import tables
+from vplog.storage.parquet_limits import check_file
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from vplog.data import Int32s
+    from vplog.maps.storage.map_store import Store
+    from vplog.stages import CodedState
+
+    Progress = Callable[[str, int, int], None]
+
+CAPACITY = 1 << 20
+"""Places of a segment, unless a single drive has more: some 140 MB, and while it is made twice that in memory."""
+_LEFT_OVER_S = 86_400.0
+"""A half-written file of a process that was killed goes after a day: none takes that long."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A segment as a search uses it."""
+
+    segment: Segment
+    path: Path | None
+    """None where it is in memory alone."""
+    numbers: Int32s
+    """(D,) number of each of its drives in the map; -1 where the map has it no more, or another part has it."""
+
+    @property
+    def places(self) -> int:
+        """Those that count."""
+        return int(np.diff(self.segment.first)[self.numbers >= 0].sum())
+
+
+def update_index(
+    store: Store,
+    drives: Mapping[str, Mapping[str, Any]],
+    library: str,
+    state: CodedState,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> tuple[list[Part], list[str]]:
+    """The parts that together have every place of the drives once, and what was wrong.
+
+    What is missing is made and written; what no drive needs any more is removed. A map that cannot be written to is
+    indexed in memory. Raises ResultError or LibraryError where descriptors cannot be read or are of another library.
+    """
+    with ThreadPoolExecutor(threads) as pool:
+        wanted = list(pool.map(lambda drive: content_of(store, drive, drives[drive]["key"]), drives))
+    known, useless, warnings = _open_all(store, library, state)
+    parts, missing = _cover(known, wanted)
+    absorbed, groups = _plan(parts, missing, {one: store.rows("descriptors", one.drive) for one in missing})
+    parts = [part for part in parts if part not in absorbed]
+    numbers = {one: number for number, one in enumerate(wanted)}
+    done = 0
+    for group in groups:
+        segment, path = _build(store, group, library, state, threads), None
+        try:
+            path = write_segment(store.index, segment)
+            segment = open_segment(path)
+        except (ResultError, OSError) as error:
+            path = None
+            warnings += [] if done else [f"The index is not stored, so every query builds it again. {error}"]
+        parts.append(Part(segment, path, np.array([numbers[one] for one in group], np.int32)))
+        done += len(group)
+        progress("index", done, sum(map(len, groups)))
+    used = {part.path for part in parts}
+    if all(part.path for part in parts):
+        _remove([path for path in [*useless, *(path for _, path in known)] if path not in used], store)
+    return parts, warnings
+
+
+def _in_cache(store: Store) -> bool:
+    """Whether the index is kept where nothing is taken on trust."""
+    return store.mirror is not None and store.mirror.cache is not None
+
+
+def content_of(store: Store, drive: str, key: str) -> Content:
+    """What a drive holds now; on an object store as its manifest says. Raises ResultError."""
+    if store.mirror is not None and (mark := store.mirror.digest(drive, "descriptors.parquet")):
+        return Content(drive, key, mark)
+    with reading_drive(drive):
+        return Content(drive, key, _footer_hash(_descriptors(store, drive)))
+
+
+def _footer_hash(path: Path) -> str:
+    try:
+        check_file(path)
+        with path.open("rb") as stream:
+            size = stream.seek(0, 2)
+            stream.seek(max(size - 8, 0))
+            end = stream.read(8)
+            length = int.from_bytes(end[:4], "little")  # of the footer, as Parquet ends
+            if end[4:] != b"PAR1" or length > size - 8:
+                raise ResultError(f"{path} is damaged. Copy it back, or {ADD_AGAIN}")
+            stream.seek(size - 8 - length)
+            return hashlib.sha256(stream.read(length)).hexdigest()
+    except OSError as error:
+        raise ResultError(
+            f"{path} cannot be read: {error.strerror or error}. Check its permissions, or {ADD_AGAIN}"
+        ) from None
+
+
+def _descriptors(store: Store, drive: str) -> Path:
+    return store.file(drive, "descriptors.parquet")
+
+
+def _open_all(
+    store: Store, library: str, state: CodedState
+) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
+    """The segments that fit the library, the files that are of no use, and why the damaged ones are not."""
+    known, useless, warnings = [], [], []
+    shape = state.shape
+    for path in sorted(store.index.glob(f"*{SUFFIX}")):
+        try:
+            segment = open_segment(path)
+            if _in_cache(store):
+                with suppress(OSError):
+                    os.utime(path)  # what was not used for longest goes first
+        except FileNotFoundError:  # another process has put it into a larger one
+            continue
+        except ResultError as error:
+            useless.append(path)
+            warnings += [] if _in_cache(store) else [f"{error} It was left out."]  # there it costs time alone
+            continue
+        fits = segment.library == library
+        if fits and (segment.lists.start.shape[0], segment.lists.boxes.shape[1]) == shape:
+            known.append((segment, path))
+        else:
+            useless.append(path)
+    return known, useless, warnings
+
+
+def _cover(known: Sequence[tuple[Segment, Path]], wanted: Sequence[Content]) -> tuple[list[Part], list[Content]]:
+    """Every drive from one segment, the largest that has it; and the drives that none has."""
+    left = {one: number for number, one in enumerate(wanted)}
+    parts = []
+    for segment, path in sorted(known, key=lambda one: (-len(one[0]), one[1].name)):
+        numbers = np.array([left.pop(one, -1) for one in segment.contents], np.int32)
+        if np.any(numbers >= 0):
+            parts.append(Part(segment, path, numbers))
+    return parts, list(left)
+
+
+def _plan(
+    parts: Sequence[Part], missing: Sequence[Content], places: dict[Content, int]
+) -> tuple[list[Part], list[list[Content]]]:
+    """Which parts are put into new ones, and the drives of each new one, in order of IDs."""
+    absorbed, total = [], sum(places[one] for one in missing)
+    for part in sorted(parts, key=lambda part: part.places):
+        mostly_gone = 2 * part.places < len(part.segment)
+        small = part.places <= min(total, CAPACITY // 2)
+        if mostly_gone or small:
+            absorbed.append(part)
+            total += part.places
+            counts = np.diff(part.segment.first).tolist()
+            alive = zip(part.segment.contents, counts, part.numbers.tolist(), strict=True)
+            places |= {one: count for one, count, number in alive if number >= 0}
+    groups: list[list[Content]] = []
+    held = CAPACITY + 1
+    for one in sorted(places):
+        if held + places[one] > CAPACITY:
+            groups.append([])
+            held = 0
+        groups[-1].append(one)
+        held += places[one]
+    return absorbed, groups
+
+
+def _build(store: Store, group: Sequence[Content], library: str, state: CodedState, threads: int) -> Segment:
+    def read(one: Content) -> pa.Array:
+        path = _descriptors(store, one.drive)
+        with reading_drive(one.drive):
+            column, made_by = tables.read_descriptors(path)
+            if made_by != library:
+                raise LibraryError(other_library(store, one.drive, made_by, library))
+        if content_of(store, one.drive, one.key) != one:
+            raise ResultError(f"{path} was replaced while it was read. Run again.")
+        return as_described(store, one.drive, column, state)
+
+    with ThreadPoolExecutor(threads) as pool:
+        columns = list(pool.map(read, group))
+    first = np.array(list(accumulate(map(len, columns), initial=0)), np.int64)
+    try:
+        lists = state.lists(*columns)
+    except LibraryError:
+        for one, column in zip(group, columns, strict=True):  # whose they are
+            with reading_drive(one.drive):
+                state.lists(column)
+        raise
+    return Segment(library, tuple(group), first, lists)
+
+
+def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.Array:
+    """A drive's descriptors in the type of the recogniser. Raises ResultError where they are of another one."""
+    try:
+        return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
+    except pa.ArrowException:
+        raise DamagedDriveError(
+            f"{_descriptors(store, drive)} is of another recogniser. Where it should not be, {ADD_AGAIN}", drive
+        ) from None
+
+
+def _remove(paths: Sequence[Path], store: Store) -> None:
+    """Who has them open keeps them. A file that cannot be removed does no harm."""
+    parts = list(store.index.glob(".*.part"))
+    for path in [*paths, *parts]:
+        try:
+            if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
+                path.unlink(missing_ok=True)
+        except (FileNotFoundError, IsADirectoryError):  # whoever wrote it has just renamed it; or it is none of ours
+            continue
+        except OSError:
+            return

@@ -1,0 +1,249 @@
+"""Where in a map the views of a log are."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import logs
+from vplog.errors import LibraryError, LogError, ResultError
+from vplog.features.extraction import extract_frames, map_in_order, one_thread_each
+from vplog.maps.search.exact import best_places
+from vplog.maps.search.index import update_index
+from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
+from vplog.maps.storage import map_store
+from vplog.maps.storage.damage import left_out, reading_drive, without_damaged
+from vplog.pipeline import Pipeline
+from vplog.places.sequence import SequenceSettings
+from vplog.results import tables
+from vplog.results.placed import placed_table, write_placed
+from vplog.run.keyframes import select_keyframes
+from vplog.stages import CodedState
+from vplog.storage.remote_path import RemotePath
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from concurrent.futures import Executor
+    from pathlib import Path
+
+    import pyarrow as pa
+
+    from vplog.data import Ints
+    from vplog.maps.search.index import Part
+    from vplog.maps.search.top_k import Answers
+    from vplog.maps.storage.download_cache import Cache
+    from vplog.maps.storage.map_store import Store
+    from vplog.stages import Log, PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+def query_map(
+    root: Path,
+    path: Path,
+    topics: logs.TopicChoice | None = None,
+    top: int = 10,
+    sequence: int | None = None,
+    out: Path | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+    executor: Executor | None = None,
+    cache: Cache | None = None,
+) -> dict[str, Any]:
+    """The `top` places of the map that are most like each view of a log, in `out` too where given.
+
+    Views are chosen and described as the map's drives were, with its library. With `sequence` views in a window (None:
+    as the map's settings say; 1: each view for itself) lines run within a drive. With an executor its workers search
+    the map; they must see its folder. With a cache a map on an object store is read from there, but for its manifests.
+    Raises VplogError with one line.
+    """
+    if out is not None and not out.parent.is_dir():  # before any work
+        raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
+    if out is not None and out.is_dir():
+        raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
+    with map_store.reading(root, cache) as store:
+        _, pipeline, state = open_map(store, threads)
+        settings = pipeline.sequence
+        if sequence is not None:
+            settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
+        log = logs.open(path, topics)
+        stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
+
+        def look() -> tuple[list[str], Answers, list[str], pa.Table]:
+            drives = map_store.one_library(store)[1]
+            short = _short(store, drives, settings.length)
+            answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
+            return list(drives), answers, short + told, _table(store, list(drives), answers, stamps)
+
+        drives, answers, told, table = without_damaged(store, look)
+        warnings += left_out(store)
+    if out is not None:
+        pipeline = pipeline.model_copy(update={"sequence": settings})
+        write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
+    return {
+        "map": str(root),
+        "log": str(path),
+        "library": state.hash,
+        "top": top,
+        "sequence": settings.length,
+        "written": None if out is None else str(out),
+        "views": len(stamps),
+        "answered": int((answers.count > 0).sum()),
+        "best_by_drive": {
+            drive: int((answers.drive[answers.count > 0, :1] == number).sum()) for number, drive in enumerate(drives)
+        },
+        "warnings": log.warnings + warnings + told,
+        "answers": table.to_pylist(),
+    }
+
+
+def index_map(
+    root: Path, threads: int = 1, progress: Progress = lambda *_: None, cache: Cache | None = None
+) -> dict[str, Any]:
+    """Bring the index of a map up to its drives, which the next query would do; that of a map on an object store in
+    the cache. Raises VplogError with one line."""
+    if isinstance(root, RemotePath) and cache is None:
+        raise ResultError(f"The index of {root} is stored in a cache only, and there is none. Name one with --cache.")
+    with map_store.reading(root, cache) as store:
+        _, _, state = open_map(store, threads)
+        if not isinstance(state, CodedState):
+            raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
+
+        def update() -> tuple[dict[str, Any], list[Part], list[str]]:
+            drives = map_store.one_library(store)[1]
+            return drives, *update_index(store, drives, state.hash, state, threads, progress)
+
+        drives, parts, warnings = without_damaged(store, update)
+        files = [part.path for part in parts if part.path is not None]
+        return {
+            "map": str(root),
+            "drives": list(drives),
+            "places": sum(part.places for part in parts),
+            "segments": [str(path) for path in files],
+            "bytes": sum(path.stat().st_size for path in files),
+            "warnings": left_out(store) + warnings,
+        }
+
+
+def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pipeline, PlaceState]:
+    """The drives of a map, its settings, and the library that describes its places. Raises VplogError."""
+    library, drives = map_store.one_library(store)
+    pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
+    folder = store.library(library)
+    if not (folder / "library.json").is_file():
+        raise LibraryError(
+            f"{store} has lost its library {library}. Copy it back to {folder}, or describe the map again: vplog "
+            f"map redescribe {store} --library LIB -o MAP"
+        )
+    return drives, pipeline, pipeline.places.load(folder, threads)
+
+
+def describe_log(
+    log: Log, pipeline: Pipeline, state: PlaceState, threads: int, progress: Progress = lambda *_: None
+) -> tuple[Ints, list[Any], list[str]]:
+    """Stamps (Q,) and descriptors of the keyframes of a log, and what was lost; of all frames without odometry.
+
+    A descriptor takes some hundred bytes, and no image or feature is kept.
+    """
+    odometry, stamps, warnings = log.odometry(), log.stamps(), []
+    if odometry is not None and len(odometry.stamp_ns) > 1:
+        keyframes, warnings = select_keyframes(log.name, stamps, odometry, pipeline.keyframes)
+        stamps = keyframes.stamp_ns
+    else:
+        warnings.append(f"{log.name} has no odometry, so every frame is a query.")
+    frames = extract_frames(log.frames(stamps), pipeline.features, threads, pipeline.stereo)
+
+    def describe(found: Any) -> tuple[int, Any, str]:
+        stamp_ns, _, features, why = found
+        return stamp_ns, None if features is None else state.describe(features), why
+
+    seen, descriptors, lost = [], [], []
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        for stamp_ns, descriptor, why in map_in_order(pool, describe, frames, ahead=4 * threads):
+            if descriptor is None:
+                lost.append(why)
+            else:
+                seen.append(stamp_ns)
+                descriptors.append(descriptor)
+            progress("describe", len(seen) + len(lost), len(stamps))
+    if not seen:
+        raise LogError(f"{log.name}: none of {len(stamps)} frames could be decoded. {' '.join(lost[:1])}")
+    if lost:
+        warnings.append(f"{len(lost)} of {len(stamps)} views were lost to damaged images. First: {lost[0]}")
+    return np.array(seen, np.int64), descriptors, warnings
+
+
+def search(
+    store: Store,
+    drives: Mapping[str, Mapping[str, Any]],
+    state: PlaceState,
+    descriptors: Sequence[Any],
+    top: int,
+    settings: SequenceSettings,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+    executor: Executor | None = None,
+) -> tuple[Answers, list[str]]:
+    """The `top` best places of all drives for each of Q views in order, and what the user should know of them.
+
+    Ties go to the earlier drive, then row. Single views are ranked exactly, by the map's index where the recogniser is
+    `bobb`. Lines are drawn in every drive of a map of up to EXACT_PLACES, else in the likely ones (`sequences.py`).
+    """
+    numbered = dict(enumerate(drives))
+    if not isinstance(state, CodedState):
+        top = min(top, sum(store.rows("descriptors", drive) for drive in drives))
+        told = [] if executor is None else ["Ray was not used: a map of another recogniser than bobb is searched here."]
+        return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
+    parts, told = update_index(store, drives, state.hash, state, threads, progress)
+    if store.mirror is not None:  # workers elsewhere do not see these files
+        parts = [replace(part, path=None) for part in parts]
+    places = sum(part.places for part in parts)
+    top = min(top, places)
+    if settings.length == 1:
+        return best_places(parts, state, descriptors, top, threads, executor, progress), told
+    if places > EXACT_PLACES:
+        single = best_places(parts, state, descriptors, PLACES_A_VIEW, threads, executor, progress)
+        numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
+        told.append(f"Sequences were searched in the {len(numbered)} of {len(drives)} drives most like single views.")
+    elif executor is not None:
+        told.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
+    return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
+
+
+def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
+    """What to do where a window of views is longer than drives: of what is usual in them there is too little."""
+    short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
+    if not short:
+        return []
+    more = f" and {len(short) - 1} more have" if len(short) > 1 else " has"
+    return [
+        f"{short[0]}{more} fewer places than the window of {length} views, so matches there are missed. Search "
+        "single views: --sequence 1"
+    ]
+
+
+def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:
+    """One row for every answer."""
+    there = np.arange(answers.score.shape[1]) < answers.count[:, None]
+    query, rank = np.nonzero(there)
+    number, keyframe = answers.drive[there], answers.keyframe[there]
+    stamp = np.empty(len(query), np.int64)
+    numbers: list[int] = number.tolist()
+    for one in set(numbers):
+        path = store.file(drives[one], "descriptors.parquet")
+        with reading_drive(drives[one]):
+            known = tables.read_stamps(path)
+        rows = keyframe[number == one]
+        if rows.max() >= len(known):
+            raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
+        stamp[number == one] = known[rows]
+    names = [drives[one] for one in numbers]
+    return placed_table(
+        [
+            query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,
+            answers.score[there], answers.support[there],
+        ]
+    )  # fmt: skip

@@ -1,0 +1,215 @@
+"""A part of a map's index in one file: the inverted lists of some drives, read in place by any number of processes.
+
+    8 bytes      magic
+    8 bytes      length of the header, little endian
+    header       JSON: format, library, block, references, windows, entries, and the drives with their places
+    arrays       those of `CodeLists`, little endian, each from a multiple of 64 bytes on; zeros between
+    4 bytes      CRC-32 of all before, little endian: it is summed up at 2.6 GB/s, sha256 at an eighth of that
+
+The header tells the size of every array, so a file is as long as its header says or it is refused. It is named by the
+hash of its header: drives of the same content make the same file under the same name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.errors import ResultError
+from vplog.places.code_lists import MOST_ROWS, CodeLists, check_lists
+from vplog.results.run_record import canonical_json
+from vplog.storage.parquet_limits import check_file
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.data import Ints
+
+SUFFIX = ".lists"
+_MAGIC = b"vplists\n"
+_FORMAT = 2
+_CRC_BYTES = 4
+_ALIGNED = 64
+"""Bytes; a line of the cache, and more than any number needs."""
+_MOST_REFERENCES = 65_535
+"""A reference's number has 16 bits, and the last one is none."""
+_MOST_WINDOWS = 256
+"""16 windows along each side, as the settings have it."""
+
+
+@dataclass(frozen=True, order=True)
+class Content:
+    """Whose places a segment holds: a drive as it was when they were read."""
+
+    drive: str
+    key: str
+    """Of drive.json: hash of all that the drive was made from."""
+    mark: str
+    """Hash of the footer of its descriptors.parquet, which tells another table even where the key is the same; on an
+    object store that of the whole file, which its manifest has."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Places of some drives, in the order of `contents`."""
+
+    library: str
+    contents: tuple[Content, ...]
+    first: Ints
+    """(D + 1,) row of each drive's first place, and the number of all."""
+    lists: CodeLists
+
+    def __len__(self) -> int:
+        return len(self.lists)
+
+    @property
+    def header(self) -> bytes:
+        places = np.diff(self.first).tolist()
+        record = {
+            "format": _FORMAT,
+            "library": self.library,
+            "block": self.lists.block,
+            "references": self.lists.start.shape[0],
+            "windows": self.lists.boxes.shape[1],
+            "entries": len(self.lists.offset),
+            "drives": [{**asdict(one), "places": count} for one, count in zip(self.contents, places, strict=True)],
+        }
+        return canonical_json(record).encode()
+
+    @property
+    def name(self) -> str:
+        return hashlib.sha256(self.header).hexdigest()[:32] + SUFFIX
+
+
+def write_segment(folder: Path, segment: Segment) -> Path:
+    """Write a segment under its name, whole or not at all. Raises ResultError where the folder cannot be written."""
+    path = folder / segment.name
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe. Move it away.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"Cannot write {folder}: {error.strerror}.") from None
+    with replacing(path) as stream:
+        total = 0
+        for block in _blocks(segment):
+            total = zlib.crc32(block, total)
+            stream.write(block)
+        stream.write(total.to_bytes(_CRC_BYTES, "little"))
+    return path
+
+
+def _blocks(segment: Segment) -> Iterator[bytes | memoryview]:
+    """What its file holds, but for the checksum."""
+    header = segment.header
+    yield (start := _MAGIC + len(header).to_bytes(8, "little") + header)
+    at = len(start)
+    for part in segment.lists.parts:
+        yield bytes(-at % _ALIGNED)
+        at += -at % _ALIGNED
+        if part.size:  # an array of none has no bytes to look at
+            yield (data := np.ascontiguousarray(part, part.dtype.newbyteorder("<")).data.cast("B"))
+            at += len(data)
+
+
+def open_segment(path: Path) -> Segment:
+    """A segment whose arrays stay in the file, which is read through once for its checksum.
+
+    The file may be anyone's: sizes are held to that of the file, and what kernels follow is looked at. Raises
+    ResultError where it is no segment or a damaged one, and FileNotFoundError where it is gone.
+    """
+    try:
+        check_file(path)
+        with path.open("rb") as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            start = stream.read(16)
+            length = int.from_bytes(start[8:], "little")
+            if len(start) < 16 or not start.startswith(_MAGIC) or length > size - 16:
+                raise ResultError("It is not a part of an index.")
+            header = _header(stream.read(length))
+            places = [one["places"] for one in header["drives"]]
+            shapes = _shapes(header, sum(places))
+            ends, at = [], 16 + length
+            for kind, shape in shapes:
+                at += -at % _ALIGNED
+                ends.append(at)
+                at += np.dtype(kind).itemsize * int(np.prod([int(n) for n in shape], dtype=object))
+            if at + _CRC_BYTES != size:
+                raise ResultError(f"It has {size} bytes, and its header claims {at + _CRC_BYTES}.")
+            whole = np.asarray(np.memmap(stream, np.uint8, "r"))
+            if zlib.crc32(whole[:at].data).to_bytes(_CRC_BYTES, "little") != whole[at:].tobytes():
+                raise ResultError("Its checksum does not match.")
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except ResultError as error:
+        raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
+    ends.append(at)
+    parts = [
+        whole[a : a + np.dtype(kind).itemsize * int(np.prod(shape))].view(kind).reshape(shape)
+        for (kind, shape), (a, _) in zip(shapes, pairwise(ends), strict=True)
+    ]
+    lists = CodeLists(*parts, block=header["block"])
+    try:
+        check_lists(lists)
+    except ResultError as error:
+        raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
+    contents = tuple(Content(one["drive"], one["key"], one["mark"]) for one in header["drives"])
+    return Segment(header["library"], contents, np.cumsum([0, *places]), lists)
+
+
+def _header(text: bytes) -> dict[str, Any]:
+    """The header, every value of the kind and within the limits that it must have. Raises ResultError."""
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ResultError("Its header is not JSON.") from None
+    if not isinstance(header, dict) or header.get("format") != _FORMAT:
+        raise ResultError("Its header is of another version.")
+    most = {"block": MOST_ROWS, "references": _MOST_REFERENCES, "windows": _MOST_WINDOWS, "entries": 2**48}
+    drives = header.get("drives")
+    sound = (
+        all(_is_count(header.get(name), limit) for name, limit in most.items())
+        and header["block"] > 0
+        and isinstance(header.get("library"), str)
+        and isinstance(drives, list)
+        and all(_is_drive(one) for one in drives)
+    )
+    if not sound:
+        raise ResultError("Its header lacks a value, or has one that cannot be.")
+    return header
+
+
+def _is_count(value: object, most: int) -> bool:
+    return type(value) is int and 0 <= value <= most
+
+
+def _is_drive(value: object) -> bool:
+    if not isinstance(value, dict) or not _is_count(value.get("places"), 2**31 - 1):
+        return False
+    return all(isinstance(value.get(name), str) for name in ("drive", "key", "mark"))
+
+
+def _shapes(header: dict[str, Any], places: int) -> Sequence[tuple[str, tuple[int, ...]]]:
+    """Type and shape of each array, in the order of `CodeLists.parts`."""
+    if places > 2**31 - 1:
+        raise ResultError(f"It would hold {places} places, and a row has 31 bits.")
+    entries, blocks = header["entries"], -(-places // header["block"])
+    return [
+        ("<i8", (header["references"], blocks + 1)),
+        ("<u2", (entries,)),
+        ("u1", (entries,)),
+        ("u1", (entries,)),
+        ("u1", (entries, header["windows"])),
+        ("<u4", (places,)),
+    ]

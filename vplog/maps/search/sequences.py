@@ -1,0 +1,107 @@
+"""The best places of a map for views along with their neighbours: lines within drives, drive by drive.
+
+A line needs the scores of every place of its drive for every view of the log, which is nothing for a few drives and
+out of reach for a map of thousands. There the drives are chosen first, by single views over the whole map, which is
+exact and fast; lines are then as exact within the drives chosen as in a small map. A drive is missed only when none of
+its places is among the best hundred of the map for any view, or when eight others are better so for each stretch of
+views.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.errors import LibraryError
+from vplog.maps.search.index import as_described
+from vplog.maps.search.top_k import NONE, Answers, answers_of, merge, no_answers
+from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.map_store import other_library
+from vplog.places.sequence import rank_places
+from vplog.results import tables
+from vplog.stages import index_of_part
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from typing import Any
+
+    from vplog.data import Floats, Int32s, Ints
+    from vplog.maps.storage.map_store import Store
+    from vplog.places.sequence import SequenceSettings
+    from vplog.stages import PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+EXACT_PLACES = 200_000
+"""Up to so many places lines are drawn in every drive: some minutes of one core for a log of a thousand views."""
+PLACES_A_VIEW = 100
+"""Best places of each single view that speak for their drives."""
+_DRIVES_A_STRETCH = 8
+"""Drives chosen for each stretch of views as long as a window."""
+
+
+def best_lines(
+    store: Store,
+    drives: Mapping[int, str],
+    state: PlaceState,
+    library: str,
+    descriptors: Sequence[Any],
+    top: int,
+    settings: SequenceSettings,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+) -> Answers:
+    """The `top` best places of some drives, by their numbers in the map, for each of Q views in order.
+
+    Drives are read one after the other, so memory is that of the largest. Works for any recogniser, and for a window
+    of one view. Raises LibraryError where a drive's descriptors are of another library.
+    """
+    best = no_answers(len(descriptors), top)
+    for done, (number, drive) in enumerate(drives.items()):
+        path = store.file(drive, "descriptors.parquet")
+        with reading_drive(drive):
+            column, made_by = tables.read_descriptors(path)
+            if made_by != library:
+                raise LibraryError(other_library(store, drive, made_by, library))
+            index = index_of_part(state, state.from_arrow(as_described(store, drive, column, state)))
+        stops = np.full(len(descriptors), len(column), np.int64)
+        rankings = rank_places(index, descriptors, stops, top, settings, threads)
+        best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)
+        progress("search", done + 1, len(drives))
+    return best
+
+
+def likely_drives(single: Answers, length: int) -> Ints:
+    """Numbers of the drives in which lines may be, rising, by the best places of each single view.
+
+    Stretches of `length` views, each half over the last, name the drives with most credit.
+    """
+    view, drive, credit = credits_of(single)
+    chosen = []
+    for start in range(0, len(single.score), max(length // 2, 1)):
+        part = slice(*np.searchsorted(view, [start, start + length]))
+        total = np.bincount(drive[part], credit[part])
+        best = np.argsort(-total, kind="stable")[:_DRIVES_A_STRETCH]
+        chosen.append(best[total[best] > 0])
+    return np.unique(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
+
+
+def credits_of(single: Answers) -> tuple[Ints, Int32s, Floats]:
+    """(C,) views, rising, drives, and how much each view says for the drive.
+
+    That is by how much the drive's best place is above the last of the view's places: a view that is like everything
+    says little.
+    """
+    top = single.score.shape[1]
+    there = single.score > NONE
+    least = np.where(there, single.score, np.inf).min(axis=1, initial=np.inf)
+    full = there.sum(axis=1) == top
+    credit = np.where(there, single.score - np.where(full, least, 0.0)[:, None] + np.float32(1e-6), 0.0)
+    view, rank = np.nonzero(there)
+    order = np.lexsort((rank, single.drive[view, rank], view))
+    view, rank = view[order], rank[order]
+    drive = single.drive[view, rank]
+    first = np.ones(len(view), np.bool_)  # a drive's best place for a view comes first
+    first[1:] = (view[1:] != view[:-1]) | (drive[1:] != drive[:-1])
+    return view[first], drive[first], credit[view[first], rank[first]].astype(np.float64)

@@ -1,0 +1,1 @@
+"""Map folders on disks and object stores."""

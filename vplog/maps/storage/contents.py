@@ -1,0 +1,300 @@
+"""The drives, records and files of a map, by name, wherever the map is."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import unquote
+
+import pyarrow as pa
+
+import vplog
+from vplog.errors import LibraryError, NewerError, ResultError
+from vplog.maps.geo_bounds import earth_from_plain, earth_of_run
+from vplog.maps.storage.damage import check_at_hand, damaged_files, reading_drive
+from vplog.maps.storage.layout import ADD_AGAIN, AT_HAND, FORMAT, HASH, drive_record, folder_name
+from vplog.maps.storage.upload import send_rest, write_json
+from vplog.results import run_record
+from vplog.storage.folders import regular_files
+from vplog.storage.parquet_limits import check_version, read_footer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+
+    from vplog.maps.storage.remote_map import Mirror
+    from vplog.results.shown import Earth
+
+    T = TypeVar("T")
+
+_TRIES, _PAUSE_S = 6, 0.02
+"""A drive is read again where it was replaced while it was read, after a pause that doubles: 1.3 s in all. A batch
+replaces each once, and a rename takes less than a millisecond."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """map.json."""
+
+    library: str | None
+    """Hash of the library; None before there is one."""
+    settings: dict[str, Any]
+    """Every setting of the last batch."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """The names in a map. Of one on an object store `root` is a local folder, where `run`, `table` and `library` put
+    what they are asked for."""
+
+    root: Path
+    mirror: Mirror | None = None
+    """None for a map that is a folder."""
+    damaged: dict[str, str] = field(default_factory=dict)
+    """Drives that `drives` leaves out, and why."""
+
+    def __str__(self) -> str:
+        """As its user calls it."""
+        return str(self.root if self.mirror is None else self.mirror.remote)
+
+    @property
+    def index(self) -> Path:
+        """Where its index is; of a map on an object store that of the reader alone, in the cache if there is one."""
+        if self.mirror is not None and self.mirror.cache is not None:
+            return self.mirror.cache.index_of(self.mirror.remote)
+        return self.root / "index"
+
+    @property
+    def staging(self) -> Path:
+        """Where a writer makes what it renames in; hidden, on the same file system."""
+        return self.root / ".staging"
+
+    def run(self, drive: str) -> Path:
+        """The run folder; of a map on a store with its tables and run.json alone (`whole` has the rest)."""
+        if self.mirror is not None:
+            self.mirror.fetch(drive, AT_HAND)
+        return self.root / "runs" / folder_name(drive)
+
+    def file(self, drive: str, name: str) -> Path:
+        """One file of the run folder, where it has one of this name."""
+        if self.mirror is not None:
+            self.mirror.fetch(drive, [name])
+        return self.root / "runs" / folder_name(drive) / name
+
+    def whole(self, drive: str) -> Path:
+        """The run folder with all that is in it."""
+        if self.mirror is not None:
+            self.mirror.fetch(drive, self.sizes(drive))
+        return self.root / "runs" / folder_name(drive)
+
+    def forget(self, drive: str) -> None:
+        """Of a map on a store, free the disk of what was asked for of a drive."""
+        if self.mirror is not None:
+            self.mirror.forget(drive)
+
+    def table(self, name: str, drive: str) -> Path:
+        """One table of a drive, under its data set; of a map on a store, in the run folder."""
+        if self.mirror is not None:
+            return self.file(drive, f"{name}.parquet")
+        return self.root / name / folder_name(drive) / f"{name}.parquet"
+
+    def library(self, digest: str) -> Path:
+        if self.mirror is not None:
+            self.mirror.library(digest)
+        return self.root / "libraries" / digest
+
+    def sizes(self, drive: str) -> dict[str, int]:
+        """Bytes of each file of a run folder, by name."""
+        if self.mirror is not None:
+            return {name: about["bytes"] for name, about in self.mirror.manifests[drive]["files"].items()}
+        run = self.run(drive)
+        return {name: (run / name).lstat().st_size for name in regular_files(run)}
+
+    def damaged_files(self, drive: str) -> list[str]:
+        """A line for each file of a drive that is not as it was written; of a map on a store, of what drives are worked
+        with by and of what is gone. Raises UnreachableError."""
+        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive, AT_HAND)
+
+    def is_whole(self, drive: str) -> bool:
+        """Whether all of a drive is where it was, though its removal may be decided. Of one that failed nothing is."""
+        if self.mirror is None:
+            return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
+        return drive in self.mirror.manifests or drive in self.failures()
+
+    def rows(self, name: str, drive: str) -> int:
+        """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
+        if self.mirror is not None:
+            return int(self.mirror.manifests[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
+        with reading_drive(drive):
+            return row_count(self.run(drive) / f"{name}.parquet")
+
+    def earth(self, drive: str) -> Earth | None:
+        """Where on earth a drive is, None where nothing says so. Raises DamagedDriveError."""
+        with reading_drive(drive):
+            about = drive_record(self.root / "runs" / folder_name(drive))
+            return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
+
+    def keep(self) -> None:
+        """Of a map on an object store, send what was made so far beside drives; a folder has it already. Where that
+        fails it is sent another time; raises SettingsError where another writer has the map now."""
+        if self.mirror is not None:
+            if self.mirror.lock is not None:
+                self.mirror.lock.check()
+            with suppress(ResultError):
+                send_rest(self.mirror)
+
+    def drives(self) -> dict[str, dict[str, Any]]:
+        """drive.json of every finished drive, by ID in order, but for those that are damaged. Raises NewerError."""
+        removed = set(map(folder_name, self.removed()))
+        found = dict[str, dict[str, Any]]()
+        for folder in sorted(self.root.glob("runs/drive=*")):
+            if folder.name in removed or not any((folder / name).exists() for name in ("drive.json", *AT_HAND)):
+                continue
+            try:
+                record = self._sound_record(folder)
+            except NewerError:
+                raise
+            except ResultError as error:
+                self.damaged.setdefault(_drive_of(folder), str(error))
+            else:
+                if record["drive"] not in self.damaged:
+                    found[record["drive"]] = record
+        return dict(sorted(found.items()))
+
+    def _sound_record(self, folder: Path) -> dict[str, Any]:
+        """drive.json of a run folder whose tables are there. Raises ResultError."""
+        record = drive_record(folder)
+        if self.mirror is None:
+            try:
+                check_at_hand(folder, record)
+            except ResultError:
+                if _identity(folder) is None:
+                    raise
+                record = drive_record(folder)  # of a folder that was replaced meanwhile
+                check_at_hand(folder, record)
+        return record
+
+    def read(self, drive: str, of: Callable[[Path], T], names: Iterable[str] = AT_HAND) -> T:
+        """What a function makes of these files of the run folder, all of one state of the drive: of the folder that a
+        writer put in place of another meanwhile, it is asked again. Raises ResultError."""
+        folder = self.root / "runs" / folder_name(drive)
+        if self.mirror is not None:
+            self.mirror.fetch(drive, names)
+            return of(folder)  # of one generation, always
+        for number in range(_TRIES):
+            time.sleep(_PAUSE_S * (2**number - 1))
+            before = _identity(folder)
+            try:
+                found = of(folder)
+            except ResultError:
+                if before is not None and _identity(folder) == before:
+                    with reading_drive(drive):
+                        raise
+                continue
+            if before is not None and _identity(folder) == before:
+                return found
+        raise ResultError(f"{folder} is being replaced or removed. Run again when that is done.")
+
+    def removed(self) -> list[str]:
+        """Drives whose removal is decided and not done yet. Raises ResultError."""
+        path = self.root / "removed.json"
+        drives = run_record.read_run_json(path).get("drives") if path.exists() else []
+        if not isinstance(drives, list) or not all(isinstance(drive, str) for drive in drives):
+            raise ResultError(f"{path} is damaged. Move it away: the drives that it named are in the map then.")
+        return drives
+
+    def write_removed(self, drives: Sequence[str]) -> None:
+        """Decide that these drives are removed; none: that this is done."""
+        self._write("removed.json", {"drives": list(drives)})
+        if not drives:
+            with suppress(OSError):
+                (self.root / "removed.json").unlink()
+
+    def failures(self) -> dict[str, dict[str, Any]]:
+        """Log and error of each drive that failed when it was last tried, by ID."""
+        path = self.root / "failures.json"
+        found = run_record.read_run_json(path) if path.exists() else {}
+        if any(not isinstance(told, dict) or not isinstance(told.get("error"), str) for told in found.values()):
+            raise ResultError(f"{path} is damaged. Move it away: the next batch tries what failed again.")
+        return found
+
+    def head(self) -> Head:
+        """map.json. Raises ResultError where the folder is no map, or one of another version."""
+        path = self.root / "map.json"
+        if not path.is_file():
+            if (self.root / "run.json").is_file():
+                raise ResultError(f"{self} is the folder of one run, not a map. Make one: vplog batch LOG... -o MAP")
+            raise ResultError(f"{self} is not a map: it has no map.json. Make one: vplog batch LOG... -o {self}")
+        record = run_record.read_run_json(path)
+        check_version(path, record.get("format"), FORMAT, record.get("vplog"))
+        library, settings = record.get("library"), record.get("settings")
+        known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
+        if not known or not isinstance(settings, dict):
+            raise ResultError(f"{path} has no sound library or settings. Run `vplog batch` again to write it anew.")
+        return Head(library, settings)
+
+    def write_head(self, head: Head) -> None:
+        """map.json, unless it says that already."""
+        record = {"format": FORMAT, "vplog": vplog.__version__, "library": head.library, "settings": head.settings}
+        self._write("map.json", record)
+
+    def write_failures(self, failures: dict[str, dict[str, Any]]) -> None:
+        self._write("failures.json", dict(sorted(failures.items())))
+
+    def _write(self, name: str, record: dict[str, Any]) -> None:
+        """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
+        path = self.root / name
+        if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+            return
+        run_record.write_run_json(path, record, checksum=name != "failures.json")  # whose keys are drives
+        if self.mirror is not None:
+            write_json(self.mirror, name)
+
+
+def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:
+    """Why a drive's places may not be mixed with those of the map, in one line."""
+    return (
+        f"{drive} in {store} was described with library {found[:12]}, and the map's is {str(wanted)[:12]}: their "
+        f"places do not compare. Describe it with that library too: add its log with `vplog batch`."
+    )
+
+
+def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
+    """The library of a map, and its drives, all described with it. Raises LibraryError where one is not, and
+    ResultError where there is none."""
+    head, drives = store.head(), store.drives()
+    if head.library is None or not drives:
+        raise ResultError(f"{store} has no finished drive yet. Add some: vplog batch LOG... -o {store}")
+    for drive, about in drives.items():
+        if about["library"] != head.library:
+            raise LibraryError(other_library(store, drive, about["library"], head.library))
+    return head.library, drives
+
+
+def row_count(path: Path) -> int:
+    """Rows of a table, by its footer. Raises ResultError."""
+    try:
+        return read_footer(path).num_rows
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise ResultError(
+            f"{path} cannot be read: {str(error).splitlines()[0]} Check its permissions, or {ADD_AGAIN}"
+        ) from None
+
+
+def _drive_of(folder: Path) -> str:
+    """The drive of a damaged run folder: by its drive.json, else by its name."""
+    try:
+        return str(drive_record(folder)["drive"])
+    except ResultError:
+        return unquote(folder.name.removeprefix("drive="))
+
+
+def _identity(run: Path) -> tuple[int, int, int] | None:
+    """Of the folder that has the name now; None where there is none."""
+    try:
+        found = (run / "drive.json").stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_mtime_ns

@@ -1,0 +1,130 @@
+"""Damaged drives: a drive that cannot be read is named and left out of an answer, and the rest of the map is not."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from vplog.errors import LibraryError, NewerError, ResultError
+from vplog.maps.geo_bounds import earth_of_made
+from vplog.maps.storage.layout import AT_HAND, FORMAT, drive_record, sha256_of
+from vplog.results import run_record
+from vplog.storage.folders import is_below
+from vplog.storage.scratch import files_in
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    T = TypeVar("T")
+
+
+class Quarantining(Protocol):
+    """A map; as text what its user calls it."""
+
+    @property
+    def damaged(self) -> dict[str, str]:
+        """Drives that are left out of answers, and why."""
+        ...
+
+
+class UnreachableError(ResultError):
+    """An object store refuses a request or cannot be reached: no drive is damaged."""
+
+
+class DamagedDriveError(ResultError):
+    """A file of one drive is damaged or missing."""
+
+    def __init__(self, message: str, drive: str = "") -> None:
+        super().__init__(message)
+        self.drive = drive
+
+
+@contextmanager
+def reading_drive(drive: str) -> Iterator[None]:
+    """Raises DamagedDriveError where a file of the drive cannot be read."""
+    try:
+        yield
+    except (DamagedDriveError, NewerError, UnreachableError):
+        raise
+    except (ResultError, LibraryError) as error:
+        raise DamagedDriveError(str(error), drive) from None
+
+
+def without_damaged(store: Quarantining, work: Callable[[], T]) -> T:
+    """What `work` makes of a map; a drive that it finds damaged is left out, and it is done again without."""
+    while True:
+        try:
+            return work()
+        except DamagedDriveError as error:
+            if error.drive in store.damaged:
+                raise
+            store.damaged[error.drive] = str(error)
+
+
+def left_out(store: Quarantining) -> list[str]:
+    """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
+    return [
+        f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
+        f"Compute it again from its log: vplog batch LOG -o {store}"
+        for drive, why in sorted(store.damaged.items())
+    ]
+
+
+def check_at_hand(folder: Path, record: dict[str, Any]) -> None:
+    """Raises ResultError where run.json or a table of a drive is missing or, tables by their length, not as drive.json
+    has it; of a drive whose drive.json has no lengths, as an older vplog wrote it, that is found when it is read."""
+    files = _files(record)
+    for name in AT_HAND if files else ():
+        if wrong := _difference(folder / name, files.get(name, {}), hashed=name == "run.json"):
+            raise ResultError(wrong)
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """A line for each file of a run folder in a map that does not have the length and sha256 that drive.json names."""
+    try:
+        files = _files(drive_record(folder))
+    except ResultError as error:
+        return [str(error)]
+    lines = (_difference(folder / name, files.get(name, {})) for name in sorted({*AT_HAND, *files}))
+    return [line for line in lines if line]
+
+
+def complete_record(made: Path, hashed: bool) -> None:
+    """Note in drive.json of a finished run folder where the drive is on earth and, if `hashed`, length and sha256 of
+    each file. Raises ResultError."""
+    about = {**drive_record(made), "format": FORMAT}
+    about.pop("files", None)  # of the map that it comes from
+    if "earth" not in about:
+        about["earth"] = earth_of_made(made)
+    try:
+        if hashed:
+            about["files"] = {
+                name: {"bytes": (made / name).stat().st_size, "sha256": sha256_of(made / name)}
+                for name in files_in(made)
+                if name != "drive.json"
+            }
+    except OSError as error:
+        raise ResultError(f"Cannot read {error.filename or made}: {error.strerror or error}.") from None
+    run_record.write_run_json(made / "drive.json", about, checksum=True)
+
+
+def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:
+    """How a file differs from what drive.json says of it; empty where it does not."""
+    try:
+        if not path.is_file():
+            return f"{path} is not a file." if path.exists() else f"{path} is not there."
+        if wanted.get("bytes") not in (None, size := path.stat().st_size):
+            return f"{path} has {size} bytes instead of {wanted['bytes']}."
+        if hashed and wanted.get("sha256") not in (None, sha256_of(path)):
+            return f"{path} does not have the sha256 that drive.json names."
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror or error}."
+    return ""
+
+
+def _files(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Of each file its length and sha256, by drive.json; empty where an older vplog wrote it."""
+    files = record.get("files")
+    sound = isinstance(files, dict) and all(isinstance(files[name], dict) and is_below(name) for name in files)
+    return files if isinstance(files, dict) and sound else {}

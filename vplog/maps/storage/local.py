@@ -1,0 +1,193 @@
+"""Drives put into and taken out of a map's folder, each by one rename."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import shutil
+from contextlib import ExitStack, contextmanager
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
+
+from vplog.errors import ResultError, SettingsError
+from vplog.maps.storage.damage import complete_record
+from vplog.maps.storage.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
+from vplog.storage.folders import check_regular, regular_files
+from vplog.storage.scratch import made_folder, replacing, sync, sync_all
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.maps.storage.contents import Store
+
+_HERE, _EXCHANGE = -100, 2
+"""AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """The folder for one writer, made where it is not there; the lock goes with the process that holds it."""
+    if root.is_dir() and not os.path.lexists(root / "map.json"):
+        others = [path.name for path in root.iterdir() if not path.name.startswith(".")]
+        if others:
+            raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
+    check_regular(root)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(made_folder(root))
+            lock = stack.enter_context((root / ".lock").open("a"))
+        except OSError as error:
+            raise SettingsError(
+                f"Cannot write to {root}: {error.strerror}. Check its permissions, or choose another folder."
+            ) from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SettingsError(f"Another vplog process is writing to {root}. Wait for it to end.") from None
+        except OSError as error:  # file systems without locks
+            raise SettingsError(f"Cannot lock {root}/.lock: {error.strerror}. Choose another folder with -o.") from None
+        try:
+            yield
+        finally:
+            if not (root / "map.json").exists():  # nothing came of it
+                shutil.rmtree(root / ".staging", ignore_errors=True)
+                (root / ".lock").unlink(missing_ok=True)
+
+
+def settle(store: Store) -> None:
+    """Put in what a killed writer had finished: a folder with drive.json, which is written last. Drives that are being
+    removed are taken out first, so what is left of them here is tables without a run folder."""
+    for file in sorted(store.staging.glob("*/drive.json")):
+        drive = _whole(file.parent)
+        if drive is not None and not store.run(drive).exists():
+            publish(store, drive, file.parent)
+    shutil.rmtree(store.staging, ignore_errors=True)
+    store.staging.mkdir(parents=True, exist_ok=True)
+    for name in TABLES:
+        for left in store.root.glob(f"{name}/drive=*"):
+            if not (store.root / "runs" / left.name).exists():
+                shutil.rmtree(left, ignore_errors=True)
+    for drive in store.drives():
+        try:
+            link_tables(store, drive)
+        except ResultError as error:
+            store.damaged[drive] = str(error)
+
+
+def _whole(made: Path) -> str | None:
+    """The drive of a folder that a writer had finished; None of one that it had not."""
+    try:
+        record = drive_record(made)
+    except ResultError:
+        return None
+    return record["drive"] if all((made / f"{name}.parquet").is_file() for name in TABLES) else None
+
+
+def clear(store: Store) -> None:
+    """Away with what a writer was making."""
+    shutil.rmtree(store.staging, ignore_errors=True)
+
+
+def publish(store: Store, drive: str, made: Path) -> None:
+    """Make a finished run folder the drive's, in place of the one it may have, and link its tables.
+
+    A reader finds the old folder or the new one: they change places in one step where the system can (Linux, on all
+    its usual file systems), else there is neither for a moment.
+    """
+    complete_record(made, hashed=True)
+    run, replaced = store.run(drive), store.staging / f"replaced-{os.getpid()}"
+    try:
+        run.parent.mkdir(exist_ok=True)
+        shutil.rmtree(replaced, ignore_errors=True)
+        sync_all(made)
+        if not run.exists():
+            made.rename(run)
+        elif exchanged(made, run):
+            made.rename(replaced)
+        else:
+            run.rename(replaced)
+            (replaced / "drive.json").unlink(missing_ok=True)  # so that nobody takes it for a new one
+            made.rename(run)
+        sync(run.parent)
+    except OSError as error:
+        raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
+    shutil.rmtree(replaced, ignore_errors=True)
+    link_tables(store, drive)
+
+
+def exchanged(one: Path, other: Path) -> bool:
+    """Let two folders change their names in one step; False where the system cannot."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    return rename is not None and rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0
+
+
+def link_tables(store: Store, drive: str) -> None:
+    """Each table of the run folder under its data set; a copy on file systems without hard links."""
+    for name in TABLES:
+        source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
+        if not source.is_file():
+            raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
+        if path.exists() and (path.samefile(source) or _same_copy(source, path)):
+            continue
+        part = store.staging / f"{name}-{os.getpid()}.parquet"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ResultError(f"Cannot make {path.parent}: {error.strerror}. Make room, and run again.") from None
+        try:
+            part.unlink(missing_ok=True)
+            os.link(source, part)
+            part.replace(path)
+        except OSError:  # no hard links here; what else is wrong, the copy says
+            with replacing(path) as stream, source.open("rb") as whole:
+                shutil.copyfileobj(whole, stream)
+
+
+def _same_copy(source: Path, path: Path) -> bool:
+    """Whether a file that is no link holds the same, told by its bytes."""
+    return source.stat().st_size == path.stat().st_size and sha256_of(source) == sha256_of(path)
+
+
+def check_removable(store: Store, drives: Sequence[str]) -> None:
+    """Raises ResultError where this user may not remove a folder of these drives."""
+    for path in [folder for drive in drives for folder in _folders_of(store, drive)]:
+        for folder in [path.parent, path, *(path / name for name in _folders_below(path))]:
+            if not os.access(folder, os.W_OK | os.X_OK):
+                raise ResultError(
+                    f"Cannot remove {', '.join(drives)} from {store}: no permission to change {folder}. The map is as "
+                    "it was. Ask the owner of that folder for the permission, or let the owner remove the drive."
+                )
+
+
+def take_out(store: Store, drives: Sequence[str]) -> None:
+    """Rename the run folders of drives out of the data set, all or none, then remove them and all that bears their
+    names. Raises OSError; the drives are as they were where that is at a rename."""
+    moved: list[tuple[Path, Path]] = []
+    try:
+        for number, drive in enumerate(drives):
+            run, gone = store.root / "runs" / folder_name(drive), store.staging / f"gone-{os.getpid()}-{number}"
+            if run.exists():
+                gone.parent.mkdir(parents=True, exist_ok=True)
+                run.rename(gone)
+                moved.append((run, gone))
+    except OSError:
+        for run, gone in moved:
+            gone.rename(run)
+        raise
+    for folder in store.staging.glob("gone-*"):  # those of a writer that was killed, too
+        shutil.rmtree(folder)
+    for drive in drives:
+        for folder in _folders_of(store, drive):
+            shutil.rmtree(folder)
+
+
+def _folders_of(store: Store, drive: str) -> list[Path]:
+    """All that bears the name of a drive, its cache too."""
+    return list(store.root.glob(f"*/{folder_name(drive)}"))
+
+
+def _folders_below(folder: Path) -> set[str]:
+    """Names of the folders below one that hold files."""
+    return {str(above) for name in regular_files(folder) for above in PurePosixPath(name).parents}

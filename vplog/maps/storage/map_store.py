@@ -1,0 +1,175 @@
+"""A map: finished drives that appear whole, described with one library, read by anyone at any time.
+
+    MAP/map.json                               format, library, settings
+    MAP/libraries/HASH/                        the references that all places are described with
+    MAP/runs/drive=ID/                         the run folder of a drive, with drive.json: what it was made from
+    MAP/keyframes/drive=ID/keyframes.parquet   its tables as data sets, partitioned by drive as DuckDB and Spark have
+    MAP/descriptors/... closures/... edges/... trajectory/...   it; hard links to the run folder's files
+    MAP/failures.json                          drives that could not be run, each with its error
+    MAP/removed.json                           drives that are being removed, while that is not done
+
+A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when its manifest is
+(mirror.py). Its tables are links: no byte is stored twice, both names always show the same bytes (every writer here
+replaces a file and never changes one), and one look at the inode tells whether a link is missing. Drives are removed
+by naming them in removed.json, one step that decides for all of them; then their files go, by the next writer where
+this one is killed.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+from vplog.errors import LibraryError, ResultError, VplogError
+from vplog.maps.storage import lease_lock, local, upload
+from vplog.maps.storage.contents import Head, Store, one_library, other_library, row_count
+from vplog.maps.storage.damage import complete_record
+from vplog.maps.storage.layout import HASH, TABLES, drive_record, folder_name
+from vplog.maps.storage.remote_map import Mirror
+from vplog.results import run_record
+from vplog.storage.folders import check_regular
+from vplog.storage.remote_path import RemotePath, check_writable
+from vplog.storage.scratch import put_in_place, scratch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.maps.storage.download_cache import Cache
+
+__all__ = [
+    "TABLES", "Head", "Store", "add_library", "folder_name", "one_library", "other_library", "publish", "reading",
+    "remove", "row_count", "writing",
+]  # fmt: skip
+
+
+@contextmanager
+def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
+    """A map, local or on an object store, for those who only read it; with a cache, what is read of the latter stays
+    there for the next one. Raises ResultError, also where something in it is not its own file."""
+    if not isinstance(root, RemotePath):
+        check_regular(root, "map.json")
+        yield Store(root)
+        return
+    if root.scheme not in ("s3", "gs"):
+        raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3:// or gs://.")
+    try:
+        with scratch("map", None if cache is None else cache.open_folders) as folder:
+            mirror = Mirror(root, folder, cache=cache)
+            yield Store(folder, mirror, mirror.damaged)
+    finally:
+        if cache is not None:
+            cache.trim()
+
+
+@contextmanager
+def writing(root: Path) -> Iterator[Store]:
+    """The map for one writer, made where it is not there yet.
+
+    What a writer that was killed had finished is put in; what it had not is removed. Raises SettingsError where the
+    folder holds other things, or where another process writes.
+    """
+    if isinstance(root, RemotePath):
+        with _writing_remote(root) as store:
+            yield store
+        return
+    with local.locked(root):
+        store = Store(root)
+        _sweep(store)
+        local.settle(store)
+        yield store
+        local.clear(store)
+
+
+@contextmanager
+def _writing_remote(root: RemotePath) -> Iterator[Store]:
+    check_writable(root)
+    with lease_lock.held(root) as lock, scratch("map") as folder:
+        mirror = Mirror(root, folder, lock)
+        store = Store(folder, mirror, mirror.damaged)
+        _sweep(store)
+        upload.begin(mirror)
+        mirror.rest()
+        store.staging.mkdir()
+        try:
+            yield store
+        except BaseException:  # what was verified of closures stays
+            with suppress(VplogError, OSError):
+                upload.send_rest(mirror)
+            raise
+        upload.send_rest(mirror)
+
+
+def publish(store: Store, drive: str, made: Path) -> None:
+    """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have. Where it is on
+    earth is noted with it. Raises ResultError; then the map has the drive as before.
+    """
+    store.damaged.pop(drive, None)
+    if store.mirror is None:
+        local.publish(store, drive, made)
+    else:
+        complete_record(made, hashed=False)
+        upload.publish(store.mirror, drive, made)
+
+
+def relocate(store: Store, drive: str, log: str) -> None:
+    """Note where the log of a drive is now; nothing else of the drive depends on it. Raises ResultError."""
+    run = store.root / "runs" / folder_name(drive)
+    if store.mirror is None:
+        run_record.write_run_json(run / "drive.json", {**drive_record(run), "log": log}, checksum=True)
+        return
+    upload.relocate(store.mirror, drive, log)
+
+
+def remove(store: Store, drives: Sequence[str]) -> None:
+    """Take drives out with all that bears their names, and forget their failures: all of them or none, whatever ends
+    this. Raises ResultError, which says whether they are out."""
+    named = f"{', '.join(drives)} {'is' if len(drives) == 1 else 'are'}"
+    if store.mirror is None:
+        local.check_removable(store, drives)
+    store.write_removed(drives)
+    try:
+        _sweep(store)
+    except ResultError as error:
+        out = f"{error} {named} out of {store}; the next command that writes to it deletes what is left of the files."
+        if all(map(store.is_whole, drives)):
+            with suppress(ResultError):  # where that cannot be taken back they are out
+                store.write_removed([])
+                out = f"{error} {named} in {store} as before."
+        raise ResultError(out) from None
+
+
+def _sweep(store: Store) -> None:
+    """Remove the files of drives whose removal is decided. Raises ResultError; of a folder they are as they were."""
+    drives = store.removed()
+    if not drives:
+        return
+    if store.mirror is None:
+        try:
+            local.take_out(store, drives)
+        except OSError as error:
+            where = error.filename or store
+            raise ResultError(f"Cannot remove {where}: {error.strerror}. Check its permissions.") from None
+    else:
+        for drive in drives:
+            upload.remove(store.mirror, drive)
+    kept = {drive: told for drive, told in store.failures().items() if drive not in drives}
+    if kept != store.failures():
+        store.write_failures(kept)
+    store.write_removed([])
+
+
+def add_library(store: Store, made: Path, digest: str) -> Path:
+    """Make a folder in staging the library of this hash; it stays as it is where the map has it."""
+    if not HASH.fullmatch(digest):
+        raise LibraryError(f"{made} has no valid hash ({digest[:20]!r}). Build it again: vplog library")
+    folder = store.library(digest)
+    try:
+        folder.parent.mkdir(exist_ok=True)
+        if not folder.exists():
+            put_in_place(made, folder)
+    except OSError as error:
+        raise ResultError(f"Cannot put the library into {store}: {error.strerror}.") from None
+    if store.mirror is not None:
+        upload.send_library(store.mirror, digest)
+    return folder

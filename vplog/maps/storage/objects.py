@@ -1,0 +1,214 @@
+"""Objects of a store by URL (s3://, gs://): each appears whole or not at all, and none is changed in place."""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from vplog.storage.remote_path import names_below, s3_place
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.storage.remote_path import RemotePath
+
+_BLOCK_BYTES = 1 << 20
+"""Of a copy to or from the store."""
+_TRIES = 5
+"""A manifest is replaced once by a writer, and read in some 20 ms."""
+
+
+def put(path: RemotePath, data: bytes) -> None:
+    """Raises OSError."""
+    system, place = path.place
+    with system.open_output_stream(place) as stream:
+        stream.write(data)
+
+
+def get(path: RemotePath) -> bytes | None:
+    """What an object holds, None where there is none. Raises OSError.
+
+    All of one state, also while it is replaced: one request has that by itself; pyarrow asks for the length before,
+    and what is read by another object's length is read again.
+    """
+    if decides(path):
+        found = get_tagged(path)
+        return None if found is None else found[0]
+    system, place = path.place
+    for _ in range(_TRIES):
+        before = system.get_file_info(place)
+        try:
+            with _opened(path) as stream:
+                data = stream.read()
+        except FileNotFoundError:
+            return None
+        after = system.get_file_info(place)
+        if (before.size, before.mtime) == (after.size, after.mtime) == (len(data), after.mtime):
+            return data
+    raise OSError("it is replaced faster than it can be read")
+
+
+def send(path: RemotePath, source: Path) -> str:
+    """A local file as an object; sha256 of what was sent. Raises OSError."""
+    system, place = path.place
+    digest = hashlib.sha256()
+    with source.open("rb") as whole, system.open_output_stream(place) as stream:
+        while block := whole.read(_BLOCK_BYTES):
+            digest.update(block)
+            stream.write(block)
+    return digest.hexdigest()
+
+
+def fetch(path: RemotePath, target: Path, most: int) -> str:
+    """An object as a local file; sha256 of what came, of which no block behind `most` bytes is read. Raises OSError."""
+    digest, count = hashlib.sha256(), 0
+    with _opened(path) as whole, target.open("wb") as stream:
+        while block := whole.read(_BLOCK_BYTES):
+            count += len(block)
+            digest.update(block)
+            stream.write(block)
+            if count > most:
+                break
+    return digest.hexdigest()
+
+
+@contextmanager
+def _opened(path: RemotePath) -> Iterator[Any]:
+    """The stream of an object. One that goes away after it was opened is not there: FileNotFoundError."""
+    from pyarrow.fs import FileType
+
+    system, place = path.place
+    try:
+        with system.open_input_stream(place) as stream:
+            yield stream
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        if system.get_file_info(place).type != FileType.File:
+            raise FileNotFoundError(place) from None
+        raise error from None
+
+
+def copy(source: RemotePath, target: RemotePath) -> None:
+    """Within the store, without a byte coming here. Raises OSError."""
+    system, place = target.place
+    system.copy_file(source.place[1], place)
+
+
+def remove(path: RemotePath) -> None:
+    """An object, or all with this prefix; nothing where there is none. Raises OSError."""
+    from pyarrow.fs import FileType
+
+    system, place = path.place
+    kind = system.get_file_info(place).type
+    if kind == FileType.File:
+        system.delete_file(place)
+    elif kind == FileType.Directory and path.scheme == "gs":  # what is only a prefix has no object of its own
+        system.delete_dir_contents(place, missing_dir_ok=True)
+    elif kind == FileType.Directory:
+        system.delete_dir(place)
+
+
+def files_below(path: RemotePath) -> dict[str, datetime]:
+    """When each object with this prefix was written, by its name behind the prefix. Raises OSError."""
+    from pyarrow.fs import FileSelector, FileType
+
+    system, place = path.place
+    found = system.get_file_info(FileSelector(place, allow_not_found=True, recursive=True))
+    return {one.path[len(place) + 1 :]: one.mtime for one in found if one.type == FileType.File}
+
+
+def folders_in(path: RemotePath) -> list[str]:
+    """Names right below this prefix that have objects below, in order. Raises OSError."""
+    return sorted(name for name, is_folder in names_below(path).items() if is_folder)
+
+
+def names_in(path: RemotePath) -> list[str]:
+    """All names right below this prefix, in order. Raises OSError."""
+    return sorted(names_below(path))
+
+
+def age_s(path: RemotePath) -> float:
+    """Seconds since an object was written, by this machine's clock and the server's; 0 where there is none."""
+    system, place = path.place
+    written = system.get_file_info(place).mtime
+    return 0.0 if written is None else (datetime.now(UTC) - written).total_seconds()
+
+
+def decides(path: RemotePath) -> bool:
+    """Whether `put_if` is at hand: on S3 with boto3, which alone asks for conditional writes."""
+    if path.scheme != "s3":
+        return False
+    try:
+        _client(*s3_place())
+    except ImportError:
+        return False
+    return True
+
+
+def put_if(path: RemotePath, data: bytes, tag: str | None) -> str | None:
+    """Write an object where it has this tag, or where there is none yet (tag None); its new tag, or None where that is
+    not so. The store decides, so that of several writers one wins. Raises OSError.
+
+    Conditional writes of S3: docs.aws.amazon.com/AmazonS3/latest/userguide/conditional-writes.html. A store that
+    knows none writes in any case.
+    """
+    condition = {"IfNoneMatch": "*"} if tag is None else {"IfMatch": tag}
+    bucket, _, key = path.place[1].partition("/")
+    try:
+        return _asked("put_object", Bucket=bucket, Key=key, Body=data, **condition)["ETag"]
+    except RefusedError:
+        return None
+
+
+def get_tagged(path: RemotePath) -> tuple[bytes, str, float] | None:
+    """What an object holds, its tag and how many seconds ago it was written, both by the server's clock; None where
+    there is none. Raises OSError."""
+    from botocore.exceptions import BotoCoreError
+
+    bucket, _, key = path.place[1].partition("/")
+    try:
+        answer = _asked("get_object", Bucket=bucket, Key=key)
+    except RefusedError:
+        return None
+    told = answer["ResponseMetadata"]["HTTPHeaders"].get("date")
+    now = parsedate_to_datetime(told) if told else datetime.now(UTC)
+    try:
+        data = answer["Body"].read()
+    except BotoCoreError as error:
+        raise OSError(str(error)) from None
+    return data, answer["ETag"], (now - answer["LastModified"]).total_seconds()
+
+
+class RefusedError(Exception):
+    """The condition does not hold, or there is no such object. Never leaves this file."""
+
+
+def _asked(verb: str, **arguments: Any) -> dict[str, Any]:
+    from botocore.exceptions import BotoCoreError, ClientError
+
+    try:
+        return getattr(_client(*s3_place()), verb)(**arguments)
+    except ClientError as error:
+        # 412: the condition does not hold; 409: another write of the object is under way; 404: there is none
+        told = error.response
+        if told["ResponseMetadata"]["HTTPStatusCode"] in (404, 409, 412) and told["Error"]["Code"] != "NoSuchBucket":
+            raise RefusedError from None
+        raise OSError(str(error)) from None
+    except BotoCoreError as error:
+        raise OSError(str(error)) from None
+
+
+@lru_cache
+def _client(endpoint: str | None, region: str | None) -> Any:
+    """boto3 looks for credentials where pyarrow does."""
+    import boto3
+    from botocore.config import Config
+
+    settings = Config(retries={"max_attempts": 4, "mode": "standard"})
+    return boto3.client("s3", endpoint_url=endpoint, region_name=region, config=settings)

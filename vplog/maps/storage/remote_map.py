@@ -1,0 +1,299 @@
+"""A map on an object store, through a local folder that has the names of a map and of its files what was asked for.
+
+    MAP/map.json, failures.json, libraries/HASH/...   as in a folder
+    MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
+    MAP/runs/drive=ID/drive.json                      the manifest: what a folder's drive.json says, the generation, and
+                                                      length and sha256 of each of its files; written when all are there
+    MAP/keyframes/drive=ID/keyframes.parquet          its tables as data sets, copied within the store
+    MAP/rest/GENERATION/..., MAP/rest.json            all else that a map's folder has, as what joins its drives
+
+An object store has no rename and no links, but an object appears whole or not at all. So a manifest is the one thing
+that changes, and what it names never does: a reader has the drive of the old manifest or that of the new one. What the
+old one named is removed afterwards, by the writer that replaced it, and a reader that comes too late for it reads the
+new manifest. No writer removes what it did not itself see replaced, so nothing breaks even where two write at once:
+the last manifest counts. A killed writer leaves objects that no manifest names; a later one removes them after a day.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import threading
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import unquote
+
+from vplog.errors import NewerError, ResultError
+from vplog.maps.storage import objects
+from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
+from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, folder_name, sound_record
+from vplog.storage.folders import is_below
+from vplog.storage.remote_path import reason
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+    from pathlib import Path
+
+    from vplog.maps.storage.download_cache import Cache
+    from vplog.maps.storage.lease_lock import Lock
+    from vplog.storage.remote_path import RemotePath
+
+_REQUESTS = 16
+"""At once: a store answers each in some 20 to 50 ms, whatever its size."""
+OWN = ("generation", "replaces", "files")
+"""What a manifest says beside the drive.json of a folder."""
+_LIBRARY_FILE_BYTES = 2**34
+"""Longest file of a library that is fetched: 16 GB, more than load_references takes."""
+_GENERATION = re.compile(r"[0-9a-f]{16}")
+
+
+class Mirror:
+    """The drives of a map on a store, and the local folder that they are read and made through."""
+
+    def __init__(
+        self, remote: RemotePath, local: Path, lock: Lock | None = None, *, cache: Cache | None = None
+    ) -> None:
+        """With a lock it may be written to; with a cache nothing is fetched that is there. Raises ResultError where the
+        store cannot be read."""
+        self.remote, self.local, self.lock, self.cache = remote, local, lock, cache
+        self.manifests: dict[str, dict[str, Any]] = {}
+        self.damaged: dict[str, str] = {}
+        """Drives whose manifest is damaged or missing, and why."""
+        self.rest_manifest: dict[str, Any] = {}
+        self._fetched: set[str] = set()
+        self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        with told(remote):
+            for name in ("map.json", "failures.json", "removed.json"):
+                if (data := objects.get(remote / name)) is not None:
+                    (local / name).write_bytes(data)
+            folders = [name for name in objects.folders_in(remote / "runs") if name.startswith("drive=")]
+            with ThreadPoolExecutor(_REQUESTS) as pool:
+                list(pool.map(self._open, folders))
+
+    def _open(self, drive_folder: str) -> None:
+        """Read the manifest of a drive. One that is missing was there where a table has a copy: that comes after it."""
+        drive, place = unquote(drive_folder.removeprefix("drive=")), self.remote / "runs" / drive_folder
+        try:
+            found = self.read_manifest(drive_folder)
+        except NewerError:
+            raise
+        except ResultError as error:
+            self.damaged[drive] = str(error)
+        else:
+            if found is not None:
+                self.lay(found)
+            elif any(objects.files_below(self.remote / name / drive_folder) for name in TABLES):
+                self.damaged[drive] = f"{place}/drive.json is not there."
+
+    def fetch(self, drive: str, names: Iterable[str]) -> None:
+        """Have these files of a drive in the local folder, all of one generation. Raises DamagedDriveError where one is
+        gone or damaged, and ResultError."""
+        with self._locks[drive]:
+            for _ in range(3):
+                if drive not in self.manifests:
+                    return
+                try:
+                    self._fetch(drive, names)
+                    return
+                except FileNotFoundError:
+                    self._again(drive)
+            raise ResultError(f"{self.remote}: {drive} is replaced faster than it can be read. Try again later.")
+
+    def _fetch(self, drive: str, names: Iterable[str]) -> None:
+        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
+        for name in names:
+            path = place / manifest["generation"] / name
+            if why := self._bring(path, self.run(drive) / name, manifest["files"].get(name)):
+                raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
+        self._fetched.add(drive)
+
+    def damaged_files(self, drive: str, names: Iterable[str]) -> list[str]:
+        """A line for each file of a drive that is gone, and for the first of `names` that is damaged: these are
+        fetched. Raises UnreachableError."""
+        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
+        with told(self.remote):
+            there = objects.files_below(place / manifest["generation"])
+        gone = [f"{place / manifest['generation'] / name} is not there." for name in manifest["files"].keys() - there]
+        try:
+            self.fetch(drive, names)
+        except DamagedDriveError as error:
+            return sorted({*gone, str(error)})
+        return sorted(gone)
+
+    def forget(self, drive: str) -> None:
+        """Free the disk of a drive's files; they are fetched anew where they are asked for again."""
+        with self._locks[drive]:
+            shutil.rmtree(self.run(drive), ignore_errors=True)
+            self._fetched.discard(drive)
+            if drive in self.manifests:
+                self.lay(self.manifests[drive])
+
+    def _again(self, drive: str) -> None:
+        """Read the manifest of a drive whose files are gone. Raises ResultError where some of them were handed out."""
+        place = self.remote / "runs" / folder_name(drive)
+        with told(self.remote):
+            found = self.read_manifest(place.name)
+        old = self.manifests[drive]
+        if found is not None and found["generation"] == old["generation"]:
+            raise DamagedDriveError(
+                f"{place} has lost files that its drive.json names. Copy them back, or {ADD_AGAIN}", drive
+            )
+        del self.manifests[drive]
+        shutil.rmtree(self.run(drive), ignore_errors=True)
+        if found is None:
+            raise ResultError(f"{drive} was removed from {self.remote} while it was read. Run again.")
+        if drive in self._fetched:
+            raise ResultError(f"{drive} was replaced in {self.remote} while it was read. Run again.")
+        self.lay(found)
+
+    def library(self, digest: str) -> None:
+        """Have a library in the local folder, if the map has it. Raises ResultError."""
+        target, place = self.local / "libraries" / digest, self.remote / "libraries" / digest
+        if target.exists() or not HASH.fullmatch(digest):
+            return
+        part, files = target.with_name(f".{digest}.part"), dict[str, str]()
+        if self.cache is None or not self.cache.take_library(digest, part):
+            with told(self.remote):
+                names = sorted(objects.files_below(place))
+                if "library.json" not in names:  # it is sent last
+                    return
+                for name in filter(is_below, names):
+                    (part / name).parent.mkdir(parents=True, exist_ok=True)
+                    files[name] = objects.fetch(place / name, part / name, _LIBRARY_FILE_BYTES)
+            if self.cache is not None:
+                self.cache.keep_library(digest, files, part)
+        part.rename(target)
+
+    def rest(self, names: Collection[str] = ()) -> None:
+        """Have all else that the map has in the local folder, or what of it has these names. Raises ResultError."""
+        before = None
+        for _ in range(3):
+            with told(self.remote):
+                manifest = read_rest(self.remote)
+            if manifest is None:
+                return
+            if manifest["generation"] == before:
+                raise ResultError(
+                    f"{self.remote}/rest has lost files that rest.json names. Move {self.remote}/rest.json away, and "
+                    f"join the drives again: vplog map join {self.remote}"
+                )
+            before = manifest["generation"]
+            place = self.remote / "rest" / manifest["generation"]
+            files = {name: about for name, about in manifest["files"].items() if self._is_of_a_drive(name)}
+            wanted = {name: about for name, about in files.items() if name in names or not names}
+            try:
+                for name, about in wanted.items():
+                    if why := self._bring(place / name, self.local / name, about):
+                        raise ResultError(
+                            f"{why}. Move {self.remote}/rest.json away, and join the drives again: vplog map join "
+                            f"{self.remote}"
+                        )
+                self.rest_manifest = manifest
+                return
+            except FileNotFoundError:
+                for name in wanted:
+                    (self.local / name).unlink(missing_ok=True)
+        raise ResultError(f"{self.remote}/rest is replaced faster than it can be read. Try again later.")
+
+    def _is_of_a_drive(self, name: str) -> bool:
+        """Whether the drive whose partition a file is in, if it is in one, is in the map."""
+        known = {folder_name(drive) for drive in self.manifests}
+        return all(part in known for part in PurePosixPath(name).parts if part.startswith("drive="))
+
+    def _bring(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
+        """Fetch an object, if the manifest names it and it is not here yet; what is wrong with it, if anything. Raises
+        FileNotFoundError where it is gone, and UnreachableError."""
+        if about is None or target.exists():
+            return ""
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if self.cache is not None and self.cache.take(about["sha256"], target):
+            return ""
+        part = target.with_name(f".{target.name}.part")
+        try:
+            digest = objects.fetch(place, part, about["bytes"])
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise UnreachableError(f"Cannot read {place}: {reason(error)}. Try again later.") from None
+        if (digest, part.stat().st_size) != (about["sha256"], about["bytes"]):
+            part.unlink()
+            return f"{place} does not have the length and sha256 that its manifest names"
+        part.replace(target)
+        if self.cache is not None:
+            self.cache.keep(digest, target)
+        return ""
+
+    def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
+        """As it is now; None where there is none. Raises OSError, and ResultError where it is damaged."""
+        place = self.remote / "runs" / drive_folder
+        data = objects.get(place / "drive.json")
+        if data is None:
+            return None
+        return sound_record(sound_manifest(data, place / "drive.json"), cast("Path", place))
+
+    def lay(self, manifest: dict[str, Any]) -> None:
+        """The drive's folder with its drive.json."""
+        folder = self.run(manifest["drive"])
+        folder.mkdir(parents=True, exist_ok=True)
+        own = {key: manifest[key] for key in manifest if key not in OWN}
+        text = json.dumps(own, indent=2, ensure_ascii=False) + "\n"  # as write_run_json has it
+        (folder / "drive.json").write_text(text, encoding="utf-8")
+        self.manifests[manifest["drive"]] = manifest
+
+    def take(self, manifest: dict[str, Any], made: Path) -> None:
+        """The folder of a drive that was just sent."""
+        folder = self.run(manifest["drive"])
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        made.rename(folder)
+        self.manifests[manifest["drive"]] = manifest
+        self.damaged.pop(manifest["drive"], None)
+        self._fetched.add(manifest["drive"])
+
+    def digest(self, drive: str, name: str) -> str | None:
+        """sha256 of a file of a drive, None where it has none of this name."""
+        about = self.manifests[drive]["files"].get(name) if drive in self.manifests else None
+        return None if about is None else str(about["sha256"])
+
+    def run(self, drive: str) -> Path:
+        return self.local / "runs" / folder_name(drive)
+
+
+def read_rest(remote: RemotePath) -> dict[str, Any] | None:
+    """The manifest of all that is neither a drive's nor a library's; None where there is none. Raises OSError, and
+    ResultError where it is damaged."""
+    data = objects.get(remote / "rest.json")
+    return None if data is None else sound_manifest(data, remote / "rest.json")
+
+
+@contextmanager
+def told(remote: RemotePath) -> Iterator[None]:
+    """What a store refuses, as an error of ours."""
+    try:
+        yield
+    except OSError as error:
+        raise UnreachableError(f"Cannot read or write {remote}: {reason(error)}.") from None
+
+
+def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
+    """A manifest whose names stay within the map. Raises ResultError."""
+    try:
+        manifest = json.loads(data)
+        files = manifest["files"]
+        generations = [manifest["generation"], manifest["replaces"] or manifest["generation"]]
+        sound = all(_GENERATION.fullmatch(one) for one in generations) and all(
+            isinstance(one["bytes"], int)
+            and isinstance(one.get("rows", 0), int)
+            and is_below(name)
+            and HASH.fullmatch(one["sha256"])
+            for name, one in files.items()
+        )
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        sound, manifest = False, {}
+    if not sound:
+        raise ResultError(f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}")
+    return manifest

@@ -1,0 +1,230 @@
+"""A reference library on disk: images, features and settings. The same files for every recogniser."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+
+import vplog
+from vplog.data import THUMBNAIL_SIDE, Features, Reference
+from vplog.errors import LibraryError
+from vplog.storage.folders import check_regular
+from vplog.storage.image_file import BadImageError, decode_image
+from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
+from vplog.storage.scratch import put_in_place, sync_all
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog.settings import Settings
+
+_FORMAT = 1
+"""Version of library.json. A reader refuses a newer one."""
+_MAX_FEATURES = 50_000_000
+"""Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
+
+
+def strongest(reference: Reference, count: int) -> Reference:
+    """The reference with at most its `count` strongest features."""
+    return replace(reference, features=reference.features.rows(slice(count)))
+
+
+def references_hash(references: Sequence[Reference], settings: Settings) -> str:
+    """sha256 over the settings, every feature: what descriptors depend on."""
+    digest = hashlib.sha256(json.dumps(settings.model_dump(mode="json"), sort_keys=True).encode())
+    features = [reference.features for reference in references]
+    start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype("<i4")
+    digest.update(np.array([(f.width, f.height) for f in features], "<i4").tobytes())
+    digest.update(start.tobytes())
+    for f in features:
+        digest.update(np.ascontiguousarray(f.points, "<f4").tobytes())
+        digest.update(np.ascontiguousarray(f.descriptors).tobytes())
+    return digest.hexdigest()
+
+
+_FEATURES = pa.schema(
+    [
+        ("reference", pa.int32()),
+        ("x", pa.float32()),
+        ("y", pa.float32()),
+        ("size", pa.float32()),
+        ("descriptor", pa.binary(128)),
+    ]
+)
+_REFERENCES = pa.schema(
+    [
+        ("drive", pa.string()),
+        ("stamp_ns", pa.int64()),
+        ("width", pa.int32()),
+        ("height", pa.int32()),
+        ("image", pa.binary()),
+    ]
+)
+
+
+def save_references(references: Sequence[Reference], settings: Settings, folder: Path) -> None:
+    """Write references.parquet (images as PNG), features.parquet and library.json, the last one last."""
+    check_regular(folder, "library.json")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "library.json").unlink(missing_ok=True)
+        features = [reference.features for reference in references]
+        owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
+        points = np.concatenate([f.points for f in features])
+        descriptors = np.concatenate([f.descriptors for f in features])
+        _write(
+            folder / "features.parquet",
+            pa.table(
+                {
+                    "reference": owners,
+                    "x": points[:, 0],
+                    "y": points[:, 1],
+                    "size": np.concatenate([f.sizes for f in features]),
+                    "descriptor": pa.FixedSizeBinaryArray.from_buffers(
+                        pa.binary(128), len(owners), [None, pa.py_buffer(np.ascontiguousarray(descriptors))]
+                    ),
+                },
+                schema=_FEATURES,
+            ),
+            compression="zstd",
+        )
+        _write(
+            folder / "references.parquet",
+            pa.table(
+                {
+                    "drive": [r.drive for r in references],
+                    "stamp_ns": [r.stamp_ns for r in references],
+                    "width": [f.width for f in features],
+                    "height": [f.height for f in features],
+                    "image": [cv2.imencode(".png", r.image)[1].tobytes() for r in references],
+                },
+                schema=_REFERENCES,
+            ),
+            compression="none",
+        )
+        record = {
+            "format": _FORMAT,
+            "vplog": vplog.__version__,
+            "hash": references_hash(references, settings),
+            "references": len(references),
+            "features": len(owners),
+            "settings": settings.model_dump(mode="json"),
+        }
+        part = folder / f".library.json.{os.getpid()}.part"
+        part.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        sync_all(folder)
+        put_in_place(part, folder / "library.json")
+    except OSError as error:
+        raise LibraryError(
+            f"Cannot write the library {folder}: {error.strerror or error}. Choose another folder."
+        ) from None
+
+
+def _write(path: Path, table: pa.Table, compression: str) -> None:
+    with path.open("wb") as stream:
+        write_table(stream, table, compression=compression)
+
+
+def read_library_record(folder: Path) -> dict[str, Any]:
+    """library.json of a saved library. Raises LibraryError where the folder is not one, ResultError where something in
+    it is not its own file."""
+    check_regular(folder, "library.json")
+    try:
+        check_file(folder / "library.json")
+        record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise LibraryError(
+            f"{folder} is not a library: it has no library.json. Build one: vplog library LOG -o {folder}"
+        ) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise LibraryError(
+            f"{folder}/library.json cannot be read: {error}. Build it again with `vplog library`."
+        ) from None
+    if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
+        raise LibraryError(f"{folder}/library.json lacks its hash or settings; build it again with `vplog library`.")
+    check_version(folder / "library.json", record.get("format", _FORMAT), _FORMAT, record.get("vplog"))
+    return record
+
+
+def read_sources(folder: Path) -> set[tuple[str, int]]:
+    """Log and stamp in ns of every reference of a saved library. Raises LibraryError."""
+    try:
+        table = _table(folder / "references.parquet", _REFERENCES)
+        return set(zip(table["drive"].to_pylist(), table["stamp_ns"].to_pylist(), strict=True))
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}.") from None
+
+
+def load_references(folder: Path, threads: int = 1) -> list[Reference]:
+    """The references of a saved library, in their order. Raises LibraryError where the files do not fit together,
+    ResultError where something in the folder is not its own file."""
+    check_regular(folder, "library.json")
+    try:
+        features = _table(folder / "features.parquet", _FEATURES)
+        references = _table(folder / "references.parquet", _REFERENCES)
+        if any(column.null_count for table in (features, references) for column in table.columns):
+            raise LibraryError(f"{folder}: the tables have empty cells; build it again with `vplog library`.")
+        entries = references.to_pylist()
+    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
+        raise LibraryError(
+            f"{folder} cannot be read: {str(error).splitlines()[0]}. Build it again with `vplog library`."
+        ) from None
+    owners = features["reference"].to_numpy()
+    start = np.searchsorted(owners, np.arange(len(references) + 1))
+    if len(owners) and (owners[0] < 0 or owners[-1] >= len(references) or np.any(np.diff(owners) < 0)):
+        raise LibraryError(
+            f"{folder}: features.parquet names references that references.parquet lacks; build it again."
+        )
+    points = np.column_stack([features["x"].to_numpy(), features["y"].to_numpy()]).astype(np.float32)
+    sizes = features["size"].to_numpy()
+    descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
+
+    def reference(row: int) -> Reference:
+        entry = entries[row]
+        part = slice(int(start[row]), int(start[row + 1]))
+        width, height = entry["width"], entry["height"]
+        if not (0 < width < 2**15 and 0 < height < 2**15) or not np.all(
+            (points[part] > -1) & (points[part] < [width, height])
+        ):
+            raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
+        image = _decode(entry["image"])
+        if image is None or image.shape != (height, width):
+            raise LibraryError(
+                f"{folder}: the image of reference {row} is damaged; build it again with `vplog library`."
+            )
+        nothing = np.full(part.stop - part.start, np.nan, np.float32)
+        thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        found = Features(points[part], sizes[part], descriptors[part], nothing, width, height, thumbnail)
+        return Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"])
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(reference, range(len(entries))))
+
+
+def _table(path: Path, schema: pa.Schema) -> pa.Table:
+    with open_table(path) as file:
+        try:
+            check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+            if file.metadata.num_rows > _MAX_FEATURES:
+                raise ValueError(f"{file.metadata.num_rows} rows")
+        except ValueError as error:
+            raise LibraryError(
+                f"{path.parent}: the tables are not those of a library ({error}); build it again with `vplog library`."
+            ) from None
+        return read_table(path, file, schema.names).select(schema.names)
+
+
+def _decode(data: bytes) -> np.ndarray | None:
+    try:
+        return decode_image(data)
+    except BadImageError:
+        return None

@@ -1,0 +1,1 @@
+"""The steps of one drive, as the pipeline lists them."""

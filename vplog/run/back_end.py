@@ -1,0 +1,159 @@
+"""From odometry and verified closures to the trajectory: build, solve, hold against the odometry, refine, judge."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vplog.cache.steps import step
+from vplog.data import EdgeKind, Verdict
+from vplog.execution.cores import limited
+from vplog.graph import build, consistency, correct_trajectory
+from vplog.graph.consistency import is_loop
+from vplog.graph.cross_check import cross_checked
+from vplog.graph.gps_factors import fixes_on
+from vplog.graph.gps_gate import keep_odometry_if_further
+from vplog.graph.noise import edge_covariance
+from vplog.graph.refine import refine
+from vplog.graph.solve import gated
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.execution.execution import Execution
+    from vplog.graph.cross_check import CrossCheckSettings
+    from vplog.graph.gps_factors import Fixes, GpsSettings
+    from vplog.graph.noise import NoiseSettings
+    from vplog.graph.refine import Refined, RefineSettings
+    from vplog.graph.solve import OptimiserSettings
+
+
+_log = logging.getLogger(__name__)
+
+_CONTRADICTED = (
+    "The odometry's covariance is too small and was replaced by the drift model: with it the solver keeps no "
+    "closure, with the model {kept} of {count}."
+)
+
+
+class BackEnd(Protocol):
+    """The settings that these steps take."""
+
+    @property
+    def noise(self) -> NoiseSettings: ...
+    @property
+    def solve(self) -> OptimiserSettings: ...
+    @property
+    def cross_check(self) -> CrossCheckSettings: ...
+    @property
+    def refine(self) -> RefineSettings: ...
+    @property
+    def gps(self) -> GpsSettings: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What came of a drive's constraints."""
+
+    closures: Closures
+    """The ledger, judged."""
+    refined: Refined
+    fixes: Fixes | None
+    """GPS, where it was asked for."""
+    trajectory: Trajectory
+    noise_source: str
+    """Of the odometry's noise, as `edge_covariance` names it."""
+    warnings: list[str]
+
+
+@step("solve")
+def solve(
+    odometry: Odometry,
+    keyframes: Keyframes,
+    closures: Closures,
+    gps: Gps | None,
+    settings: BackEnd,
+    *,
+    execution: Execution,
+) -> Solved:
+    """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
+    with limited(execution.threads):
+        solved = _solve(odometry, keyframes, closures, gps, settings)
+    for warning in solved.warnings:
+        _log.warning(warning)
+    return solved
+
+
+def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
+    covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
+    graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
+    solution = solve_gated(graph, settings)
+    if source != "model" and len(rows) and not (solution.weight[is_loop(graph)] > 0.5).any():
+        # a covariance is the least reliable thing in a log; closures that agree with a usual drift speak against it
+        usual = settings.noise.model_copy(update={"source": "model"})
+        modelled, _, _ = edge_covariance(odometry, keyframes.stamp_ns, usual)
+        other, _, _ = build.build_graph(keyframes, modelled, closures)
+        again = solve_gated(other, settings)
+        if kept := int((again.weight[is_loop(other)] > 0.5).sum()):
+            graph, solution, source = other, again, "model"
+            doubts = [*doubts, _CONTRADICTED.format(count=len(rows), kept=kept)]
+    fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
+    if fixes is not None:
+        solution = keep_odometry_if_further(graph, solution, fixes)
+    refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
+    return Solved(
+        judge(closures, graph, refined, rows),
+        refined,
+        fixes,
+        correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body),
+        source,
+        doubts + repairs + (fixes.warnings if fixes else []),
+    )
+
+
+def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
+    """The robust solution, or the odometry where that cannot be believed."""
+    return cross_checked(graph, gated(graph, settings.solve), settings.cross_check)
+
+
+def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
+    """(E,) edges whose metres are the odometry's: its own, and closures (ledger `rows`) with its scale."""
+    result = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    result[~result] = [closures.scale[row] == "odometry" for row in rows.tolist()]
+    return result
+
+
+def about_gps(solved: Solved) -> dict[str, Any] | None:
+    """What run.json says of GPS: how many fixes were kept, and where on earth the trajectory's frame is."""
+    fixes, refined = solved.fixes, solved.refined
+    if fixes is None or refined.world_from_enu is None:
+        return None
+    latitude, longitude, altitude = fixes.origin
+    return {
+        "fixes": len(fixes),
+        "kept": int(refined.inlier.sum()),
+        "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude},
+        "world_from_enu": refined.world_from_enu.tolist(),
+    }
+
+
+def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) -> Closures:
+    """The ledger with what the solve made of the closures in the graph: residuals, weights, verdicts.
+
+    Residuals before are to the odometry as it was assumed to be, those after to the odometry as it turned out.
+    """
+    solution = refined.solution
+    loops = np.array([kind == EdgeKind.LOOP for kind in graph.kind], bool)
+    before, after, weight = (np.full(len(closures), np.nan) for _ in range(3))
+    before[rows] = consistency.residual_before(graph)[loops]
+    after[rows] = consistency.residual_sigma(refined.graph, solution.world_from_body)[loops]
+    weight[rows] = solution.weight[loops]
+    verdict = list(closures.verdict)
+    for row in rows.tolist():
+        if weight[row] < 0.5 and verdict[row] is Verdict.ACCEPTED:
+            verdict[row] = Verdict.REJECTED_BY_SOLVER
+    return replace(closures, residual_before=before, residual_after=after, weight=weight, verdict=verdict)

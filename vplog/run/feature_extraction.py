@@ -1,0 +1,323 @@
+"""Extraction in parts: stretches of keyframes, each decoded and described by itself, and one file of the stage cache.
+
+    parts = parts_of(path, pipeline, topics)       # what there is to do
+    data = compute_part(part)                      # in any process, on any machine that reads the log by its path
+    put_part(cache, part, data)                    # where run(path, ..., topics=topics, cache=cache) finds it
+
+A part's bytes are the same whoever computes it, a run among others: frames of a video are decoded from the key frame
+before them, depth and stereo frame by frame. Settings of the library do not count: a part does not know which of its
+keyframes become references.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vplog import logs
+from vplog.cache.checked_file import AbsentError, DamagedError, check_file, content_of, file_name, sealed
+from vplog.cache.code_hash import code_of
+from vplog.cache.feature_shards import Extracted, packed
+from vplog.cache.input_hashes import files_of
+from vplog.cache.stage_cache import StageCache, finished_parts, inputs_of, key_of
+from vplog.cache.steps import step
+from vplog.data import Keyframes
+from vplog.errors import LogError, ResultError
+from vplog.features.extraction import extract_frames
+from vplog.results.previews import preview
+from vplog.run.keyframes import select_keyframes
+from vplog.storage.remote_path import address, located
+from vplog.storage.scratch import replacing
+from vplog.storage.urls import shown
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.cache.stage_cache import Inputs
+    from vplog.cache.steps import Steps
+    from vplog.data import Camera, Features, Frame, Odometry
+    from vplog.execution.execution import Execution
+    from vplog.features.sift import SiftSettings
+    from vplog.features.stereo_depth import StereoSettings
+    from vplog.results.previews import PictureSettings
+    from vplog.run.keyframes import KeyframeSettings
+    from vplog.stages import Log
+
+    Decoded = tuple[int, Frame | None, Features | None, str]
+    """Of `extract_frames`: stamp, frame, features, and why there are none."""
+
+_log = logging.getLogger(__name__)
+_UNCALIBRATED = (
+    "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
+    "Record its camera_info, or name it with --camera-info-topic."
+)
+
+PART_KEYFRAMES = 64
+"""Keyframes of a part: about 6 s of one core and 20 MB. A kill costs at most one part, and who computes one elsewhere
+opens the log for it, which reads it through once."""
+
+
+class Extraction(Protocol):
+    """The settings that extraction takes, as the pipeline has them."""
+
+    @property
+    def keyframes(self) -> KeyframeSettings: ...
+    @property
+    def features(self) -> SiftSettings: ...
+    @property
+    def stereo(self) -> StereoSettings: ...
+    @property
+    def pictures(self) -> PictureSettings: ...
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a drive's keyframes; goes to another process as it is."""
+
+    log: tuple[str, ...]
+    """Paths or URLs of the files of the drive."""
+    lengths: str
+    """sha256 over those of all these files."""
+    topics: logs.TopicChoice
+    pipeline: Extraction
+    stamp_ns: tuple[int, ...]
+    """Of its keyframes, increasing."""
+    number: int
+    key: str
+    """sha256 over all that its content depends on."""
+
+    @property
+    def file(self) -> str:
+        """Its name in a cache."""
+        return file_name(f"extract-{self.number:06d}", self.key)
+
+
+def parts_of(
+    path: Path | Sequence[Path],
+    pipeline: Extraction,
+    topics: logs.TopicChoice | None = None,
+    cache: Path | None = None,
+) -> list[Part]:
+    """What a run of this drive has to extract. With its cache, a log that was only touched is known by its content.
+
+    Raises LogError where there is no such log, or nothing to extract in it.
+    """
+    log = logs.open_drive(files_of(path), topics)
+    keyframes, _ = select_keyframes(log.name, log.stamps(), odometry_of(log), pipeline.keyframes)
+    return cut(path, topics, pipeline, keyframes, inputs_of(path, cache))
+
+
+def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
+    """The parts that the cache does not hold, or not whole."""
+
+    def held(part: Part) -> bool:
+        try:
+            check_file(cache / part.file, part.key)
+        except (AbsentError, DamagedError):
+            return False
+        return True
+
+    return [part for part in parts if not held(part)]
+
+
+def compute_part(part: Part, threads: int = 1) -> bytes:
+    """Decode and describe a part's keyframes: the bytes of its file. The same on any machine and any `threads`.
+
+    Raises LogError where the log cannot be read, or is another one than `parts_of` saw.
+    """
+    paths = [located(path) for path in part.log]
+    log = logs.open_drive(paths, part.topics)
+    if inputs_of(paths, None).lengths != part.lengths:
+        raise LogError(f"{paths[0]} changed during the run. Run again when it is written or copied to its end.")
+    return sealed(part.key, _content(log, part, _frames(log, [part], threads)))
+
+
+def put_part(cache: Path, part: Part, data: bytes) -> None:
+    """Put what `compute_part` gave into a drive's cache, as a whole. Raises ResultError."""
+    try:
+        content_of(data, part.key)
+    except DamagedError as error:
+        raise ResultError(f"Part {part.number} of {shown(part.log[0])} arrived damaged: {error}. Run again.") from None
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"Cannot make the folder {cache}: {error.strerror}.") from None
+    with replacing(cache / part.file) as stream:
+        stream.write(data)
+
+
+def stored_features(cache: Path) -> Extracted | None:
+    """The features of a finished run's keyframes by their rows; None where the cache does not hold them all."""
+    names = finished_parts(cache)
+    found = Extracted()
+    try:
+        for name in names:
+            check_file(cache / name)
+            found.add(cache / name)
+    except (AbsentError, DamagedError):
+        return None
+    return found if names else None
+
+
+def cut(
+    drive: Path | Sequence[Path],
+    topics: logs.TopicChoice | None,
+    settings: Extraction,
+    keyframes: Keyframes,
+    inputs: Inputs,
+) -> list[Part]:
+    """The keyframes in parts. Raises LogError where there is only one."""
+    stamp_ns = keyframes.stamp_ns
+    if len(stamp_ns) < 2:
+        raise LogError(
+            f"{keyframes.drive}: by the odometry nothing moves far enough for a second keyframe, and a graph needs "
+            "two. Set keyframes.distance_m lower, or choose another topic with --odometry-topic."
+        )
+    topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files_of(drive))
+    alike = {
+        "inputs": inputs.token,
+        "topics": images_topics(topics),
+        "features": settings.features.model_dump(mode="json"),
+        "stereo": settings.stereo.model_dump(mode="json"),
+        "pictures": settings.pictures.model_dump(mode="json", include={"megapixels", "quality"}),
+        **code_of(__name__, type(settings.features).__module__),
+    }
+    stamps = [tuple(stamp_ns[at : at + PART_KEYFRAMES].tolist()) for at in range(0, len(stamp_ns), PART_KEYFRAMES)]
+    return [
+        Part(paths, inputs.lengths, topics, settings, own, number, key_of({**alike, "stamps": own}))
+        for number, own in enumerate(stamps)
+    ]
+
+
+def images_topics(topics: logs.TopicChoice) -> dict[str, Any]:
+    """The choice of topics as far as images depend on it; files beside the log by their content."""
+    named = topics.model_dump(mode="json", exclude={"gps"})
+    for name, file in (("odometry_file", topics.odometry_file), ("calibration_file", topics.calibration_file)):
+        if file is not None:
+            with file.open("rb") as stream:
+                named[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return named
+
+
+@step("read")
+def read(log: Log, settings: KeyframeSettings) -> tuple[Odometry, Camera, Keyframes]:
+    """Odometry, camera and selected keyframes of a drive. Raises LogError where there is no odometry."""
+    odometry = odometry_of(log)
+    selected, doubts = select_keyframes(log.name, log.stamps(), odometry, settings)
+    for doubt in doubts:
+        _log.warning(doubt)
+    if (camera := log.camera()).matrix is None:
+        _log.warning(_UNCALIBRATED, camera.name)
+    return odometry, camera, selected
+
+
+def odometry_of(log: Log) -> Odometry:
+    """Raises LogError where there is none."""
+    odometry = log.odometry()
+    if odometry is None or len(odometry.stamp_ns) < 2:
+        raise LogError(
+            f"{log.name} has no odometry, and a trajectory is built on it. "
+            "`vplog info` lists the topics; choose one with --odometry-topic."
+        )
+    return odometry
+
+
+@step("extract", items=lambda log, topics, keyframes, settings: len(keyframes.stamp_ns))
+def extract(
+    log: Log,
+    topics: logs.TopicChoice,
+    keyframes: Keyframes,
+    settings: Extraction,
+    *,
+    steps: Steps,
+    execution: Execution,
+) -> Extracted:
+    """The keyframes' features: of the parts that the cache holds from there, of the others from the log's images.
+
+    Raises LogError where fewer than two keyframes decode, and ResultError where the disk is full.
+    """
+    cache = steps.cache
+    parts = cut(cache.drive, topics, settings, keyframes, cache.inputs)
+    missing = [part for part in parts if not _held(cache, part)]
+    total = sum(len(part.stamp_ns) for part in parts)
+    done = total - sum(len(part.stamp_ns) for part in missing)
+    # one stream over all that is missing: workers do not wait at the end of a part
+    frames = _frames(log, missing, execution.threads) if missing else ()
+    counted = _counted(frames, lambda count: execution.progress("extract", done + count, total))
+    for part in missing:
+        cache.put(part.file, sealed(part.key, _content(log, part, counted)))
+    found = Extracted()
+    for part in parts:
+        found.add(cache.folder / part.file)
+    _count(log, found.undecodable)
+    if len(found) < 2:
+        why = f" The first: {found.lost[0]}" if found.lost else ""
+        raise LogError(f"{log.name}: {len(found)} of {total} keyframes could be decoded, and a graph needs two.{why}")
+    steps.count("extract", len(parts), len(parts) - len(missing))
+    return found
+
+
+def decoded(keyframes: Keyframes, found: Extracted) -> Keyframes:
+    """The keyframes whose images decode, with a warning where that is not all of them."""
+    rows, total = np.searchsorted(keyframes.stamp_ns, found.stamp_ns), len(keyframes.stamp_ns)
+    for why in found.lost[:1]:
+        _log.warning("%d of %d keyframes were lost to damaged images. First: %s", total - len(rows), total, why)
+    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows])
+
+
+def _held(cache: StageCache, part: Part) -> bool:
+    """Whether the cache holds the part whole."""
+    path, found = cache.folder / part.file, Extracted()
+    if not cache.keep:
+        return False
+    try:
+        check_file(path, part.key)
+        found.add(path)
+        if not set(found.stamp_ns) <= set(part.stamp_ns) or found.stamp_ns != sorted(set(found.stamp_ns)):
+            raise DamagedError("it holds other keyframes")
+    except AbsentError:
+        return False
+    except DamagedError as error:
+        cache.damaged(path, error)
+        return False
+    cache.use(part.file)
+    return True
+
+
+def _content(log: Log, part: Part, frames: Iterable[Decoded]) -> bytes:
+    """What the file of a part holds; `frames` gives its keyframes in order, and maybe more."""
+    found, lost = [], []
+    for stamp_ns, frame, features, why in islice(frames, len(part.stamp_ns)):
+        if frame is None or features is None:
+            lost.append(why)
+        else:
+            found.append((stamp_ns, features, preview(frame.image, part.pipeline.pictures)))
+    account = getattr(log, "account", None)
+    return packed(found, lost, [] if account is None else account.undecodable(part.stamp_ns))
+
+
+def _count(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:
+    """Losses that were found when a part was computed are those of this run too; counted twice they count once."""
+    account = getattr(log, "account", None)
+    if account is not None:
+        for topic, at in undecodable:
+            account.add("undecodable_image", {topic: 1}, (topic, at), [(at, at)])
+
+
+def _frames(log: Log, parts: Sequence[Part], threads: int) -> Iterator[Decoded]:
+    """The keyframes of some parts of a drive, decoded, with their features, in order."""
+    stamp_ns = np.array([stamp_ns for part in parts for stamp_ns in part.stamp_ns], np.int64)
+    settings = parts[0].pipeline
+    return extract_frames(log.frames(stamp_ns), settings.features, threads, settings.stereo)
+
+
+def _counted(frames: Iterable[Decoded], tell: Callable[[int], None]) -> Iterator[Decoded]:
+    for count, frame in enumerate(frames, start=1):
+        tell(count)
+        yield frame

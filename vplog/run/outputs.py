@@ -1,0 +1,158 @@
+"""What comes of a run, and the files of its folder."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vplog.cache.steps import step
+from vplog.data import EdgeKind, Verdict
+from vplog.figures.run_figures import ClosureInputs, earth_of, finished_picture, reference_use
+from vplog.geometry import tum
+from vplog.graph import consistency
+from vplog.results import g2o, mcap, run_record, tables
+from vplog.run import provenance
+from vplog.run.back_end import about_gps
+from vplog.run.report import write_report
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog.cache.feature_shards import Extracted
+    from vplog.cache.steps import Steps
+    from vplog.data import Camera, Closures, Keyframes, Odometry, PoseGraph, Reference, Solution
+    from vplog.execution.execution import Execution
+    from vplog.loops.verify import VerifySettings
+    from vplog.places.coverage import Coverage
+    from vplog.results.previews import PictureSettings
+    from vplog.run.back_end import Solved
+    from vplog.stages import Log, PlaceState
+
+
+class Pictured(Protocol):
+    """The settings of what a run shows, as the pipeline has them."""
+
+    @property
+    def verify(self) -> VerifySettings: ...
+    @property
+    def pictures(self) -> PictureSettings: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """All that a finished run knows."""
+
+    log: Log
+    odometry: Odometry
+    camera: Camera
+    keyframes: Keyframes
+    features: Extracted
+    """Of the keyframes, as long as the stage cache is there."""
+    library: Path | None
+    """The folder of the library given; None where the references are of the drive's own keyframes."""
+    references: list[Reference]
+    state: PlaceState
+    coverage: Coverage
+    places: Sequence[Any]
+    """Descriptors of the keyframes."""
+    solved: Solved
+    record: dict[str, Any] = field(default_factory=dict)
+    """What run.json holds."""
+
+    @property
+    def closures(self) -> Closures:
+        return self.solved.closures
+
+    @property
+    def graph(self) -> PoseGraph:
+        return self.solved.refined.graph
+
+    @property
+    def solution(self) -> Solution:
+        return self.solved.refined.solution
+
+
+@step("write")
+def write(
+    folder: Path,
+    run: Run,
+    pipeline: Pictured,
+    header: tables.TableMetadata,
+    *,
+    steps: Steps,
+    execution: Execution,
+) -> None:
+    """Write the tables, the trajectory, the graph and result.mcap of a run into its folder."""
+    log, keyframes, trajectory, poses = run.log, run.keyframes, run.solved.trajectory, run.solution.world_from_body
+    previews, gps = run.features.pictures, log.gps()
+    inputs = ClosureInputs(previews.image, run.features.__getitem__, run.camera, run.state, run.places)
+    shown = finished_picture(
+        inputs, previews, run.closures, run.references, pipeline.verify, pipeline.pictures, execution.threads, gps=gps,
+        earth=earth_of(trajectory, gps, about_gps(run.solved)),
+        about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
+    )  # fmt: skip
+    column = [run.state.to_arrow(run.places)]
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, run.state.arrow_type, header)
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
+    tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
+    residual = consistency.residual_sigma(run.graph, poses)
+    tables.write_edges(folder / "edges.parquet", run.graph, run.solution, residual, header)
+    tables.write_trajectory(folder / "trajectory.parquet", trajectory, run.odometry, header)
+    tum.write_tum(folder / "trajectory.tum", trajectory)
+    g2o.write_g2o(folder / "graph.g2o", run.graph, poses)
+    mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, run.camera, shown)
+    if run.library is None:
+        run.state.save(folder / "library")
+    steps.cache.finish(run.features.files)
+
+
+@step("report")
+def report(folder: Path, run: Run, head: dict[str, Any], *, steps: Steps) -> dict[str, Any]:
+    """Write report.html of the run in `folder`; the record for its run.json, but for the time that this step takes."""
+    account = {**head, **_account(run), "inputs": steps.cache.hashes(), "warnings": run.log.warnings + steps.warnings}
+    write_report(folder, {**account, **steps.account()})
+    return account
+
+
+def finish(folder: Path, run: Run, account: dict[str, Any], steps: Steps) -> Run:
+    """Write run.json, the last file of a run, and give the run with its content."""
+    account = {**account, **steps.account(), "finished": True}
+    run_record.write_run_json(folder / "run.json", account)
+    return replace(run, record=account)
+
+
+def _account(run: Run) -> dict[str, Any]:
+    """What run.json says of the results."""
+    solution, refined, verdicts = run.solution, run.solved.refined, run.closures.verdict
+    constrained = EdgeKind.LOOP in run.graph.kind or run.solved.fixes
+    return {
+        "library": {
+            "hash": run.state.hash,
+            "from": provenance.library_of(run.library),
+            "references": len(run.references),
+            "used": reference_use(run.state, run.places),
+            "coverage": asdict(run.coverage),
+        },
+        "descriptor_bits": run.state.bits,
+        "counts": {
+            "frames": len(run.log.stamps()),
+            "odometry": len(run.odometry.stamp_ns),
+            "keyframes": len(run.keyframes.stamp_ns),
+            "candidates": len(run.closures),
+            "verdicts": {verdict.value: verdicts.count(verdict) for verdict in Verdict if verdict in verdicts},
+        },
+        "losses": [asdict(loss) for loss in getattr(run.log, "losses", [])],
+        "noise": run.solved.noise_source,
+        "solution": {
+            "error_before": solution.error_before,
+            "error_after": solution.error_after,
+            "iterations": solution.iterations,
+            "converged": solution.converged,
+            "reason": solution.reason if constrained else "No closure passed verification.",
+        },
+        "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
+        "gps": about_gps(run.solved),
+    }

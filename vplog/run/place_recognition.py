@@ -1,0 +1,63 @@
+"""Place recognition of a drive by a learned recogniser: descriptors of all keyframes, and which may be returns."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from vplog.cache.codecs import columns_codec, descriptors_codec
+from vplog.cache.steps import step
+from vplog.features.extraction import map_in_order, one_thread_each
+from vplog.loops.propose import Proposals, candidate_stops, propose
+from vplog.places.sequence import rank_places
+from vplog.stages import BoxState
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vplog.cache.feature_shards import Extracted
+    from vplog.data import Closures, Keyframes
+    from vplog.execution.execution import Execution
+    from vplog.loops.propose import ProposeSettings
+    from vplog.places.sequence import SequenceSettings
+    from vplog.stages import PlaceState
+
+
+@step(
+    "describe",
+    lambda state, features: descriptors_codec(state, len(features)),
+    items=lambda state, features: len(features),
+)
+def describe(state: PlaceState, features: Extracted, *, execution: Execution) -> Sequence[Any]:
+    """A descriptor for every keyframe, in order."""
+    result, threads = [], execution.threads
+    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        work = map_in_order(pool, lambda row: state.describe(features[row]), range(len(features)), ahead=4 * threads)
+        for descriptor in work:
+            result.append(descriptor)
+            execution.progress("describe", len(result), len(features))
+    return result
+
+
+@step("propose", lambda *_: columns_codec(Proposals), items=lambda state, descriptors, *_: len(descriptors))
+def find_candidates(
+    state: PlaceState,
+    descriptors: Sequence[Any],
+    keyframes: Keyframes,
+    settings: ProposeSettings,
+    sequence: SequenceSettings,
+    *,
+    execution: Execution,
+) -> Proposals:
+    """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
+    index, stops = state.index(descriptors), candidate_stops(keyframes, settings)
+    return propose(rank_places(index, descriptors, stops, settings.asked, sequence, execution.threads), settings)
+
+
+def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:
+    """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
+    if not isinstance(state, BoxState):
+        return closures
+    found = state.shared(descriptors, closures.query, closures.match)
+    return replace(closures, shared_references=found.references, shared_overlap=found.overlap)

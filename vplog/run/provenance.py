@@ -1,0 +1,121 @@
+"""The run folder's own account: what was run, on what, and what was said on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+import vplog
+from vplog import logs
+from vplog.cache.input_hashes import bytes_of, files_of, look_of
+from vplog.errors import LogError, ResultError
+from vplog.results import run_record
+from vplog.storage.remote_path import local_copy, located, original, reason
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.settings import Settings
+    from vplog.stages import Log
+
+
+OWN_LIBRARY = "the drive's own keyframes"
+"""Where the library of a run is from to which none was given."""
+
+
+_NO_QUERY = " URLs are kept without their query, which may hold a token."
+
+
+def stored_log(text: str, whose: str, again: str) -> Path:
+    """A log by where a record says it is. Raises LogError, which ends with how to give it `again`, where it is gone or
+    cannot be asked for, as a signed link without its signature."""
+    path = located(text)
+    try:
+        if path.exists():
+            return path
+        why = "no longer exists"
+    except OSError as error:
+        why = f"cannot be opened ({reason(error)})"
+    no_query = _NO_QUERY if text.startswith("http") else ""
+    raise LogError(f"{whose} {path} {why}.{no_query} {again}")
+
+
+def reopened(
+    account: dict[str, Any],
+    log: Path | None,
+    topics: logs.TopicChoice | None,
+    again: str = "Say where it is: --log LOG.",
+) -> Log:
+    """The log of a run by its run.json, or the one given in its place. Raises LogError, which says how to give it
+    `again`, or ResultError where none is."""
+    if log is None and not isinstance(account.get("log"), str):
+        raise ResultError("The run's run.json lacks log. Run `vplog run` again.")
+    parts = account.get("parts") or [account.get("log")]
+    known = [log] if log is not None else [stored_log(str(part), "The log of the run", again) for part in parts]
+    if log is not None and not log.exists():
+        raise LogError(f"There is no log at {log}. {again}")
+    return logs.open_drive(known, topics)
+
+
+def stat_of(files: Sequence[Path]) -> dict[str, Any]:
+    """Length of the files of a log, and a sha256 over their paths, lengths and times: unchanged means the same log."""
+    look = run_record.canonical_json(look_of(files)).encode()
+    return {"bytes": bytes_of(files), "sha256": hashlib.sha256(look).hexdigest()}
+
+
+def library_of(library: Path | None) -> str:
+    """What run.json says of where a library is from."""
+    return OWN_LIBRARY if library is None else str(original(library).resolve())
+
+
+def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
+    """What run.json says of the logs of several drives."""
+    return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)} if drives else {}
+
+
+@contextmanager
+def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
+    """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
+    library = folder / "library"
+    if not (library / "library.json").is_file():
+        told = account.get("library")
+        if not isinstance(told, dict) or not isinstance(told.get("from"), str):
+            raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
+        library = located(told["from"])
+    with local_copy(library) as here:
+        yield here
+
+
+def head(
+    pipeline: Settings, path: Path | Sequence[Path], threads: int, topics: logs.TopicChoice | None = None
+) -> dict[str, Any]:
+    """What run.json says of what was asked for, and of the machine."""
+    files = [str(file.resolve()) for file in files_of(path)]
+    return {
+        "format": run_record.FORMAT,
+        "vplog": vplog.__version__,
+        "log": files[0],
+        **({"parts": files} if len(files) > 1 else {}),
+        "log_stat": stat_of(files_of(path)),
+        "threads": threads,
+        "settings": pipeline.model_dump(mode="json"),
+        "versions": versions(),
+        **({} if topics is None else {"topics": topics.model_dump(mode="json")}),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on."""
+    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
+    return {"python": platform.python_version(), **{name: _version(name) for name in packages}}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

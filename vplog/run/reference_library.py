@@ -1,0 +1,232 @@
+"""Reference libraries: of a drive's own keyframes, of frames of several logs, and how far one explains a drive."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from vplog import logs
+from vplog.cache.codecs import images_codec, json_codec
+from vplog.cache.steps import step
+from vplog.data import Reference
+from vplog.errors import LibraryError, SettingsError
+from vplog.features.extraction import extract_frames
+from vplog.places.coverage import (
+    STRONGEST,
+    Coverage,
+    choose_by_coverage,
+    coverage_warning,
+    frames_needed,
+    measure_coverage,
+)
+from vplog.places.library import WordSettings
+from vplog.places.library import build_library as index_words
+from vplog.places.library_files import load_references, read_library_record, read_sources
+from vplog.places.reference_choice import PAPER_SIZE, choose, evenly
+from vplog.results.staging import recover, staged
+from vplog.storage.folders import check_regular
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from vplog.cache.codecs import Codec
+    from vplog.cache.feature_shards import Extracted
+    from vplog.data import Bytes, Ints, Keyframes
+    from vplog.execution.execution import Execution
+    from vplog.features.sift import SiftSettings
+    from vplog.places import PlaceSettings
+    from vplog.places.reference_choice import LibrarySettings
+    from vplog.stages import Log, PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+_log = logging.getLogger(__name__)
+
+
+class Describing(Protocol):
+    """The settings that a library is made with, as the pipeline has them."""
+
+    @property
+    def features(self) -> SiftSettings: ...
+    @property
+    def library(self) -> LibrarySettings: ...
+    @property
+    def places(self) -> PlaceSettings: ...
+
+
+def check_library(folder: Path | None, pipeline: Describing) -> None:
+    """Before any work: is what was given a library, and made as this run describes places? Raises LibraryError."""
+    if folder is None:
+        return
+    recover(folder)
+    made = pipeline.places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
+    for name, value in pipeline.places:
+        if getattr(made, name) != value:
+            raise LibraryError(
+                f"{folder} was made with places.{name}={getattr(made, name)}, and this run has {value}. "
+                f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
+            )
+
+
+@step("choose", lambda *_: images_codec(), without=("log",))  # the features stand for the log's images
+def own_images(
+    log: Log,
+    selected: Keyframes,
+    keyframes: Keyframes,
+    features: Extracted,
+    settings: LibrarySettings,
+    *,
+    execution: Execution,
+) -> list[tuple[int, Bytes]]:
+    """Rows and images of the keyframes that become the drive's own references; these images are read once more.
+
+    `keyframes` are those of the `selected` that decode.
+    """
+    if settings.choose == "coverage":
+        rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, execution.threads)
+    else:
+        chosen_ns = selected.stamp_ns[choose(selected.stamp_ns, settings)]
+        rows = np.flatnonzero(np.isin(keyframes.stamp_ns, chosen_ns))
+    frames = log.frames(keyframes.stamp_ns[rows])
+    return [(row, encoded.decode().image) for row, encoded in zip(rows.tolist(), frames, strict=True)]
+
+
+def own_references(keyframes: Keyframes, features: Extracted, images: Sequence[tuple[int, Bytes]]) -> list[Reference]:
+    """References of a drive's own keyframes, by row and image."""
+    stamps = keyframes.stamp_ns.tolist()
+    return [Reference(image, features[row], keyframes.drive, stamps[row]) for row, image in images]
+
+
+@step("choose")
+def given_references(library: Path, *, execution: Execution) -> list[Reference]:
+    """The references of a library in a folder. Raises LibraryError."""
+    return load_references(library, execution.threads)
+
+
+@step("learn", items=lambda places, references, library: len(references))
+def learn(
+    places: PlaceSettings, references: list[Reference], library: Path | None, *, execution: Execution
+) -> PlaceState:
+    """The recogniser with its library: the folder given, or one of these references."""
+    if library is not None:
+        return places.load(library, execution.threads)
+    return places.learn(references, execution.threads)
+
+
+@step("cover", lambda *_: coverage_codec())
+def cover(
+    keyframes: Keyframes, references: list[Reference], given: bool, features: Extracted, *, execution: Execution
+) -> Coverage:
+    """How far the references explain the drive, with a warning where that is little; of no frames where the library
+    has no features that could tell (`places.features: 0`)."""
+    if not any(len(one.features) for one in references):
+        return Coverage(0.0, 0.0, 0)
+    library = index_words(references, WordSettings(), execution.threads, own=False)
+    coverage = measure_coverage(
+        len(features), features.__getitem__, keyframes.stamp_ns, keyframes.drive, library, execution.threads
+    )
+    if doubt := coverage_warning(coverage, len(features), given, len(library)):
+        _log.warning(doubt)
+    return coverage
+
+
+def coverage_codec() -> Codec[Coverage]:
+    """JSON of how far references explain a drive."""
+    return json_codec(
+        lambda tree: Coverage(float(tree["explained"]), float(tree["median"]), int(tree["frames"])), asdict
+    )
+
+
+def build_library(
+    paths: Sequence[Path],
+    out: Path,
+    pipeline: Describing,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    progress: Progress = lambda *_: None,
+    warn: Callable[[str], object] = lambda _: None,
+    *,
+    force: bool = True,
+) -> PlaceState:
+    """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
+
+    `warn` gets what the logs warn of, once they are read. A library that `out` holds stays until the new one is whole;
+    without `force` one with references of other logs is not replaced.
+    Raises VplogError where that cannot be.
+    """
+    references: list[Reference] = []
+    opened = [logs.open(path, topics) for path in paths]
+    by_coverage = pipeline.library.choose == "coverage"
+    with staged(out, lambda: _library_in(out, None if force else opened)) as made:
+        wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
+        for log, stamps in zip(opened, wanted, strict=True):
+            for done, (stamp_ns, frame, features, _) in enumerate(
+                extract_frames(log.frames(stamps), pipeline.features, threads)
+            ):
+                progress(f"extract {log.name}", done + 1, len(stamps))
+                if frame is not None and features is not None:
+                    references.append(Reference(frame.image, features, log.name, stamp_ns))
+        for line in dict.fromkeys(line for log in opened for line in log.warnings):
+            warn(line)
+        state = pipeline.places.learn(references, threads)
+        state.save(made)
+    return state
+
+
+def _library_in(out: Path, opened: Sequence[Log] | None) -> list[str]:
+    """The files of a library in a folder that a new one may replace: one of these logs, or any. Raises SettingsError
+    where it may not."""
+    if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "library.json").is_file():
+        raise SettingsError(f"{out} is a folder with other things in it, not a library. Choose another with -o.")
+    check_regular(out, "library.json")
+    if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
+        raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")
+    if opened is not None and (out / "library.json").is_file():
+        _check_same_logs(out, opened)
+    return ["library.json", "features.parquet", "references.parquet"]
+
+
+def _check_same_logs(out: Path, opened: Sequence[Log]) -> None:
+    """Raises SettingsError where a library has a reference that is a frame of none of these logs, by name and stamp."""
+    remedy = "Choose another folder with -o, or replace that library with --force."
+    try:
+        sources = read_sources(out)
+    except LibraryError as error:
+        raise SettingsError(f"{error} So its logs are not known. {remedy}") from None
+    others = sources - {(log.name, stamp) for log in opened for stamp in log.stamps().tolist()}
+    if others:
+        names, given = (", ".join(sorted(one)) for one in ({name for name, _ in others}, {log.name for log in opened}))
+        raise SettingsError(f"{out} is a library of {names}, and {given} is another log or has changed. {remedy}")
+
+
+def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
+    """Stamps of an equal share of references for each log."""
+    size, result = pipeline.library.size or PAPER_SIZE, []
+    for number, log in enumerate(opened):
+        share = size * (number + 1) // len(opened) - size * number // len(opened)
+        seeded = pipeline.library.model_copy(update={"size": share, "seed": pipeline.library.seed + number})
+        result.append(log.stamps()[choose(log.stamps(), seeded)])
+    return result
+
+
+def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, threads: int, progress: Progress) -> list[Ints]:
+    """Stamps of the references of each log that explain the frames of all best; equally many of each are seen."""
+    each = -(-frames_needed(pipeline.library.size) // len(opened))
+    descriptors, owners, seen_ns = [], [], []
+    for number, log in enumerate(opened):
+        stamps = log.stamps()[evenly(len(log.stamps()), each)]
+        frames = extract_frames(log.frames(stamps), pipeline.features, threads)
+        for done, (stamp_ns, _, features, _) in enumerate(frames):
+            progress(f"look at {log.name}", done + 1, len(stamps))
+            if features is not None:
+                descriptors.append(features.descriptors[:STRONGEST].copy())
+                owners.append(number)
+                seen_ns.append(stamp_ns)
+    rows = choose_by_coverage(len(descriptors), descriptors.__getitem__, pipeline.library, threads)
+    owner, stamp = np.array(owners, np.int64)[rows], np.array(seen_ns, np.int64)[rows]
+    return [stamp[owner == number] for number in range(len(opened))]

@@ -1,0 +1,115 @@
+"""report.html of a finished run, from the files of its folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import Trajectory
+from vplog.figures.run_figures import earth_of
+from vplog.geometry import geodesy, se3
+from vplog.graph.joint import spaced_apart
+from vplog.results import mcap_read, tables
+from vplog.results.report.content import Content
+from vplog.results.report.page import page
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Floats, Keyframes
+    from vplog.results.mcap_read import Found
+    from vplog.results.report.content import Judged
+    from vplog.results.shown import Earth
+
+
+def write_report(
+    folder: Path,
+    record: dict[str, Any],
+    path: Path | None = None,
+    judged: Judged | None = None,
+    pictures: dict[int, bytes] | None = None,
+) -> Path:
+    """Write the page of the run in `folder`, whose run.json holds `record`, as `path` (report.html in it where None).
+
+    `pictures` are JPEGs of closures by row, where result.mcap has none. Raises ResultError.
+    """
+    path = path or folder / "report.html"
+    text = page(gather(folder, record, judged, pictures))
+    with replacing(path) as stream:
+        stream.write(text.encode())
+    return path
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run changed of the odometry."""
+
+    moved_m: float
+    """Largest distance between a corrected and an odometry position, both from the same first pose."""
+    closures: int
+    """Loop closures with more than half their weight."""
+    places: int
+    """Those of them that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
+
+
+def outcome_of(folder: Path, spacing: int) -> Outcome:
+    """Raises ResultError where a table of the run is missing or damaged."""
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    closures = tables.read_closures(folder / "closures.parquet")
+    first_from_odom = after.world_from_body[0] @ se3.inverse(odometry.odom_from_body[0])
+    moved = (after.world_from_body - first_from_odom @ odometry.odom_from_body)[:, :3, 3]
+    used = closures.weight > 0.5  # NaN where the solver never had it
+    places = min(spaced_apart(one[used].astype(np.int64), spacing) for one in (closures.query, closures.match))
+    return Outcome(float(np.linalg.norm(moved, axis=1).max()), int(used.sum()), places)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Where a run was, before and after."""
+
+    keyframes: Keyframes
+    world_from_body: Floats
+    """(N, 4, 4) of the keyframes, solved."""
+    before: Trajectory
+    """The odometry, laid on the first solved keyframe."""
+    after: Trajectory
+    found: Found
+    """What result.mcap holds beside."""
+    earth: Earth | None
+    """Where the trajectory is on earth, None without satellite fixes."""
+
+
+def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
+    """Raises ResultError where a file of the run is missing or damaged."""
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    found = mcap_read.read_pictures(folder / "result.mcap")
+    laid = world_from_body[:1] @ se3.inverse(keyframes.odom_from_body[:1]) @ odometry.odom_from_body
+    earth = earth_of(after, found.gps, record.get("gps"))
+    return Tracks(keyframes, world_from_body, Trajectory(odometry.stamp_ns, laid), after, found, earth)
+
+
+def gather(
+    folder: Path, record: dict[str, Any], judged: Judged | None = None, pictures: dict[int, bytes] | None = None
+) -> Content:
+    """All that the page tells. Raises ResultError where a file of the run is missing or damaged."""
+    tracks = gather_tracks(folder, record)
+    fixes_m = None
+    if tracks.found.gps is not None and tracks.earth is not None:
+        world_from_enu = se3.inverse(tracks.earth.enu_from_world)
+        fixes_m = se3.transform(world_from_enu, geodesy.local_enu(tracks.found.gps).enu_m)
+    return Content(
+        record=record,
+        keyframes=tracks.keyframes,
+        world_from_body=tracks.world_from_body,
+        closures=tables.read_closures(folder / "closures.parquet"),
+        before=tracks.before,
+        after=tracks.after,
+        pictures=tracks.found.pictures or pictures or {},
+        references=tracks.found.references,
+        fixes_m=fixes_m,
+        judged=judged,
+    )

@@ -1,0 +1,106 @@
+"""The ledger of a drive's candidates, checked in parts, so that a kill costs at most the last."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.cache.codecs import closures_codec, json_codec
+from vplog.cache.steps import step
+from vplog.data import Closures
+from vplog.execution.execution import Execution
+from vplog.loops.verify import calibration_share, drive_of, verify_between
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vplog.cache.feature_shards import Extracted
+    from vplog.cache.steps import Steps
+    from vplog.data import Camera, Ints, Keyframes
+    from vplog.loops.propose import Proposals
+    from vplog.loops.verify import Drive, VerifySettings
+
+_PART_CANDIDATES = 1000
+"""Candidates of a part: 5 to 10 s of one core, as a part of the keyframes."""
+
+
+@step("verify", items=lambda proposals, *_: len(proposals.query))
+def verify(
+    proposals: Proposals,
+    keyframes: Keyframes,
+    camera: Camera,
+    features: Extracted,
+    settings: VerifySettings,
+    *,
+    steps: Steps,
+) -> Closures:
+    """The ledger of `loops.verify.verify_between`, whose row depends on its two frames and the calibration alone.
+
+    A part has all candidates of some map frames, whose landmarks are made once all the same.
+    """
+    drive = keyframes, camera, features, settings
+    places = _parts(proposals.match)
+    if not places:
+        return verify_part.function(proposals, 0.0, 0, 0, *drive, execution=Execution())
+    share = 0.0 if camera.matrix is None else steps.part(calibrate, *drive)
+    total, before = len(proposals.query), np.cumsum([0, *map(len, places)]).tolist()
+    parts = [(proposals.rows(rows), share, done, total, *drive) for rows, done in zip(places, before, strict=False)]
+    return merged(steps.in_parts(verify_part, parts), places)
+
+
+@step("calibrate", lambda *_: json_codec(float, float))
+def calibrate(
+    keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings, *, execution: Execution
+) -> float:
+    """By what share of a rotation the calibration is wrong at most."""
+    return calibration_share(_drive(keyframes, camera, features, settings), execution.threads)
+
+
+@step("verify", lambda *_: closures_codec(), without=("done", "total"))
+def verify_part(
+    proposals: Proposals,
+    share: float,
+    done: int,
+    total: int,
+    keyframes: Keyframes,
+    camera: Camera,
+    features: Extracted,
+    settings: VerifySettings,
+    *,
+    execution: Execution,
+) -> Closures:
+    """The ledger of some candidates; `done` of the `total` were checked before them."""
+    drive = _drive(keyframes, camera, features, settings)
+    tell = execution.progress
+    return verify_between(
+        proposals, drive, drive, execution.threads, lambda count, _: tell("verify", done + count, total), share
+    )
+
+
+def _drive(keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings) -> Drive:
+    return drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
+
+
+def _parts(match: np.ndarray) -> list[Ints]:
+    """Rows of the candidates of each part, by map frame."""
+    order = np.argsort(match, kind="stable")
+    begins = np.flatnonzero(np.diff(match[order], prepend=-1))
+    # a map frame goes to the part in which its first candidate falls
+    number = np.repeat(begins // _PART_CANDIDATES, np.diff(begins, append=len(order)))
+    return [np.sort(order[number == part]) for part in np.unique(number)]
+
+
+def merged(parts: Sequence[Closures], rows: Sequence[Ints]) -> Closures:
+    """One ledger of several parts, by the numbers `rows` of their candidates."""
+    place = np.argsort(np.concatenate(rows), kind="stable")
+    columns = {}
+    for field in fields(Closures):
+        values = [getattr(part, field.name) for part in parts]
+        if isinstance(values[0], np.ndarray):
+            columns[field.name] = np.concatenate(values)[place]
+        else:
+            joined = [value for part in values for value in part]
+            columns[field.name] = [joined[at] for at in place.tolist()]
+    return Closures(**columns)

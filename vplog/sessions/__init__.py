@@ -1,0 +1,1 @@
+"""Several drives in one pose graph."""

@@ -1,0 +1,131 @@
+"""Several drives and the ledgers between them in one graph, and its results in tables: for runs and for maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import EdgeKind, Verdict
+from vplog.graph import joint as graph_joint
+from vplog.graph.build import busier
+from vplog.graph.correct_trajectory import correct_trajectory
+from vplog.graph.refine import rescaled
+from vplog.results import tables
+from vplog.run.back_end import by_odometry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from vplog.data import Closures, Floats, Keyframes, Odometry, PoseGraph, Trajectory
+    from vplog.pipeline import Pipeline
+
+    Ledgers = Mapping[tuple[int, int], Closures]
+    """By numbers of the later drive, whose keyframes are the queries, and of the earlier one."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedDrive:
+    """A drive as its own run solved it."""
+
+    keyframes: Keyframes
+    graph: graph_joint.Drive
+    odometry: Callable[[], Odometry]
+    """Needed for its trajectory alone."""
+
+
+def solve_drives(
+    drives: Sequence[SolvedDrive], ledgers: Ledgers, pipeline: Pipeline
+) -> tuple[graph_joint.Joined, dict[tuple[int, int], Closures]]:
+    """The maps that the drives make, and the ledgers with weights, residuals and verdicts of the solve. Raises
+    GraphError where a graph cannot be solved."""
+    between = [_between_of(*pair, ledger) for pair, ledger in ledgers.items()]
+    graphs = [drive.graph for drive in drives]
+    joined = graph_joint.join(graphs, between, pipeline.solve, pipeline.join, pipeline.refine)
+    judged = map(_judged_by, ledgers.values(), joined.weight, joined.residual)
+    return joined, dict(zip(ledgers, judged, strict=True))
+
+
+def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor: float) -> graph_joint.Drive:
+    """The graph of a drive at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0),
+    with the odometry's noise before its solve scaled that by `sigma_factor`: the joint solve estimates it again, with
+    the same scale for all."""
+    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    claimed = rescaled(graph, odometry, odometry, 1.0 / sigma_factor**2, 1.0)
+    used = np.flatnonzero(np.isfinite(closures.weight))
+    metric = np.array([closures.scale[row] != "none" for row in used.tolist()], bool)
+    of_odometry = by_odometry(claimed, closures, np.concatenate([used[metric], used[~metric]]))
+    edges = np.flatnonzero(odometry | (weight > 0.5))
+    own = replace(
+        claimed,
+        a=graph.a[edges],
+        b=graph.b[edges],
+        a_from_b=claimed.a_from_b[edges],
+        information=claimed.information[edges],
+        kind=[graph.kind[edge] for edge in edges.tolist()],
+    )
+    return graph_joint.Drive(own, of_odometry[edges], sigma_factor)
+
+
+def pair_record(query_drive: str, match_drive: str, ledger: Closures) -> dict[str, Any]:
+    """A pair of drives as run.json and component.json have it."""
+    kept = int(np.nansum(ledger.weight))
+    return {
+        "query_drive": query_drive,
+        "match_drive": match_drive,
+        "candidates": len(ledger),
+        "verified": int(np.isfinite(ledger.weight).sum()),
+        "kept": kept,
+        "median_residual_sigma": float(np.nanmedian(ledger.residual_after)) if kept else None,
+    }
+
+
+def write_ledgers(path: Path, drives: Sequence[SolvedDrive], ledgers: Ledgers, header: tables.TableMetadata) -> None:
+    """The table of the candidates of all pairs."""
+    rows = [
+        (drives[later].keyframes, drives[earlier].keyframes, ledger) for (later, earlier), ledger in ledgers.items()
+    ]
+    tables.write_joins(path, rows, header)
+
+
+def write_drive(
+    folder: Path, prefix: str, drive: SolvedDrive, poses: Floats, header: tables.TableMetadata
+) -> Trajectory:
+    """Tables of keyframes (N, 4, 4) and trajectory of a drive in the frame of its map. Returns the trajectory."""
+    odometry = drive.odometry()
+    trajectory = correct_trajectory(odometry, drive.keyframes, poses)
+    tables.write_keyframes(folder / f"{prefix}keyframes.parquet", drive.keyframes, poses, header)
+    tables.write_trajectory(folder / f"{prefix}trajectory.parquet", trajectory, odometry, header)
+    return trajectory
+
+
+def _accepted(ledger: Closures) -> np.ndarray:
+    """Rows of the verified closures."""
+    return np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
+
+
+def _between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
+    """The verified closures of a ledger, for the graph."""
+    rows = _accepted(ledger)
+    shared = busier(ledger.match[rows], ledger.query[rows])
+    return graph_joint.Between(
+        later,
+        earlier,
+        query=ledger.query[rows].astype(np.int64),
+        match=ledger.match[rows].astype(np.int64),
+        match_from_query=ledger.match_from_query[rows],
+        information=ledger.information[rows] / shared[:, None, None],
+        of_odometry=np.array([ledger.scale[row] == "odometry" for row in rows.tolist()], bool),
+    )
+
+
+def _judged_by(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
+    """The ledger with weights and residuals (L,) of its verified rows from the joint solve."""
+    rows = _accepted(ledger)
+    weights, residuals, verdict = np.full(len(ledger), np.nan), np.full(len(ledger), np.nan), list(ledger.verdict)
+    weights[rows], residuals[rows] = weight, residual
+    for row in rows[weight < 0.5].tolist():
+        verdict[row] = Verdict.REJECTED_BY_SOLVER
+    return replace(ledger, weight=weights, residual_after=residuals, verdict=verdict)

@@ -1,0 +1,205 @@
+"""Several drives in one map: each by itself, closures between them, one graph of those that closures join."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from vplog import logs
+from vplog.errors import SettingsError
+from vplog.execution.cores import limited
+from vplog.execution.execution import Execution
+from vplog.execution.timing import Watch
+from vplog.geometry import tum
+from vplog.loops.verify import calibration_share, drive_of, no_closures
+from vplog.pipeline import CacheOptions
+from vplog.pipeline import run as run_alone
+from vplog.results import g2o, run_record, tables
+from vplog.results.run_record import CACHE
+from vplog.run import provenance
+from vplog.run.feature_extraction import odometry_of
+from vplog.run.reference_library import build_library, check_library
+from vplog.run.run_folder import begun
+from vplog.sessions.inter_session import candidates_among, closures_between, likely_pairs, with_shared
+from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from vplog.data import Closures
+    from vplog.graph.joint import Joined
+    from vplog.loops.verify import Drive
+    from vplog.pipeline import Pipeline, Run
+    from vplog.sessions.joint_graph import Ledgers
+    from vplog.stages import PlaceState
+
+    Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """One drive, run by itself."""
+
+    name: str
+    run: Run
+    drive: Drive
+    """For the verification of its candidates."""
+    solved: SolvedDrive
+
+
+def run_joint(
+    paths: Sequence[Path],
+    out: Path,
+    pipeline: Pipeline,
+    library: Path | None = None,
+    topics: logs.TopicChoice | None = None,
+    execution: Execution | None = None,
+    use_cache: bool = True,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Run each drive into a folder of its own in `out`, join them, and return the record in its run.json.
+
+    What `out` holds stays until all is done; a run that has another log is replaced with `force` only. All drives
+    share one library, the one given or one of an equal share of each. Raises VplogError with one line.
+    """
+    if pipeline.gps.use:
+        raise SettingsError("GPS holds one drive at a time: run each by itself with --gps, or several without.")
+    opened = [logs.open(path, topics) for path in paths]
+    drives_at = dict(zip(_names([log.name for log in opened]), paths, strict=True))
+    check_library(library, pipeline)
+    for log in opened:  # before the first drive is computed
+        odometry_of(log)
+    execution, watch = execution or Execution(), Watch()
+    threads, progress = execution.threads, execution.progress
+    with ExitStack() as stack:
+        made = stack.enter_context(
+            begun(out, pipeline, paths[0], threads, library, topics, drives_at, resumable=use_cache, force=force)
+        )
+        caches = out / CACHE if use_cache else made / CACHE
+        if not use_cache:
+            stack.callback(shutil.rmtree, caches, ignore_errors=True)
+        if library is None:
+            library = made / "library"
+            with watch.stage("library"):
+                build_library(paths, library, pipeline, topics, threads, progress)
+        drives = []
+        for name, path in drives_at.items():
+            with watch.stage(name):
+                done = run_alone(
+                    path, made / name, pipeline, library, topics, execution.within(name), CacheOptions(caches / name)
+                )
+                drives.append(_alone(name, done, pipeline))
+        with watch.stage("between"):
+            state = pipeline.places.load(library, threads)
+            ledgers = _ledgers(drives, state, pipeline, threads, progress)
+        with watch.stage("join"), limited(threads):
+            joined, ledgers = solve_drives([alone.solved for alone in drives], ledgers, pipeline)
+        with watch.stage("write"):
+            header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
+            write_ledgers(made / "joins.parquet", [alone.solved for alone in drives], ledgers, header)
+            _write_maps(made, drives, joined, header)
+        account = {
+            **provenance.head(pipeline, paths[0], threads),
+            **provenance.logs_of(paths),
+            "finished": True,
+            "library": {"hash": state.hash, "from": provenance.library_of(library)},
+            **_account(drives, ledgers, joined),
+            "stages": watch.stages,
+            "totals": watch.totals(),
+        }
+        run_record.write_run_json(made / "run.json", account)
+    return account
+
+
+def _alone(name: str, run: Run, pipeline: Pipeline) -> Alone:
+    keyframes = replace(run.keyframes, drive=name)
+    graph = replace(run.graph, world_from_body=run.solution.world_from_body)
+    own = own_drive(graph, run.solution.weight, run.closures, run.record["odometry"]["sigma_factor"])
+    drive = drive_of(keyframes, run.camera, run.features.__getitem__, pipeline.verify, run.camera.baseline_m)
+    return Alone(name, run, drive, SolvedDrive(keyframes, own, lambda: run.odometry))
+
+
+def _ledgers(
+    drives: Sequence[Alone], state: PlaceState, pipeline: Pipeline, threads: int, progress: Progress
+) -> Ledgers:
+    """The ledger of every pair of drives; empty where it is not likely that they meet."""
+    places = [alone.run.places for alone in drives]
+    share = [0.0 if alone.drive.camera.matrix is None else calibration_share(alone.drive, threads) for alone in drives]
+    later = {number: places[number] for number in range(1, len(drives))}
+    searched = {number: range(number) for number in later}
+    found = candidates_among(later, places.__getitem__, searched, state, pipeline, threads)
+    likely = {(one.later, one.earlier): one for one in likely_pairs(found, places.__getitem__, state, pipeline.join)}
+
+    def verified(later: int, earlier: int) -> Closures:
+        pair = likely.get((later, earlier))
+        if pair is None:
+            return no_closures()
+        name = f"{drives[later].name} in {drives[earlier].name}"
+        ledger = closures_between(
+            pair.proposals, drives[later].drive, drives[earlier].drive, pipeline.join,
+            max(share[later], share[earlier]), threads, lambda done, total: progress(name, done, total),
+        )  # fmt: skip
+        return with_shared(ledger, pair.proposals, pair.shared)
+
+    return {(number, earlier): verified(number, earlier) for number in later for earlier in range(number)}
+
+
+def _names(names: Sequence[str]) -> list[str]:
+    """A folder name for each drive: its own, with a number where several have the same, or the library has it."""
+    result: list[str] = []
+    for name in names:
+        number, free = 2, name
+        while free in ("library", *result):
+            free, number = f"{name}-{number}", number + 1
+        result.append(free)
+    return result
+
+
+def _write_maps(out: Path, drives: Sequence[Alone], joined: Joined, header: tables.TableMetadata) -> None:
+    """The graph of each map of several drives, and the keyframes and trajectories of its drives in the map's frame."""
+    for number, members in enumerate(joined.maps):
+        if members not in joined.solved:
+            continue
+        refined = joined.solved[members]
+        g2o.write_g2o(out / f"map{number}.g2o", refined.graph, refined.solution.world_from_body)
+        for member in members:
+            folder = out / drives[member].name
+            trajectory = write_drive(folder, "joint_", drives[member].solved, joined.world_from_body[member], header)
+            tum.write_tum(folder / "joint_trajectory.tum", trajectory)
+
+
+def _account(drives: Sequence[Alone], ledgers: Ledgers, joined: Joined) -> dict[str, Any]:
+    """Maps, pairs and warnings as run.json has them."""
+    names = [alone.name for alone in drives]
+    maps = [
+        {
+            "drives": [names[member] for member in members],
+            "reason": joined.solved[members].solution.reason if members in joined.solved else None,
+        }
+        for members in joined.maps
+    ]
+    pairs, warnings = list(ledgers), []
+    for at, reason in joined.apart.items():
+        later, earlier = (names[drive] for drive in pairs[at])
+        warnings.append(f"Closures of {later} to {earlier} were not enough to join them. {reason.strip()}")
+    if len(joined.maps) > 1:
+        warnings += [
+            f"{names[members[0]]} has too few closures with other drives (join.least_closures) and stays in its own "
+            "frame."
+            for members in joined.maps
+            if len(members) == 1
+        ]
+    warnings += [f"{alone.name}: {text}" for alone in drives for text in alone.run.record["warnings"]]
+    map_of = {member: number for number, members in enumerate(joined.maps) for member in members}
+    return {
+        "drives": [
+            {"name": name, "folder": name, "keyframes": len(drives[at].run.keyframes.stamp_ns), "map": map_of[at]}
+            for at, name in enumerate(names)
+        ],
+        "maps": maps,
+        "joins": [pair_record(names[later], names[earlier], ledger) for (later, earlier), ledger in ledgers.items()],
+        "warnings": warnings,
+    }

@@ -1,0 +1,431 @@
+"""Files by URL: s3:// and gs:// through pyarrow, http(s):// by range requests; read in parts, written when finished.
+
+A RemotePath answers as much of pathlib's Path as logs are read with. What is asked for is read, in blocks; nothing is
+kept on disk. Credentials and endpoints come from where each service's own tools look for them (AWS_ACCESS_KEY_ID,
+AWS_ENDPOINT_URL, GOOGLE_APPLICATION_CREDENTIALS, STORAGE_EMULATOR_HOST, ...).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import shutil
+import urllib.parse
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
+
+from vplog.errors import LogError, ResultError, SettingsError
+from vplog.storage.gcs import google_file_system, google_place, plain, plain_errors
+from vplog.storage.http import get_range, head
+from vplog.storage.scratch import scratch
+from vplog.storage.urls import shown, without_secrets
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pyarrow.fs import FileInfo, FileSystem
+
+SCHEMES = ("s3", "gs", "http", "https")
+_BLOCK_BYTES = 1 << 20
+"""Read ahead of small reads: a chunk of a log; a request costs as much as some hundred kB."""
+_TIMEOUT_S = 30.0
+"""A server that says nothing for so long is taken as gone."""
+_DENIED = re.compile(r"ACCESS_DENIED|AccessDenied|PERMISSION_DENIED|HTTP response code 403")
+"""What pyarrow's clients say of a request that this account may not make."""
+
+
+@dataclass(frozen=True)
+class Stat:
+    """What `Path.stat` is asked for."""
+
+    st_size: int
+
+
+def located(text: str | Path | RemotePath) -> Path:
+    """A local path, or where the text is a URL, a RemotePath, which answers like one.
+
+    Raises SettingsError for a scheme that is not known.
+    """
+    if isinstance(text, RemotePath):
+        return cast("Path", text)
+    if "://" not in str(text):
+        return Path(text)
+    scheme = str(text).split("://", 1)[0]
+    if scheme not in SCHEMES:
+        known = f"{scheme}:// is not known. Known: {', '.join(SCHEMES)}, or a path."
+        raise SettingsError(f"Cannot open {shown(str(text))}: {known}")
+    return cast("Path", RemotePath(_checked(str(text), scheme)))
+
+
+def address(path: Path) -> str:
+    """What opens a path from another process: a URL with its query, which is not to be stored or shown."""
+    return path.url if isinstance(path, RemotePath) else str(path)
+
+
+def _checked(url: str, scheme: str) -> str:
+    """The URL, if credentials are in the query of http alone. Raises SettingsError, which does not show them."""
+    host, store = re.split("[/?#]", url.split("://", 1)[1], maxsplit=1)[0], scheme in ("s3", "gs")
+    port = host.rpartition(":")[2]
+    if "@" in host or (":" in host and (store or not (port.isdigit() or port.endswith("]")))):
+        raise SettingsError(
+            f"A {scheme}:// URL names a user, a password, or a port that is no number, and vplog sends none. Leave "
+            "them out: a store's keys come from the environment, and a web server takes a signed link."
+        )
+    if store and "?" in url:
+        raise SettingsError(f"{shown(url)} has a query, which {scheme}:// does not take. Write ? in a name as %3F.")
+    return url.replace("#", "%23") if store else url
+
+
+class RemotePath:
+    """One object, or what has this prefix, on a server. A URL has % for what it cannot spell; names here have not."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url if "?" in url else url.rstrip("/")
+
+    @property
+    def url(self) -> str:
+        """With its query, which may hold a token."""
+        return self._url
+
+    def __str__(self) -> str:
+        """As it is stored and shown: without its query."""
+        return shown(self._url)
+
+    def __repr__(self) -> str:
+        return f"RemotePath({str(self)!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RemotePath) and self._url == other._url
+
+    def __hash__(self) -> int:
+        return hash(self._url)
+
+    def __lt__(self, other: RemotePath) -> bool:
+        return self._url < other._url
+
+    def __truediv__(self, name: str) -> RemotePath:
+        place, mark, query = self._url.partition("?")
+        quoted = str(name).replace("%", "%25").replace("?", "%3F").replace("#", "%23")
+        return RemotePath(f"{place}/{quoted}{mark}{query}")
+
+    @property
+    def scheme(self) -> str:
+        return self._url.split("://", 1)[0]
+
+    @property
+    def name(self) -> str:
+        return PurePosixPath(urllib.parse.unquote(urllib.parse.urlsplit(self._url).path)).name
+
+    @property
+    def stem(self) -> str:
+        return PurePosixPath(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        return PurePosixPath(self.name).suffix
+
+    def resolve(self) -> RemotePath:
+        return self
+
+    def relative_to(self, folder: RemotePath) -> PurePosixPath:
+        below = PurePosixPath(str(self)).relative_to(PurePosixPath(str(folder)))
+        return PurePosixPath(urllib.parse.unquote(str(below)))
+
+    def exists(self) -> bool:
+        return self._kind != "none"
+
+    def is_file(self) -> bool:
+        return self._kind == "file"
+
+    def is_dir(self) -> bool:
+        return self._kind == "folder"
+
+    def stat(self) -> Stat:
+        return Stat(self._length)
+
+    def version(self) -> str:
+        """What changes when the object does, without reading it: its length and time, or the server's tag."""
+        if self._is_http:
+            return f"length {self._length}, {self._head.get('ETag') or self._head.get('Last-Modified') or 'no tag'}"
+        return f"length {self._length}, time {self._info.mtime_ns}"
+
+    def open(self, mode: str = "rb") -> BinaryIO:
+        """A stream that reads what is asked for. Raises OSError."""
+        if mode != "rb":
+            raise ValueError(f"a remote file is opened with mode rb, not {mode}")
+        raw: Any = _HttpRanges(self._url, self._length) if self._is_http else _Ranges(*self.place, self._length)
+        return io.BufferedReader(raw, _BLOCK_BYTES)
+
+    def read_bytes(self) -> bytes:
+        with self.open() as stream:
+            return stream.read()
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        return self.read_bytes().decode(encoding)
+
+    def iterdir(self) -> Iterator[RemotePath]:
+        """What is right below, in order of names. HTTP servers do not list: nothing."""
+        yield from self._below(recursive=False)
+
+    def rglob(self, _: str = "*") -> Iterator[RemotePath]:
+        yield from self._below(recursive=True)
+
+    @property
+    def _is_http(self) -> bool:
+        return self.scheme in ("http", "https")
+
+    @cached_property
+    def place(self) -> tuple[FileSystem, str]:
+        """The file system of an object store, and the path in it."""
+        place = urllib.parse.unquote(self._url.split("://", 1)[1])
+        if self.scheme == "gs":
+            return google_system(google_place(), place.partition("/")[0]), place
+        return file_system(*s3_place()), place
+
+    @cached_property
+    def _info(self) -> FileInfo:
+        system, place = self.place
+        with plain_errors():
+            return system.get_file_info(place)
+
+    @cached_property
+    def _head(self) -> dict[str, str]:
+        return head(self._url)
+
+    @cached_property
+    def _kind(self) -> str:
+        if self._is_http:
+            return "file" if self._head else "none"
+        from pyarrow.fs import FileType
+
+        return {FileType.File: "file", FileType.Directory: "folder"}.get(self._info.type, "none")
+
+    @property
+    def _length(self) -> int:
+        if not self._is_http:
+            return int(self._info.size or 0)
+        length = self._head.get("Content-Length", "")
+        if not length.isdigit():
+            raise OSError("the server does not say how long the file is")
+        return int(length)
+
+    def _below(self, recursive: bool) -> Iterator[RemotePath]:
+        if self._is_http:
+            return
+        if not recursive:
+            for name in sorted(names_below(self)):
+                yield self / name
+            return
+        from pyarrow.fs import FileSelector
+
+        system, place = self.place
+        with plain_errors():
+            below = system.get_file_info(FileSelector(place, recursive=True))
+        for found in sorted(below, key=lambda one: one.path):
+            yield self / found.path[len(place) + 1 :]
+
+
+class _Ranges(io.RawIOBase):
+    """Random access to an object; every read is a request for just these bytes."""
+
+    def __init__(self, system: FileSystem, place: str, length: int) -> None:
+        with plain_errors():
+            self._file, self._at, self._length = system.open_input_file(place), 0, length
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._length}[whence]
+        self._at = max(start + offset, 0)
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        wanted = min(len(buffer), max(self._length - self._at, 0))
+        if wanted == 0:
+            return 0
+        data = self._fetch(self._at, wanted)
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        if not self.closed and getattr(self, "_file", None) is not None:
+            self._file.close()
+        super().close()
+
+    def _fetch(self, start: int, count: int) -> bytes:
+        with plain_errors():
+            return self._file.read_at(count, start)
+
+
+class _HttpRanges(_Ranges):
+    """The same of a file on a web server (RFC 9110, section 14)."""
+
+    def __init__(self, url: str, length: int) -> None:
+        self._url, self._at, self._length, self._file = url, 0, length, None
+
+    def _fetch(self, start: int, count: int) -> bytes:
+        return get_range(self._url, start, count, self._length)
+
+
+def names_below(path: RemotePath) -> dict[str, bool]:
+    """What is right below a prefix of an object store, and whether that has objects below. Raises OSError.
+
+    On gs:// pyarrow tells of no folder that is not an object itself, so there it is asked for all that is below.
+    """
+    from pyarrow.fs import FileSelector, FileType
+
+    system, place = path.place
+    below = dict[str, bool]()
+    with plain_errors():
+        found = system.get_file_info(FileSelector(place, allow_not_found=True, recursive=path.scheme == "gs"))
+    for one in found:
+        name, _, rest = one.path[len(place) + 1 :].partition("/")
+        below[name] = below.get(name, False) or bool(rest) or one.type == FileType.Directory
+    return below
+
+
+def s3_place() -> tuple[str | None, str | None]:
+    """Endpoint and region of S3, as its own tools are told them; None where they are not told."""
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+    return endpoint, os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
+
+
+@lru_cache
+def google_system(endpoint: str, bucket: str) -> FileSystem:
+    """One for all objects of a bucket. Raises OSError."""
+    return google_file_system(endpoint, bucket)
+
+
+@lru_cache
+def file_system(endpoint: str | None, region: str | None) -> FileSystem:
+    """One for all objects of a server that speaks S3: it keeps its connections."""
+    from pyarrow import fs
+
+    known = {"endpoint_override": endpoint, "region": region}
+    return fs.S3FileSystem(  # delayed: a small file is one request, not the three of an upload in parts
+        request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, allow_delayed_open=True,
+        **{name: value for name, value in known.items() if value},
+    )  # fmt: skip
+
+
+_STANDS_FOR: dict[Path, Path | RemotePath] = {}
+"""What folders and files of this machine stand for, while they are there."""
+
+
+def original(path: Path) -> Path:
+    """What a local path stands for, itself or by the folder it is in; any other path itself."""
+    for folder in (path, *([] if isinstance(path, RemotePath) else path.parents)):
+        if folder in _STANDS_FOR:
+            place = _STANDS_FOR[folder]
+            return original(cast("Path", place if folder == path else place / path.relative_to(folder).as_posix()))
+    return path
+
+
+@contextmanager
+def stands_for(path: Path, place: Path | RemotePath) -> Iterator[Path]:
+    """For the time of the block, what is recorded of `path` is said of `place`, where its files come from or go to."""
+    _STANDS_FOR[path] = place
+    try:
+        yield path
+    finally:
+        del _STANDS_FOR[path]
+
+
+@contextmanager
+def local_copy(path: Path | RemotePath) -> Iterator[Path]:
+    """A remote folder or file as a local one for the time of the block; a local one as it is. Raises LogError."""
+    if not isinstance(path, RemotePath):
+        yield path
+        return
+    with scratch("url") as folder:
+        target = folder / (path.name or "remote")
+        try:
+            if not path.exists():
+                raise LogError(f"There is nothing at {path}.")
+            _download(path, target)
+        except OSError as error:
+            raise LogError(f"Cannot read {path}: {reason(error)}.") from None
+        with stands_for(target, path):
+            yield target
+
+
+def _download(path: RemotePath, target: Path) -> None:
+    files = [path] if path.is_file() else [file for file in path.rglob() if file.is_file()]
+    for file in files:
+        place = target if path.is_file() else target / file.relative_to(path)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with file.open() as source, place.open("wb") as sink:
+            shutil.copyfileobj(source, sink, _BLOCK_BYTES)
+
+
+@contextmanager
+def local_output(path: Path | RemotePath) -> Iterator[Path]:
+    """Where to write what is to end at `path`: there, or for a remote one a local folder that is sent when all is done.
+
+    The run's own account, run.json, is sent last: who finds it finds everything. Nothing is sent of what failed.
+    Raises ResultError where the server does not take it, before any work where there is none, SettingsError for one
+    that takes nothing.
+    """
+    if not isinstance(path, RemotePath):
+        yield path
+        return
+    check_writable(path)
+    _check_bucket(path)
+    with scratch("url") as folder:
+        target = folder / (path.name or "out")
+        with stands_for(target, path):
+            yield target
+        files = [target] if target.is_file() else sorted(file for file in target.rglob("*") if file.is_file())
+        files.sort(key=lambda file: file.name == "run.json" and file.parent == target)
+        try:
+            system, place = path.place
+            for file in files:
+                with (
+                    file.open("rb") as source,
+                    system.open_output_stream(str(PurePosixPath(place) / file.relative_to(target))) as sink,
+                ):
+                    shutil.copyfileobj(source, sink, _BLOCK_BYTES)
+        except OSError as error:
+            raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
+
+
+def check_writable(path: RemotePath) -> None:
+    """Raises SettingsError for what is only read."""
+    if path.scheme not in ("s3", "gs"):
+        raise SettingsError(
+            f"Cannot write to {path}: {path.scheme}:// is for reading. Write to s3://, gs:// or a path."
+        )
+
+
+def _check_bucket(path: RemotePath) -> None:
+    """Before an hour of work: raises ResultError where there is no server, or no such bucket on it. Whether this
+    account may write to it, only writing tells."""
+    from pyarrow.fs import FileType
+
+    try:
+        system, place = path.place
+        bucket = place.partition("/")[0]
+        there = system.get_file_info(bucket).type != FileType.NotFound
+    except OSError as error:
+        if _DENIED.search(str(error)):  # a look at the bucket; what writes need not have the right to that
+            return
+        raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
+    if not there:
+        raise ResultError(f"Cannot write {path}: there is no bucket {bucket}. Make it, or choose another with -o.")
+
+
+def reason(error: OSError) -> str:
+    said = without_secrets(plain(error.strerror or str(error)))
+    return (said.splitlines()[0] if said else type(error).__name__)[:300].rstrip(".")

@@ -1,0 +1,199 @@
+"""Temporary folders, files that appear whole or not at all, and folders of files as arrays sent between machines."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+
+from vplog.errors import ResultError
+from vplog.storage.folders import is_below, regular_files
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    Bytes = NDArray[np.uint8]
+
+_PIECE_BYTES = 2**24
+"""Of a file that travels. Ray's smallest store of objects has 75 MiB, and needs room for several; 16 MiB take about
+10 ms to copy, which is more than the about 1 ms that an object costs by itself."""
+
+
+def own_folder() -> Path:
+    """This user's folder in the machine's temporary one. Raises ResultError where somebody else has made it."""
+    folder = Path(tempfile.gettempdir()) / f"vplog-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        about = folder.lstat()
+    except OSError as error:
+        raise ResultError(f"Cannot make {folder}: {error.strerror}. Set TMPDIR to a folder with room.") from None
+    if folder.is_symlink() or about.st_uid != os.getuid():
+        raise ResultError(f"{folder} belongs to somebody else. Set TMPDIR to a folder of your own.")
+    return folder
+
+
+@contextmanager
+def scratch(name: str, among: Path | None = None) -> Iterator[Path]:
+    """A new folder for the time of the block, among others in the one given, which is there, or in `own_folder`. Those
+    of processes that were killed are removed before and after. Raises ResultError."""
+    among = among or own_folder()
+    _sweep(among)
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f"{name}-{os.getpid()}-", dir=among))
+        lock = (folder / ".new").open("w")
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        (folder / ".new").rename(folder / ".lock")
+    except OSError as error:
+        raise ResultError(f"Cannot make a folder in {among}: {error.strerror}. Make room, or set TMPDIR.") from None
+    with lock:  # goes with the process, however that ends
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            _sweep(among)  # a killed process may not have ended when the block began
+
+
+def _sweep(among: Path) -> None:
+    for path in among.glob("*/.lock"):
+        with suppress(OSError), path.open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
+            shutil.rmtree(path.parent, ignore_errors=True)
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """A folder, with those above it, for a block; those made for it go again where they are empty at its end. Raises
+    OSError where it cannot be made."""
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        with suppress(OSError):  # it holds something
+            for one in made:
+                one.rmdir()
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A binary stream that becomes `path` when the block ends well; what was there before stays until then.
+
+    The bytes go to a hidden file beside it (a rename is atomic only within one file system), are synced, then
+    renamed. A link stays one: what it points to is replaced. A device or a pipe is written into, as renaming would put
+    a file in its place. Raises ResultError where the folder cannot be written or the disk is full; nothing is left
+    behind.
+    """
+    if not path.name:
+        raise ResultError("The name of a file to write is empty. Give one with -o.")
+    try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            with path.open("wb") as stream:
+                yield stream
+            return
+        path = path.resolve() if path.is_symlink() else path
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            with part.open("wb") as stream:
+                yield stream
+            put_in_place(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error).splitlines()[0]
+        raise ResultError(f"Cannot write {path}: {reason}. Free space or choose another folder with -o.") from None
+
+
+def put_in_place(part: Path, path: Path) -> None:
+    """Rename a file or a folder with its files to `path`, so that after a power cut what is there is whole: content is
+    on the disk before the name is. Raises OSError."""
+    sync_all(part)
+    part.replace(path)
+    sync(path.parent)
+
+
+def sync_all(path: Path) -> None:
+    """Have a file, or a folder with all that is in it, on the disk. Raises OSError."""
+    names = list(regular_files(path))
+    below = {*names, *(str(above) for name in names for above in PurePosixPath(name).parents), "."}
+    for name in sorted(below):
+        sync(path / name)
+
+
+def sync(path: Path) -> None:
+    """Have a file, or the names in a folder, on the disk. Raises OSError."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:
+        if not path.is_dir():  # some file systems know no fsync of folders
+            raise
+    finally:
+        os.close(handle)
+
+
+def files_in(folder: Path) -> list[str]:
+    """Names of all files in a folder and below it, in order; hidden ones are nobody's result."""
+    return [name for name in regular_files(folder) if not any(part.startswith(".") for part in name.split("/"))]
+
+
+def pieces(path: Path) -> Iterator[Bytes]:
+    """The bytes of a file, a piece at a time; one empty piece of an empty file."""
+    with path.open("rb") as stream:
+        block = stream.read(_PIECE_BYTES)
+        yield np.frombuffer(block, np.uint8)
+        while block := stream.read(_PIECE_BYTES):
+            yield np.frombuffer(block, np.uint8)
+
+
+def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
+    """A file of a folder from its pieces. Raises ResultError."""
+    if not is_below(name):
+        raise ResultError(f"A worker gave back a file named {name!r}, which is not inside its folder.")
+    path = folder / name
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        whole = path.with_name(f".{path.name}.{os.getpid()}.part")
+        with whole.open("wb") as stream:
+            for part in parts:
+                stream.write(part.data)
+        put_in_place(whole, path)
+    except OSError as error:
+        raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
+
+
+def packed(folder: Path) -> dict[str, Bytes]:
+    """The files of a folder, whole, by name."""
+    return {name: np.fromfile(folder / name, np.uint8) for name in files_in(folder)}
+
+
+def unpacked(files: dict[str, Bytes], name: str) -> Path:
+    """A folder of this machine with these files, which are written once for all that use the name. Raises ResultError.
+
+    The name must stand for the content. A machine may clean up old files one by one, so sizes are looked at.
+    """
+    place = own_folder() / name
+    if not _is_whole(place, files):
+        with scratch("unpack") as folder:
+            for file, data in files.items():
+                write_pieces(folder / "new", file, iter([data]))
+            with suppress(OSError):
+                place.rename(folder / "old")
+            with suppress(OSError):  # another worker may have been first
+                (folder / "new").rename(place)
+        if not _is_whole(place, files):
+            raise ResultError(f"Cannot put {len(files)} files into {place}. Set TMPDIR to a folder with room.")
+    return place
+
+
+def _is_whole(place: Path, files: dict[str, Bytes]) -> bool:
+    return place.is_dir() and all(
+        (place / name).is_file() and (place / name).stat().st_size == data.size for name, data in files.items()
+    )

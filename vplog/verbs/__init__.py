@@ -1,0 +1,1 @@
+"""What each command line verb does, without its printing."""

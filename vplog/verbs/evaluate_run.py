@@ -1,0 +1,204 @@
+"""A finished run against the truth: trajectory error before and after, and whether the closures were right."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import Trajectory
+from vplog.errors import ResultError, TruthError
+from vplog.evaluate import closures, gps, residuals, trajectory
+from vplog.evaluate.body_truth import body_truth
+from vplog.evaluate.closure_pose import pose_bounds
+from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
+from vplog.evaluate.truth import read_truth
+from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.results import mcap_read, run_record, tables
+from vplog.run.provenance import reopened
+from vplog.storage.folders import is_below
+from vplog.storage.urls import shown
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog import logs
+    from vplog.data import Floats, Keyframes
+    from vplog.evaluate.body_truth import BodyTruth
+
+
+@dataclass(frozen=True)
+class TruthOptions:
+    """How a run is compared with the truth."""
+
+    distance_m: float = DISTANCE_M
+    """m between frames of one place."""
+    heading_deg: float = HEADING_DEG
+    """Degrees between their optical axes."""
+    align: str = "se3"
+    """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`."""
+    truth_offset_s: float = 0.0
+    """s added to the stamps of the truth, as evo's --t_offset."""
+
+    @property
+    def place(self) -> closures.PlaceCriterion:
+        return closures.PlaceCriterion(self.distance_m, self.heading_deg)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A run of one drive against a file of poses."""
+
+    record: dict[str, Any]
+    """As `evaluate` gives it."""
+    keyframes: Keyframes
+    truth: BodyTruth
+    judged: closures.Judgement
+
+
+def evaluate(
+    folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None
+) -> dict[str, Any]:
+    """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file or `gps`.
+
+    Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
+
+    Raises TruthError or ResultError with one line.
+    """
+    options = options or TruthOptions()
+    record = run_record.read_finished_run(folder)
+    if "maps" in record:
+        return _joint(folder, record, truth, options)
+    if truth == "gps":
+        return {"truth": "gps", **_against_gps(folder, record, topics, options)}
+    return evaluate_poses(folder, record, truth, options).record
+
+
+def evaluate_poses(
+    folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None
+) -> Evaluation:
+    """A run of one drive against a TUM file, or the poses `known` that were read from it. Raises as `evaluate`."""
+    known = _read_truth(truth, options) if known is None else known
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    ledger = tables.read_closures(folder / "closures.parquet")
+    settings = _recorded(record, folder, dict, "settings", "propose")
+    stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
+    camera = _camera(folder)
+    of_body = body_truth(known, before, camera)
+    score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
+    found = {
+        "truth": shown(truth),
+        "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
+        **_trajectories(before, after, known, of_body, options),
+        "closures": asdict(score),
+        "residuals": asdict(residuals.score_residuals(keyframes, ledger, of_body)),
+    }
+    return Evaluation(found, keyframes, of_body, judged)
+
+
+def _read_truth(truth: str, options: TruthOptions) -> Trajectory:
+    known = read_truth(truth)
+    return Trajectory(known.stamp_ns + round(options.truth_offset_s * 1e9), known.world_from_body)
+
+
+def _trajectories(
+    before: Trajectory, after: Trajectory, known: Trajectory, of_body: BodyTruth, options: TruthOptions
+) -> dict[str, Any]:
+    """ATE and RPE against the truth as it is given, as evo has them, and the drift against that of the body."""
+    found: dict[str, Any] = {}
+    for when, one in (("before", before), ("after", after)):
+        compared, found["interpolated"] = trajectory.at_truth(one, known)
+        found[f"ate_{when}"] = asdict(trajectory.ate(compared, known, alignment=options.align))
+        found[f"rpe_{when}"] = asdict(trajectory.rpe(compared, known))
+        found[f"drift_{when}"] = asdict(trajectory.drift(compared, of_body.trajectory))
+    return found
+
+
+def _camera(folder: Path) -> Floats | None:
+    """body_from_camera (4, 4), None where the run was written without."""
+    path = folder / "result.mcap"
+    return mcap_read.read_camera_pose(path) if path.exists() else None
+
+
+def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
+    """A joint run: drives by themselves, each map of several as one trajectory, and the closures between drives.
+
+    Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
+    """
+    if truth == "gps":
+        raise TruthError(f"{folder} holds several drives; each has its own GPS: vplog evaluate {folder}/DRIVE")
+    known = _read_truth(truth, options)
+    drives: dict[str, Evaluation] = {}
+    uncovered: dict[str, str] = {}
+    maps = []
+    for found in _recorded(record, folder, list, "maps"):
+        names = _recorded(found, folder, list, "drives")
+        if not all(map(is_below, names)):
+            raise ResultError(f"{folder}/run.json names drives outside its folder. Run `vplog run` again.")
+        for name in names:
+            try:
+                own = run_record.read_finished_run(folder / name)
+                drives[name] = evaluate_poses(folder / name, own, truth, options, known)
+            except TruthError as error:
+                uncovered[name] = str(error)
+        names = [name for name in names if name in drives]
+        if names:
+            file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
+            parts = [tables.read_trajectory(folder / name / file)[0] for name in names]
+            stamps, rows = np.unique(np.concatenate([part.stamp_ns for part in parts]), return_index=True)
+            whole = Trajectory(stamps, np.concatenate([part.world_from_body for part in parts])[rows])
+            ate = trajectory.ate(trajectory.at_truth(whole, known)[0], known, alignment=options.align)
+            own = [{"drive": name, **drives[name].record} for name in names]
+            maps.append({"drives": own, "ate_after": asdict(ate)})
+    if not drives:
+        raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
+    joins = _joins(folder, drives, options.place)
+    return {"truth": shown(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
+
+
+def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
+    """The closures between each two drives, as those of one are judged."""
+    found = []
+    for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():
+        if later in drives and earlier in drives:
+            query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
+            bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
+            oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
+            cameras = _camera(folder / later), _camera(folder / earlier)
+            judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
+            counts = closures.count_closures(ledger, judged, place)
+            found.append({"query_drive": later, "match_drive": earlier, **counts})
+    return found
+
+
+def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
+    """What run.json holds under these names. Raises ResultError where that is not of the kind, or not there."""
+    for name in names:
+        record = record.get(name) if isinstance(record, dict) else None
+    if not isinstance(record, kind):
+        raise ResultError(f"{folder}/run.json lacks {'.'.join(names)}. Compute it again with `vplog run`.")
+    return record
+
+
+def _against_gps(
+    folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions
+) -> dict[str, Any]:
+    if options != TruthOptions(align=options.align):
+        raise TruthError(
+            "--truth gps takes no --distance-m, --heading-deg or --truth-offset-s: fixes judge no closure and are in "
+            "the log's clock. Give a TUM file, or leave them out."
+        )
+    if options.align == "origin":
+        raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    fixes = reopened(record, None, topics, "Put it back there, or give a truth file: --truth FILE.tum.").gps()
+    if fixes is None or not len(fixes.stamp_ns):
+        raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
+    before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+    return {
+        "ate_before": asdict(gps.ate_to_gps(before, fixes, options.align)),
+        "ate_after": asdict(gps.ate_to_gps(after, fixes, options.align)),
+    }

@@ -1,0 +1,142 @@
+"""One closure of a finished run in words and in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import logs
+from vplog.errors import LibraryError, LogError, ResultError
+from vplog.features.extraction import extract_frames
+from vplog.figures.closure_view import find_agreement, find_boxes
+from vplog.results import run_record, tables
+from vplog.run.provenance import reopened
+from vplog.stages import BoxState
+from vplog.verbs import explain_text
+from vplog.verbs.explain_figure import Side, View, draw
+from vplog.verbs.report import recorded_pipeline, recorded_places
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from vplog.data import Closures, Keyframes
+    from vplog.figures.closure_view import SharedBoxes
+    from vplog.pipeline import Pipeline
+
+    Choose = Callable[[Closures, Keyframes], int]
+
+
+def explain(
+    folder: Path,
+    choose: Choose,
+    picture: Path | None = None,
+    log: Path | None = None,
+    words_only: bool = False,
+) -> dict[str, Any]:
+    """What happened to one closure of the run in `folder`: its row, sentences, and what the picture shows.
+
+    `picture` is the .png or .svg to write, `closure-K.png` in the run folder where None. The run's log is read for it,
+    or `log` where that has moved. Raises VplogError with one line.
+    """
+    record = run_record.read_single_run(folder)
+    if picture is not None and picture.suffix not in (".png", ".svg"):
+        raise ResultError(f"{picture} is neither a .png nor a .svg. Name one with -o.")
+    _part(record, folder, "settings")
+    pipeline = recorded_pipeline(folder, record)
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    path = folder / "closures.parquet"
+    closures = tables.read_closures(path)
+    number = choose(closures, keyframes)
+    row = tables.read_closure(path, number)
+    siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
+    reason = str(_part(record, folder, "solution").get("reason", ""))
+    words = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
+    shown = None
+    if not words_only:
+        topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
+        opened, file = reopened(record, log, topics), picture or folder / f"closure-{number}.png"
+        shown = _show(number, row, words, folder, record, pipeline, opened, file)
+    return {"run": str(folder), "closure": number, "row": row, **asdict(words), "picture": shown}
+
+
+def numbered(number: int) -> Choose:
+    """The closure in this row of the ledger."""
+    return lambda _closures, _keyframes: number
+
+
+def between(query: int, match: int) -> Choose:
+    """The closure of two keyframes, by their rows or their stamps in ns."""
+
+    def choose(closures: Closures, keyframes: Keyframes) -> int:
+        count = len(keyframes.stamp_ns)
+        rows = [one if one < count else int(np.searchsorted(keyframes.stamp_ns, one)) for one in (query, match)]
+        for one, at in zip((query, match), rows, strict=True):
+            if at >= count or (one >= count and keyframes.stamp_ns[at] != one):
+                raise ResultError(f"No keyframe has the row or stamp {one}. Rows are 0..{count - 1}; stamps are in ns.")
+        found = np.flatnonzero((closures.query == rows[0]) & (closures.match == rows[1]))
+        if not len(found):
+            known = closures.match[closures.query == rows[0]].tolist()
+            raise ResultError(
+                f"Keyframe {rows[1]} was not proposed for keyframe {rows[0]}. "
+                f"Proposed for it: {', '.join(map(str, known)) or 'none'}."
+            )
+        return int(found[0])
+
+    return choose
+
+
+def worst(closures: Closures, _keyframes: Keyframes) -> int:
+    """The closure that the solved trajectory is furthest from, in sigma."""
+    if not np.isfinite(closures.residual_after).any():
+        raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
+    return int(np.nanargmax(closures.residual_after))
+
+
+def _part(record: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
+    if not isinstance(record.get(name), dict):
+        raise ResultError(f"{folder}/run.json lacks {name}. Run `vplog run` again.")
+    return record[name]
+
+
+def _show(
+    number: int, row: dict[str, Any], words: explain_text.Words, folder: Path, record: dict[str, Any],
+    pipeline: Pipeline, log: Any, picture: Path,
+) -> dict[str, Any]:  # fmt: skip
+    """Read both frames again, look for what they share, and draw it."""
+    stamps = np.array([row["match_stamp_ns"], row["query_stamp_ns"]], np.int64)
+    if not np.isin(stamps, log.stamps()).all():
+        raise ResultError(f"{log.name} has no frames of these stamps: is it the log of {folder}? Name it with --log.")
+    sides = []
+    for _, frame, features, why in extract_frames(log.frames(stamps), pipeline.features, 1):
+        if frame is None or features is None:
+            raise ResultError(why)
+        sides.append(Side(frame.image, features))
+    match, query = sides
+    agreement = find_agreement(query.features, match.features, row, log.camera(), pipeline.verify)
+    boxes, missing = _boxes(row, folder, record, pipeline)
+    draw(picture, View(number, row, words, query, match, agreement, boxes, missing))
+    return {
+        "file": str(picture),
+        "matches": len(agreement.agrees),
+        "agree": int(agreement.agrees.sum()),
+        "agree_with": agreement.model,
+        "references": [one.reference for one in boxes],
+        "without_boxes": missing,
+    }
+
+
+def _boxes(
+    row: dict[str, Any], folder: Path, record: dict[str, Any], pipeline: Pipeline
+) -> tuple[list[SharedBoxes], str]:
+    """What both views share on the library's references, or why that is not known."""
+    if not row["shared_references"]:
+        return [], f"{pipeline.places.kind} names no reference that both views share"
+    try:
+        state, column = recorded_places(folder, record, pipeline, 1)
+        query, match = state.from_arrow(column.take([row["query"], row["match"]]))
+    except (LibraryError, LogError) as error:
+        return [], str(error).rstrip(".")
+    return (find_boxes(state, query, match, row["shared_references"]) if isinstance(state, BoxState) else []), ""

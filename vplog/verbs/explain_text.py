@@ -1,0 +1,261 @@
+"""A row of the ledger in plain sentences: what was proposed and why, the results of geometry and solver, what would
+change the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import Verdict
+from vplog.geometry import se3 as geometry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.data import Floats, Keyframes
+    from vplog.pipeline import Pipeline
+
+    Row = dict[str, Any]
+
+_NAMED = 4
+"""References named in a sentence; the table has them all."""
+_TYPICAL_SIGMA, _MOST_SIGMA = 2.3, 3.5
+"""Median and 95 % of the length of six independent normal errors, square roots of chi-square's 5.35 and 12.6."""
+_SCALE = {
+    "odometry": "Its metres come from the odometry between the map's own frames.",
+    "depth": "Its metres come from the depth images.",
+    "stereo": "Its metres come from the stereo pair.",
+}
+
+
+@dataclass(frozen=True)
+class Words:
+    """Paragraphs on one closure, each of one to four sentences."""
+
+    verdict: str
+    proposed: str
+    geometry: str
+    solver: str
+    change: str
+
+
+def describe(
+    row: Row, keyframes: Keyframes, world_from_body: Floats, siblings: list[str], pipeline: Pipeline, reason: str
+) -> Words:
+    """Describe one ledger row, by column.
+
+    `world_from_body` (N, 4, 4) are the solved poses, `siblings` the verdicts of all candidates of its query, `reason`
+    the solver's sentence on the whole run.
+    """
+    verdict = Verdict(row["verdict"])
+    became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, f"Rejected, {verdict.value}")
+    return Words(
+        f"{became}: {verdict.sentence}",
+        _proposed(row, keyframes, siblings),
+        _geometry(row),
+        _solver(row, keyframes, world_from_body, reason),
+        _CHANGES[verdict](row, pipeline),
+    )
+
+
+def _proposed(row: Row, keyframes: Keyframes, siblings: list[str]) -> str:
+    query, match, start = row["query"], row["match"], keyframes.stamp_ns[0]
+    at_s = [(row[f"{role}_stamp_ns"] - int(start)) / 1e9 for role in ("query", "match")]
+    path = keyframes.odom_from_body[match : query + 1, :3, 3]
+    between_m = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    sentences = [
+        f"Keyframe {query} ({at_s[0]:.1f} s into the drive) was proposed as a return to keyframe {match} "
+        f"({at_s[1]:.1f} s), {between_m:.1f} m of path earlier.",
+        f"It ranks {row['rank'] + 1} of this keyframe's {len(siblings)} candidates, "
+        f"{siblings.count(Verdict.ACCEPTED.value)} of them accepted; its score is {row['score']:.3f}"
+        + (
+            f", with {_count(row['support'], 'neighbouring pair')} in agreement by sequence." if row["support"] else "."
+        ),
+    ]
+    shared = list(zip(row["shared_references"], row["shared_overlap"], strict=True))
+    if shared:
+        named = ", ".join(f"no. {number} ({100 * share:.0f} %)" for number, share in shared[:_NAMED])
+        more = f" and {len(shared) - _NAMED} more" if len(shared) > _NAMED else ""
+        sentences.append(
+            f"{_count(len(shared), 'reference image')} of the library {'explain' if len(shared) > 1 else 'explains'} "
+            f"both views: {named}{more}; in brackets, how much of a box the two have in common there."
+        )
+    return " ".join(sentences)
+
+
+def _geometry(row: Row) -> str:
+    sentences = [f"The two images have {_count(row['matches'], 'feature match', 'es')}"]
+    if row["landmarks"]:
+        sentences[0] += f", {row['landmarks']} of them with a known position in the map"
+    sentences[0] += (
+        f"; {row['inliers']} agree with one geometry" if row["inliers"] else "; none agree with one geometry"
+    )
+    sentences[0] += f" and cover {100 * row['spread']:.0f} % of the image." if row["spread"] else "."
+    if row["reverse_inliers"] >= 0:
+        sentences.append(f"Checked in reverse, {row['reverse_inliers']} agree.")
+    if row["tx"] is not None:
+        moved = np.array([row["tx"], row["ty"], row["tz"]])
+        turn = geometry.rotation(np.array([row["qx"], row["qy"], row["qz"], row["qw"]]))
+        turned = f"is turned by {np.degrees(geometry.angle(turn)):.1f} degrees"
+        if row["scale"] == "none":
+            sentences.append(f"By it keyframe {row['query']} {turned}; its direction is known, its distance is not.")
+        else:
+            sentences.append(
+                f"By it keyframe {row['query']} lies {np.linalg.norm(moved):.2f} m from keyframe {row['match']} "
+                f"(x {moved[0]:+.2f}, y {moved[1]:+.2f}, z {moved[2]:+.2f} in its body frame) and {turned}."
+            )
+            sentences += [_certainty(row["covariance"]), _SCALE[row["scale"]]]
+    return " ".join(sentences)
+
+
+def _certainty(covariance: list[float] | None) -> str:
+    if covariance is None:
+        return "In some direction nothing constrains it."
+    matrix = np.reshape(covariance, (6, 6))
+    turn, shift = (np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0.0)) for part in (matrix[:3, :3], matrix[3:, 3:]))
+    return f"Its standard deviation in the worst direction is {shift:.3f} m and {np.degrees(turn):.2f} degrees."
+
+
+def _solver(row: Row, keyframes: Keyframes, world_from_body: Floats, reason: str) -> str:
+    query, match = row["query"], row["match"]
+    odometry_m, solved_m = (
+        float(np.linalg.norm(poses[query, :3, 3] - poses[match, :3, 3]))
+        for poses in (keyframes.odom_from_body, world_from_body)
+    )
+    apart = f"The two keyframes are {odometry_m:.2f} m apart by the odometry and {solved_m:.2f} m in the result."
+    if row["weight"] is None:
+        return f"It was not given to the solver. {apart}"
+    before, after = (_sigma(row[f"residual_{when}"]) for when in ("before", "after"))
+    return (
+        f"The odometry alone is {before} away from it, and the solved trajectory {after} (for a true closure "
+        f"{_TYPICAL_SIGMA} is usual, and more than {_MOST_SIGMA} rare). Its weight in the robust solve is "
+        f"{row['weight']:.2f}. {apart} The solve of the whole run: {reason}"
+    )
+
+
+def _sigma(residual: float | None) -> str:
+    return "an unknown number of sigma" if residual is None else f"{residual:.1f} sigma"
+
+
+def _count(number: int, name: str, plural: str = "s") -> str:
+    return f"{number or 'no'} {name}{plural if number != 1 else ''}"
+
+
+def _accepted(row: Row, pipeline: Pipeline) -> str:
+    metric = pipeline.verify.metric
+    needed = _needed(row, pipeline)
+    return (
+        f"It would be rejected with fewer than {needed} inliers, if they covered less than "
+        f"{100 * metric.min_spread:.0f} % of the image, or if the robust solve found it at odds with the rest."
+    )
+
+
+def _too_few_matches(row: Row, pipeline: Pipeline) -> str:
+    needed, ratio = pipeline.verify.min_matches, pipeline.verify.matching.ratio
+    return (
+        f"{needed} matches are needed (verify.min_matches), or their part among the strongest "
+        f"{pipeline.verify.matching.first_look} features. --set verify.min_matches={row['matches']}, or a "
+        f"verify.matching.ratio above {ratio:g}, would verify it, and many false candidates with it."
+    )
+
+
+def _too_few_landmarks(row: Row, pipeline: Pipeline) -> str:
+    return (
+        f"{pipeline.verify.metric.min_inliers} matches with a position are needed (verify.metric.min_inliers). Depth "
+        f"images, or more sideways motion around keyframe {row['match']}, would give more of them one."
+    )
+
+
+def _too_few_inliers(row: Row, pipeline: Pipeline) -> str:
+    needed = _needed(row, pipeline)
+    settings = "verify.metric" if row["landmarks"] else "verify.epipolar"
+    if row["inliers"] >= needed:
+        return (
+            f"Enough agree, {needed} being needed, but so many of {row['landmarks'] or row['matches']} may do so by "
+            f"chance ({settings}.log10_false_alarms)."
+        )
+    share = ", min_share" if row["landmarks"] else ""
+    return f"{needed} inliers are needed ({settings}.min_inliers{share}), and {row['inliers']} were found."
+
+
+def _needed(row: Row, pipeline: Pipeline) -> int:
+    """Inliers that a pose, or without calibration an epipolar geometry, has to have."""
+    if not row["landmarks"]:
+        return pipeline.verify.epipolar.min_inliers
+    metric = pipeline.verify.metric
+    return max(metric.min_inliers, int(np.ceil(metric.min_share * row["landmarks"])))
+
+
+def _poor_spread(row: Row, pipeline: Pipeline) -> str:
+    name = "metric" if row["landmarks"] else "epipolar"
+    needed = getattr(pipeline.verify, name).min_spread
+    return (
+        f"{100 * needed:.0f} % of the image must be covered (verify.{name}.min_spread): less is one object, such as a "
+        "sign or a parked car, that may stand anywhere."
+    )
+
+
+def _degenerate(row: Row, _: Pipeline) -> str:
+    return (
+        f"Depth images, or frames around keyframe {row['match']} that move sideways, would give its features positions."
+    )
+
+
+def _no_calibration(_: Row, pipeline: Pipeline) -> str:
+    return (
+        f"Record the camera's camera_info, or name it with --camera-info-topic: then a pose with "
+        f"{pipeline.verify.metric.min_inliers} inliers would make it a closure."
+    )
+
+
+def _implausible(_: Row, pipeline: Pipeline) -> str:
+    return (
+        f"The distance may be {pipeline.verify.metric.max_depths:g} of the inliers' median depth "
+        "(verify.metric.max_depths); beyond it two views hardly share what they see."
+    )
+
+
+def _too_far(_: Row, pipeline: Pipeline) -> str:
+    return (
+        f"Up to {pipeline.verify.metric.max_distance_m:g} m are taken (verify.metric.max_distance_m). Nearer "
+        "keyframes of the same pass have a smaller error; see the other candidates of this keyframe."
+    )
+
+
+def _inconsistent(row: Row, _: Pipeline) -> str:
+    return (
+        "Both ways must give one pose. Where they do not, the scene repeats itself, or too little of it is seen "
+        f"from both; see the other candidates of keyframe {row['query']}. --set verify.both_ways=false checks one "
+        "way."
+    )
+
+
+def _by_solver(row: Row, _: Pipeline) -> str:
+    return (
+        "It would be kept if the odometry or other closures agreed with it. Where it is right, the odometry's "
+        "noise is set too small or the neighbouring closures are false: look at the candidates around keyframe "
+        f"{row['query']} with a weight of 1, and at the noise settings (`noise`)."
+    )
+
+
+def _direction_only(row: Row, _: Pipeline) -> str:
+    return "Metres would need landmarks: keyframes around the match that moved further, a depth image or a stereo pair."
+
+
+_CHANGES: dict[Verdict, Callable[[Row, Pipeline], str]] = {
+    Verdict.ACCEPTED: _accepted,
+    Verdict.TOO_FEW_MATCHES: _too_few_matches,
+    Verdict.TOO_FEW_LANDMARKS: _too_few_landmarks,
+    Verdict.TOO_FEW_INLIERS: _too_few_inliers,
+    Verdict.POOR_SPREAD: _poor_spread,
+    Verdict.DEGENERATE_MOTION: _degenerate,
+    Verdict.NO_CALIBRATION: _no_calibration,
+    Verdict.IMPLAUSIBLE_POSE: _implausible,
+    Verdict.TOO_FAR: _too_far,
+    Verdict.INCONSISTENT: _inconsistent,
+    Verdict.DIRECTION_ONLY: _direction_only,
+    Verdict.REJECTED_BY_SOLVER: _by_solver,
+}
+"""What would change each verdict."""

@@ -1,0 +1,72 @@
+"""A finished run in the formats of other tools."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import ResultError
+from vplog.geometry import tum
+from vplog.results import geo, poses, tables
+from vplog.results.rrd import write_rrd
+from vplog.results.run_record import read_single_run
+from vplog.run.report import gather_tracks
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.results.shown import Earth
+    from vplog.run.report import Tracks
+
+FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+
+
+def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
+    """Write the run in `folder` as one of `FORMATS`; what was written. Raises ResultError."""
+    tracks = gather_tracks(folder, read_single_run(folder))
+    written = [str(path)]
+    match kind:
+        case "tum":
+            tum.write_tum(path, tracks.after)
+        case "kitti":
+            written.append(str(poses.write_kitti(path, tracks.after)))
+        case "euroc":
+            poses.write_euroc(path, tracks.after)
+        case "g2o":
+            _copy(folder / "graph.g2o", path)
+        case "geojson":
+            closures = tables.read_closures(folder / "closures.parquet")
+            where = _earth(folder, kind, tracks)
+            tree = geo.feature_collection(where, tracks.world_from_body, tracks.keyframes.stamp_ns, closures)
+            geo.write_geojson(path, tree)
+        case "geoparquet":
+            header = tables.read_metadata(folder / "trajectory.parquet")
+            geo.write_geoparquet(path, tracks.after, _earth(folder, kind, tracks), header)
+        case "rrd":
+            closures = tables.read_closures(folder / "closures.parquet")
+            write_rrd(
+                path, tracks.keyframes, tracks.world_from_body, closures, tracks.before, tracks.after, tracks.earth,
+                folder / "result.mcap",
+            )  # fmt: skip
+        case _:
+            raise ResultError(f"No format {kind!r}. Formats: {', '.join(FORMATS)}.")
+    return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}
+
+
+def _copy(source: Path, path: Path) -> None:
+    try:
+        data = source.read_bytes()
+    except OSError as error:
+        raise ResultError(f"Cannot read {source}: {error.strerror}. Write it again with `vplog run`.") from None
+    with replacing(path) as stream:
+        stream.write(data)
+
+
+def _earth(folder: Path, kind: str, tracks: Tracks) -> Earth:
+    if tracks.earth is None:
+        others = ", ".join(one for one in FORMATS if not one.startswith("geo"))
+        raise ResultError(
+            f"{folder} has fewer than three satellite fixes, so no place on earth, which {kind} needs. "
+            f"Other formats: {others}."
+        )
+    return tracks.earth

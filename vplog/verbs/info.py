@@ -1,0 +1,347 @@
+"""The preflight: what is in a log, what a run would use of it and why, what is wrong, and the command to run."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from vplog import logs
+from vplog.errors import LogError
+from vplog.logs.odometry_sources import in_words as evidence_in_words
+from vplog.logs.stamps import rate_hz
+from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.storage.remote_path import address
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
+    from vplog.logs import TopicChoice
+    from vplog.stages import Log
+
+_SAMPLES = 8
+"""Frames that are decoded: enough to see what the drive looks like and whether its images decode throughout."""
+PICTURE_PX = 480
+"""px across a picture that is kept: a phone's width, and half of a column on a screen."""
+_GAP_S = 1.0
+"""s without a message that count as a gap, where they are also _GAP_PERIODS of the topic's own."""
+_GAP_PERIODS = 10
+_MOST_TRIED = 4
+"""Other topics that are tried where those chosen do not work: each reads the log again."""
+_MOST_GAPS = 20
+"""Gaps that are listed, the longest."""
+_OPTIONS = {
+    "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
+    "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
+    "calibration_file": "calibration",
+}  # fmt: skip
+"""Option of the command line for each field of TopicChoice."""
+_PART_WORDS = {
+    "image": "camera",
+    "right": "right image of the pair",
+    "depth": "depth",
+    "camera_info": "calibration",
+    "right_info": "calibration of the right camera",
+    "odometry": "odometry",
+    "gps": "satellite fixes",
+    "tf_static": "static transforms",
+    "tf": "transforms",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """What was found."""
+
+    record: dict[str, Any]
+    """Plain values, as `vplog info --json` prints them."""
+    pictures: list[tuple[int, Bytes]] = field(default_factory=list)
+    """Stamp in ns and grey image of frames evenly spread over the drive, not wider than PICTURE_PX."""
+
+
+def preflight(path: Path, topics: TopicChoice | None = None) -> Preflight:
+    """Read the chosen topics once and decode a few frames. Raises LogError where the log cannot be opened.
+
+    Where a run cannot work, other topics are tried in the same way, and the record's `command` is one that works.
+    """
+    found = _look(path, topics or logs.TopicChoice())
+    if found.record["problems"]:
+        found.record["command"] = _working(path, topics or logs.TopicChoice(), found)
+    return found
+
+
+def _working(path: Path, topics: TopicChoice, found: Preflight) -> str | None:
+    """A run with another camera or odometry topic, or, with images alone, a library; None where nothing works."""
+    unused = [topic for topic in found.record["topics"] if topic["count"] and not topic["used"]]
+    for topic in [topic for topic in unused if topic["role"] in ("image", "odometry")][:_MOST_TRIED]:
+        file = {"odometry_file": None} if topic["role"] == "odometry" else {}
+        choice = topics.model_copy(update={topic["role"]: topic["name"], **file})
+        with suppress(LogError):
+            if _look(path, choice).record["ready"]:
+                return command(path, choice)
+    images = topics.model_copy(update={"odometry": None, "odometry_file": None})
+    return command(path, images).replace("vplog run", "vplog library", 1) if found.pictures else None
+
+
+def _look(path: Path, topics: TopicChoice) -> Preflight:
+    """What is there with these topics, whose `command` runs on it where nothing is in the way."""
+    log = logs.open(path, topics)
+    found = log.info()
+    problems: list[str] = []
+    camera, odometry, gps = _camera(log, problems), log.odometry(), log.gps()
+    stamp_ns = log.stamps() if camera is not None else np.zeros(0, np.int64)
+    pictures, decoded = _pictures(log, stamp_ns, problems)
+    keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
+    warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
+    named = {**asdict(found), "warnings": warnings}
+    for topic, told in zip(found.topics, named["topics"], strict=True):
+        told["why"] = _why(topic, found, topics)
+    record = {
+        **named,
+        "camera": None if camera is None else _about_camera(camera),
+        "frames": {
+            "count": len(stamp_ns), **_timing(stamp_ns), "sampled": decoded[1], "decoded": decoded[0],
+            "keyframes": keyframes,
+        },
+        "odometry": _about_odometry(odometry, found, topics),
+        "gps": _about_gps(gps, found),
+        "scale": _scale(camera, found),
+        "gaps": _gaps(found, stamp_ns, odometry, gps),
+        "losses": [asdict(loss) for loss in getattr(log, "losses", [])],
+        "problems": problems,
+        "ready": not problems,
+        "command": command(path, topics),
+    }  # fmt: skip
+    return Preflight(record, pictures)
+
+
+def command(path: Path, topics: TopicChoice) -> str:
+    """The command that runs on this log with these topics."""
+    chosen = {name: value for name, value in topics if value is not None}
+    options = [f"--{_OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
+    log = "LOG" if address(path) != str(path) else shlex.quote(str(path))  # a URL with its query is shown nowhere
+    return " ".join(["vplog run", log, "-o OUT", *options])
+
+
+def _camera(log: Log, problems: list[str]) -> Camera | None:
+    try:
+        return log.camera()
+    except LogError as error:
+        problems.append(str(error))
+        return None
+
+
+def _pictures(log: Log, stamp_ns: Ints, problems: list[str]) -> tuple[list[tuple[int, Bytes]], tuple[int, int]]:
+    """Frames evenly spread over the drive that decode, and how many of how many did."""
+    rows = np.unique(np.linspace(0, len(stamp_ns) - 1, min(_SAMPLES, len(stamp_ns))).astype(np.int64))
+    pictures: list[tuple[int, Bytes]] = []
+    reason = ""
+    for encoded in log.frames(stamp_ns[rows]) if len(rows) else ():
+        try:
+            pictures.append((encoded.stamp_ns, _small(encoded.decode().image)))
+        except LogError as error:
+            reason = reason or str(error)
+    if len(rows) and not pictures:
+        problems.append(f"None of {len(rows)} frames tried can be decoded. The first: {reason}")
+    return pictures, (len(pictures), len(rows))
+
+
+def _small(image: Bytes) -> Bytes:
+    """The picture, not wider than PICTURE_PX."""
+    height, width = image.shape
+    if width <= PICTURE_PX:
+        return image
+    size = PICTURE_PX, max(round(height * PICTURE_PX / width), 1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _keyframes(
+    log: Log, stamp_ns: Ints, odometry: Odometry | None, problems: list[str]
+) -> tuple[int | None, list[str]]:
+    """How many keyframes a run would take with the default settings, and which frames it would leave out."""
+    if not len(stamp_ns):
+        return None, []
+    if odometry is None or len(odometry.stamp_ns) < 2:
+        problems.append(
+            "There is no odometry, and a trajectory is built on it: name its topic with --odometry-topic, or give "
+            "poses with --odometry-file."
+        )
+        return None, []
+    try:
+        keyframes, missing = select_keyframes(log.name, stamp_ns, odometry, KeyframeSettings())
+    except LogError as error:
+        problems.append(str(error))
+        return None, []
+    if len(keyframes.stamp_ns) < 2:
+        problems.append(
+            "By the odometry nothing moves far enough for a second keyframe, and a graph needs two. Choose another "
+            "odometry with --odometry-topic or --odometry-file."
+        )
+    return len(keyframes.stamp_ns), missing
+
+
+def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
+    """Why a topic is used or not, in a sentence."""
+    if topic.used:
+        asked = {str(value) for name, value in topics if value and not name.endswith("_file")}
+        return f"used as {_PART_WORDS[topic.part]}" + (", as asked for" if topic.name in asked else "")
+    if not topic.count:
+        return "no messages"
+    if not topic.role:
+        return f"no use for {topic.type or 'its type'} in {topic.encoding or 'its encoding'}"
+    part = "depth" if topic.role == "depth" else topic.role
+    taken = next((other.name for other in found.topics if other.part == part), None)
+    if topic.role == "odometry" and topics.odometry_file is not None:
+        return f"{topics.odometry_file} is used instead"
+    if topic.role == "camera_info":
+        if topics.calibration_file is not None:
+            return f"{topics.calibration_file} is used instead"
+        return "its matrix is not set" if topic.calibrated is False else "of another camera"
+    best, others = _odometry_sources(found)
+    source = next((other for other in others if other.topic == topic.name), None)
+    if best is not None and source is not None:
+        return (
+            f"{best.topic} is taken, score {best.score:.2g}; this has {evidence_in_words(source)}; "
+            f"--odometry-topic {topic.name} takes it"
+        )
+    if topic.role in ("tf", "tf_static"):
+        return "it adds no transform to those of other topics"
+    if topic.role == "depth" and any(other.part == "right" for other in found.topics):
+        return "depth comes from the pair"
+    option = f"--{topic.role}-topic {topic.name}"
+    return f"{taken} is taken; {option} takes this" if taken else f"left out; {option} takes it"
+
+
+def _timing(stamp_ns: Ints) -> dict[str, Any]:
+    """First and last stamp, and the rate between them."""
+    if not len(stamp_ns):
+        return {"start_ns": None, "end_ns": None, "rate_hz": None}
+    return {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1]), "rate_hz": rate_hz(stamp_ns)}
+
+
+def _about_camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "matrix": None if camera.matrix is None else camera.matrix.tolist(),
+        "distortion_model": camera.distortion_model,
+        "distortion": camera.distortion.tolist(),
+        "body_from_camera": camera.body_from_camera.tolist(),
+        "baseline_m": camera.baseline_m,
+    }
+
+
+def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoice) -> dict[str, Any] | None:
+    if odometry is None:
+        return None
+    taken = next((topic for topic in found.topics if topic.part == "odometry"), None)
+    position = odometry.odom_from_body[:, :3, 3]
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    known = odometry.covariance is not None
+    return {
+        "source": taken.name if taken else str(topics.odometry_file),
+        "type": taken.type if taken else "TUM file",
+        "frames": found.odometry_frames,
+        "count": len(odometry.stamp_ns),
+        **_timing(odometry.stamp_ns),
+        "path_m": round(float(steps.sum()), 3),
+        "choice": _choice(found, topics),
+        "covariance": "logged" if known else "unknown",
+    }
+
+
+def _odometry_sources(found: LogInfo) -> tuple[OdometrySource | None, list[OdometrySource]]:
+    """The source in use, None of a file, and the others."""
+    used = next((topic.name for topic in found.topics if topic.part == "odometry"), None)
+    best = next((source for source in found.odometry_sources if source.topic == used), None)
+    return best, [source for source in found.odometry_sources if source is not best]
+
+
+def _choice(found: LogInfo, topics: TopicChoice) -> str:
+    """Why this source is the odometry, and what comes next; empty of a file."""
+    best, others = _odometry_sources(found)
+    if best is None:
+        return ""
+    why = "as asked for" if topics.odometry else "the only source" if not others else "the best source"
+    text = f"{best.topic} is {why}: {evidence_in_words(best)}"
+    return text + (f"; next is {others[0].topic}: {evidence_in_words(others[0])}" if others else "")
+
+
+def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
+    if gps is None:
+        return None
+    return {
+        "source": next((topic.name for topic in found.topics if topic.part == "gps"), ""),
+        "count": len(gps.stamp_ns),
+        **_timing(gps.stamp_ns),
+        "with_covariance": int(np.isfinite(gps.covariance).all(axis=(1, 2)).sum()),
+        "latitude_deg": [float(gps.latitude_deg.min()), float(gps.latitude_deg.max())],
+        "longitude_deg": [float(gps.longitude_deg.min()), float(gps.longitude_deg.max())],
+        "antenna_m": None if gps.antenna_m is None else gps.antenna_m.tolist(),
+    }
+
+
+def _scale(camera: Camera | None, found: LogInfo) -> dict[str, str]:
+    """Where the metres of a closure come from."""
+    if camera is None:
+        return {"source": "none", "why": "There are no images."}
+    if camera.matrix is None:
+        return {"source": "none", "why": "No calibration, so no closure gets a metric pose; --calibration gives one."}
+    if camera.baseline_m is not None:
+        return {"source": "stereo", "why": f"The pair has a baseline of {camera.baseline_m:.3f} m."}
+    unused = any(line.startswith("Depth is not used") for line in found.warnings)
+    if not unused and any(topic.part == "depth" for topic in found.topics):
+        return {"source": "depth", "why": "Depth images come with the camera's."}
+    return {"source": "odometry", "why": "A single camera has no scale: its metres are the odometry's."}
+
+
+def _gaps(found: LogInfo, stamp_ns: Ints, odometry: Odometry | None, gps: Gps | None) -> list[dict[str, Any]]:
+    """The longest stretches without a message, in order of time."""
+    by_part = [("images", stamp_ns)]
+    by_part += [("odometry", odometry.stamp_ns)] if odometry is not None else []
+    by_part += [("gps", gps.stamp_ns)] if gps is not None else []
+    gaps = []
+    for part, stamps in by_part:
+        steps = np.diff(stamps)
+        limit = max(_GAP_S * 1e9, _GAP_PERIODS * float(np.median(steps))) if len(steps) else 0.0
+        gaps += [(int(steps[row]), int(stamps[row]), part) for row in np.flatnonzero(steps > limit)]
+    longest = sorted(gaps, reverse=True)[:_MOST_GAPS]
+    return [
+        {"what": part, "after_s": round((at - found.start_ns) / 1e9, 3), "seconds": round(step / 1e9, 3)}
+        for step, at, part in sorted(longest, key=lambda gap: gap[1])
+    ]
+
+
+def in_words(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """What of a record would be used, a name and a line each."""
+    camera, frames, odometry, gps = (found[name] for name in ("camera", "frames", "odometry", "gps"))
+    if camera is not None:
+        matrix = camera["matrix"]
+        model = "no distortion" if camera["distortion_model"] == "none" else camera["distortion_model"]
+        lens = "uncalibrated" if matrix is None else f"fx {matrix[0][0]:.1f} px, {model}"
+        pair = "" if camera["baseline_m"] is None else f", pair with a baseline of {camera['baseline_m']:.3f} m"
+        yield "camera", f"{camera['name']}: {camera['width']} x {camera['height']}, {lens}{pair}"
+        rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.1f} Hz"
+        keyframes = "" if frames["keyframes"] is None else f", about {frames['keyframes']} keyframes"
+        yield "frames", f"{frames['count']}{rate}{keyframes}; {frames['decoded']} of {frames['sampled']} tried decode"
+    if odometry is not None:
+        chain = " -> ".join(odometry["frames"]) or "no frames named"
+        rate = "" if odometry["rate_hz"] is None else f" at {odometry['rate_hz']:.1f} Hz"
+        text = f"{odometry['source']}: {chain}, {odometry['count']} poses{rate} over {odometry['path_m']:.1f} m"
+        yield "odometry", f"{text}, covariance {odometry['covariance']}"
+        if odometry["choice"]:
+            yield "chosen", odometry["choice"]
+    if gps is not None:
+        known = f"{gps['with_covariance']} with a covariance"
+        yield "gps", f"{gps['source']}: {gps['count']} fixes, {known}; --gps uses them"
+    yield "scale", f"{found['scale']['source']}: {found['scale']['why']}"
+    if found["skew_ms"]:
+        skews = ", ".join(f"{topic} {skew:.1f}" for topic, skew in found["skew_ms"].items())
+        yield "skew", f"log time less header stamp, ms: {skews}"

@@ -1,0 +1,149 @@
+"""`vplog optimize`: a pose graph from anywhere is read, checked, solved, held against its odometry, and written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from vplog.data import EdgeKind, PoseGraph, Solution
+from vplog.errors import GraphError
+from vplog.execution.timing import Watch
+from vplog.geometry.se3 import inverse
+from vplog.graph.build import checked, parts
+from vplog.graph.solve import OptimiserSettings, gated
+from vplog.results.g2o import read_g2o, write_g2o
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from vplog.data import Ints
+    from vplog.results.g2o import GraphFile
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised:
+    """A solved file."""
+
+    file: GraphFile
+    solution: Solution
+    record: dict[str, Any]
+    """What `--json` prints."""
+
+
+def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
+    """Solve the graph of a g2o file and write it with its new poses to `out`, all its edges too.
+
+    Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
+    where it is. Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
+    """
+    optimiser = TypeAdapter(OptimiserSettings).validate_python({"kind": method})
+    watch = Watch()
+    with watch.stage("read"):
+        file = read_g2o(path)
+    graph, ids = file.graph, file.ids
+    part = parts(len(ids), graph.a, graph.b)
+    warnings = file.warnings + _about_parts(part, ids)
+    with watch.stage("solve"):
+        solution, repairs = solve_parts(graph, part, optimiser, ids)
+        solution = _holding(solution, graph, part == part[file.held], file.held)
+    with watch.stage("write"):
+        write_g2o(out, graph, solution.world_from_body, ids, file.held)
+    return Optimised(file, solution, _record(path, out, method, file, solution, warnings + repairs, watch))
+
+
+def _about_parts(part: Ints, ids: Ints) -> list[str]:
+    """What to say of a graph that is not in one part (N,)."""
+    size = np.bincount(part)
+    first = [str(ids[np.argmax(part == number)]) for number in np.flatnonzero(size > 1)[:5].tolist()]
+    alone = int((size == 1).sum())
+    said = [f"{alone} poses have no edge and stay where they are."] if alone else []
+    if (size > 1).sum() > 1:
+        said.append(
+            f"The graph has {int((size > 1).sum())} unconnected parts (from {', '.join(first)} "
+            f"on{', ..' if (size > 1).sum() > 5 else ''}); each is solved by itself with its first pose fixed."
+        )
+    return said
+
+
+def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints) -> tuple[Solution, list[str]]:
+    """The solution of each part (N,) of a graph by itself, put together, and warnings of what was repaired."""
+    poses, weight = np.array(graph.world_from_body), np.ones(len(graph.a))
+    solutions, warnings = [], []
+    size = np.bincount(part)
+    rows_of, edges_of = _by_part(part, len(size)), _by_part(part[graph.a], len(size))
+    for number in np.flatnonzero(size > 1).tolist():
+        rows, edges = rows_of(number), edges_of(number)
+        alone = PoseGraph(
+            graph.world_from_body[rows],
+            np.searchsorted(rows, graph.a[edges]).astype(np.int32),
+            np.searchsorted(rows, graph.b[edges]).astype(np.int32),
+            graph.a_from_b[edges],
+            graph.information[edges],
+            [graph.kind[edge] for edge in edges],
+            graph.dimension,
+        )
+        alone, repairs = checked(alone)
+        solution = gated(alone, optimiser)
+        where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
+        warnings += [where + text for text in repairs]
+        poses[rows], weight[edges] = solution.world_from_body, solution.weight
+        solutions.append(replace(solution, reason=where + solution.reason))
+    if not solutions:
+        raise GraphError(
+            "No edge joins two poses, so there is nothing to solve. Give a graph with edges between two poses."
+        )
+    return Solution(
+        poses,
+        weight,
+        sum(one.error_before for one in solutions),
+        sum(one.error_after for one in solutions),
+        max(one.iterations for one in solutions),
+        all(one.converged for one in solutions),
+        " ".join(one.reason for one in solutions),
+    ), warnings
+
+
+def _by_part(part: Ints, parts: int) -> Callable[[int], Ints]:
+    """The rows of each part, in order, of the part that each row (N,) is of."""
+    order = np.argsort(part, kind="stable")
+    first = np.searchsorted(part[order], np.arange(parts + 1))
+    return lambda number: order[first[number] : first[number + 1]]
+
+
+def _holding(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:
+    """The solution with this part (N,) moved as one so that its row is where the graph has it."""
+    poses = np.array(solution.world_from_body)
+    poses[part] = graph.world_from_body[row] @ inverse(poses[row]) @ poses[part]
+    return replace(solution, world_from_body=poses)
+
+
+def _record(
+    path: Path, out: Path, method: str, file: GraphFile, solution: Solution, warnings: list[str], watch: Watch
+) -> dict[str, Any]:
+    graph = file.graph
+    loop = np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind])
+    rejected = np.flatnonzero(solution.weight < 0.5)
+    return {
+        "graph": str(path),
+        "output": str(out),
+        "method": method,
+        "dimension": graph.dimension,
+        "poses": len(file.ids),
+        "edges": len(graph.a),
+        "loops": int(loop.sum()),
+        "kept": int(loop.sum()) - len(rejected),
+        "rejected": len(rejected),
+        "rejected_edges": np.stack([file.ids[graph.a[rejected]], file.ids[graph.b[rejected]]], axis=1).tolist(),
+        "error_before": solution.error_before,
+        "error_after": solution.error_after,
+        "iterations": solution.iterations,
+        "converged": solution.converged,
+        "odometry_kept": "Odometry was kept" in solution.reason,
+        "reason": solution.reason,
+        "seconds": {name: round(stage["seconds"], 3) for name, stage in watch.stages.items()},
+        "warnings": warnings,
+    }

@@ -1,0 +1,130 @@
+"""The report of a finished run written again: against a truth, or with pictures from the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import logs
+from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
+from vplog.evaluate.closures import in_words
+from vplog.features.extraction import extract_frames
+from vplog.figures.run_figures import ClosureInputs, choose_examples, draw_closures
+from vplog.geometry import se3
+from vplog.pipeline import Pipeline
+from vplog.results import mcap_read, run_record, tables
+from vplog.results.previews import shrink
+from vplog.results.report.content import Judged
+from vplog.run.provenance import library_at
+from vplog.run.report import write_report
+from vplog.storage.remote_path import original
+from vplog.storage.urls import shown
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses
+
+if TYPE_CHECKING:
+    from pyarrow import Array
+
+    from vplog.data import Bytes, Features
+    from vplog.stages import PlaceState
+
+
+def report(
+    folder: Path,
+    path: Path | None = None,
+    truth: str | None = None,
+    log: Path | None = None,
+    topics: logs.TopicChoice | None = None,
+    threads: int = 1,
+    options: TruthOptions | None = None,
+) -> dict[str, Any]:
+    """Write report.html of the run in `folder`, to `path` where given; what was written.
+
+    `truth` is a TUM file or `gps`, and `options` how it is used, as in `evaluate`; `log` the drive, read again where
+    result.mcap has no pictures of closures.
+    Raises VplogError with one line.
+    """
+    record = run_record.read_single_run(folder)
+    options = options or TruthOptions()
+    if truth is None and options != TruthOptions():
+        raise TruthError(
+            "--distance-m, --heading-deg, --align and --truth-offset-s say how a truth is used: give --truth."
+        )
+    judged = judge(folder, record, truth, topics, options) if truth is not None else None
+    pictures = None
+    if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
+        pictures = pictures_from(log, folder, record, threads)
+    written = write_report(folder, record, path, judged, pictures)
+    return {"report": str(written), "bytes": written.stat().st_size, "truth": truth and shown(truth)}
+
+
+def judge(
+    folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None, options: TruthOptions
+) -> Judged:
+    """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
+    if truth == "gps":
+        return Judged(truth, evaluate(folder, truth, topics, options))
+    found = evaluate_poses(folder, record, truth, options)
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
+    true, solved = at.world_from_body[at.known][:, :3, 3], world_from_body[at.known][:, :3, 3]
+    world_from_truth, _ = se3.umeyama(true, solved)
+    # of the truth only what the drive covers, so that the map is that of the drive
+    during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
+    path = se3.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
+    return Judged(
+        Path(shown(truth)).name,
+        found.record,
+        in_words(found.record["closures"]),
+        path,
+        judged.right,
+        judged.right | judged.wrong,
+        judged.curves,
+        judged.at_place,
+    )
+
+
+def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int) -> dict[int, bytes]:
+    """Pictures of closures drawn from the log itself. Raises LogError or ResultError."""
+    pipeline = recorded_pipeline(folder, record)
+    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    closures = tables.read_closures(folder / "closures.parquet")
+    state, column = recorded_places(folder, record, pipeline, threads)
+    opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
+    settings = pipeline.pictures.model_copy(update={"megapixels": pipeline.pictures.megapixels or 0.15})
+    rows = choose_examples(closures, settings.closures)
+    nodes = np.unique(np.concatenate([closures.query[rows], closures.match[rows]])) if rows else np.zeros(0, np.int32)
+    stamps = keyframes.stamp_ns[nodes]
+    if not np.isin(stamps, opened.stamps()).all():
+        raise ResultError(f"{opened.name} has no frames of these stamps: is it the log of {folder}?")
+    images: dict[int, Bytes] = {}
+    features: dict[int, Features] = {}
+    frames = extract_frames(opened.frames(stamps), pipeline.features, threads)
+    for node, (_, frame, found, why) in zip(nodes.tolist(), frames, strict=True):
+        if frame is None or found is None:
+            raise ResultError(why)
+        images[node], features[node] = shrink(frame.image, settings.megapixels), found
+    places = state.from_arrow(column)
+    inputs = ClosureInputs(images.__getitem__, features.__getitem__, opened.camera(), state, places)
+    return draw_closures(rows, inputs, closures, pipeline.verify, settings.quality, threads)
+
+
+def recorded_places(folder: Path, record: dict[str, Any], pipeline: Pipeline, threads: int) -> tuple[PlaceState, Array]:
+    """The recogniser of a run and its descriptors. Raises LibraryError where its library is not there."""
+    with library_at(folder, record) as library:
+        state = pipeline.places.load(library, threads)
+        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+        if made_by != state.hash:
+            raise LibraryError(
+                f"{original(library)} is not the library of the run in {folder}, so its boxes cannot be drawn."
+            )
+    return state, column
+
+
+def recorded_pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
+    """The settings of a run. Raises ResultError."""
+    try:
+        return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
+    except SettingsError as error:
+        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None

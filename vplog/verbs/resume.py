@@ -1,0 +1,114 @@
+"""Going on with a run that was killed: what was asked for and what was done are in its cache."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from vplog import logs
+from vplog.cache.stage_cache import inputs_of, key_of
+from vplog.errors import LogError, ResultError, SettingsError
+from vplog.pipeline import Pipeline
+from vplog.results import run_record
+from vplog.results.run_record import CACHE, REQUEST
+from vplog.results.staging import recover
+from vplog.run.provenance import OWN_LIBRARY, stat_of, stored_log
+from vplog.storage.folders import check_regular
+from vplog.storage.remote_path import located
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a run was asked for."""
+
+    logs: list[Path]
+    """The parts of one recording, or the drives of one map."""
+    several: bool
+    """Whether they are drives, each of its own."""
+    pipeline: Pipeline
+    library: Path | None
+    topics: logs.TopicChoice
+
+
+def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
+    """What the unfinished run in `out` was asked for; logs `given` must be its logs.
+
+    Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
+    """
+    check_regular(out, "run.json")
+    check_regular(out / CACHE)
+    recover(out)
+    file = out / REQUEST if (out / REQUEST).is_file() else out / "run.json"  # there older versions had it
+    if not file.is_file():
+        raise ResultError(f"Nothing to resume: {out} has no run.json. Begin a run: vplog run LOG -o {out}")
+    account = run_record.read_run_json(file)
+    if account.get("finished") is not False:
+        raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")
+    if not isinstance(account.get("topics"), dict):  # of an older version
+        raise ResultError(
+            f"{out}/run.json lacks options of its run. Give the full command without --resume: finished stages are "
+            "reused."
+        )
+    known = [str(located(text).resolve()) for text in _texts(account, out)]
+    paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
+    if not given:
+        again = f"Give it again: vplog run --resume LOG -o {out}"
+        paths = [stored_log(text, f"The log of the run in {out}", again) for text in known]
+    if sorted(str(path.resolve()) for path in paths) != sorted(known):
+        raise SettingsError(
+            f"The run in {out} is of {' '.join(known)}, not of {given[0]}. Leave out the log, or choose another -o."
+        )
+    _check_unchanged(paths, account, out)
+    where = str(file)
+    pipeline = Pipeline.read(_tree(account, "settings", out), where)
+    library = _tree(account, "library", out).get("from")
+    if not isinstance(library, str):
+        raise _lacking(out, "library.from")
+    return Asked(
+        paths,
+        "logs" in account,
+        pipeline,
+        None if library == OWN_LIBRARY else located(library),
+        logs.TopicChoice.read(_tree(account, "topics", out), where),
+    )
+
+
+def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) -> None:
+    """Raises LogError where a log is not what it was when the run began, by its stat, or by its content if known."""
+    about = account.get("log_stat")
+    if not isinstance(about, dict) or not all(path.exists() for path in paths) or stat_of(paths) == about:
+        return  # of an older version; or the run says what is missing
+    now = inputs_of(paths, out / CACHE)
+    if now.token == key_of(now.look):  # the cache does not know the content either, so nothing of it would be found
+        given = shlex.join(map(str, paths))
+        raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
+
+
+def _place(known: list[str], path: Path) -> int:
+    """Of a log among those of the run; behind all where it is none of them."""
+    text = str(path.resolve())
+    return known.index(text) if text in known else len(known)
+
+
+def _texts(account: dict[str, Any], out: Path) -> list[str]:
+    named = account.get("logs") or account.get("parts") or [account.get("log")]
+    paths = [path for path in named if isinstance(path, str)] if isinstance(named, list) else []
+    if not paths or len(paths) < len(named):
+        raise _lacking(out, "log")
+    return paths
+
+
+def _tree(account: dict[str, Any], name: str, out: Path) -> dict[str, Any]:
+    tree = account.get(name)
+    if not isinstance(tree, dict):
+        raise _lacking(out, name)
+    return tree
+
+
+def _lacking(out: Path, name: str) -> ResultError:
+    return ResultError(f"{out}/run.json lacks {name}. Run again without --resume.")
