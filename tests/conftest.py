@@ -30,12 +30,54 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 # servers of the tests are on this machine, whatever proxy there is
 os.environ["NO_PROXY"] = os.environ["no_proxy"] = "127.0.0.1,localhost"
 
-_LONGEST = ("test_shared_drives.py", "test_ray.py", "test_join.py", "test_study.py", "test_batch.py", "test_verify.py")
+DURATIONS = Path(__file__).parent / "durations.json"
+"""Seconds by test function, of those that `--record-durations` found to take more than `_NOTED_S`."""
+_NOTED_S = 0.1
+_SLOW_S = 0.25
+"""From here on a test is `slow`: the others together take a minute on two cores."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--record-durations", action="store_true", help=f"write {DURATIONS.name}, for the mark `slow`")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--record-durations"):
+        config.pluginmanager.register(_Recorder())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The files that take minutes first: each stays with one worker, and the others would wait for the last."""
-    items.sort(key=lambda item: item.path.name not in _LONGEST)
+    """Mark slow tests by their measured time. Files that take longest come first: each stays with one worker, and the
+    others would wait for the last."""
+    known: dict[str, float] = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    of_file: dict[str, float] = {}
+    for name, seconds in known.items():
+        file = name.partition("::")[0]
+        of_file[file] = of_file.get(file, 0.0) + seconds
+    for item in items:
+        if known.get(item.nodeid.partition("[")[0], 0.0) > _SLOW_S:
+            item.add_marker("slow")
+    items.sort(key=lambda item: -of_file.get(item.nodeid.partition("::")[0], 0.0))
+
+
+class _Recorder:
+    """The longest case of every test function, with what its fixtures take."""
+
+    def __init__(self) -> None:
+        self.cases: dict[str, float] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.cases[report.nodeid] = self.cases.get(report.nodeid, 0.0) + report.duration
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if hasattr(session.config, "workerinput"):
+            return
+        longest: dict[str, float] = {}
+        for name, seconds in self.cases.items():
+            function = name.partition("[")[0]
+            longest[function] = max(longest.get(function, 0.0), round(seconds, 1))
+        noted = {name: seconds for name, seconds in sorted(longest.items()) if seconds > _NOTED_S}
+        DURATIONS.write_text(json.dumps(noted, indent=0) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True)

@@ -631,9 +631,10 @@ def begun(drive: Drive, out: Path) -> subprocess.Popen[str]:
     code = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that starts the tests in the background ignores it
-from vplog import cli, parts
+from vplog.cli import main
+from vplog.run import feature_extraction as parts
 parts.PART_KEYFRAMES = 4  # the first is soon there
-cli.main()
+main.main()
 """
     told = ["run", str(drive.log), "-o", str(out), *QUICK, "--threads", "1"]
     process = subprocess.Popen(

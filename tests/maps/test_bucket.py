@@ -316,7 +316,8 @@ def test_a_store_that_decides_nothing(root: Any, monkeypatch: pytest.MonkeyPatch
 KILLED = """
 import os, signal, sys
 from tests.maps.runs import put
-from vplog.maps import objects, store
+from vplog.maps.storage import objects
+from vplog.maps.storage import map_store as store
 from vplog.storage.remote_path import located
 with store.writing(located(sys.argv[1])) as writer:
     put(writer, "one", 2)

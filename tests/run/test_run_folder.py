@@ -336,9 +336,10 @@ def started(*told: object) -> subprocess.Popen[str]:
     code = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from vplog import cli, parts
+from vplog.cli import main
+from vplog.run import feature_extraction as parts
 parts.PART_KEYFRAMES = 4
-cli.main()
+main.main()
 """
     command = [sys.executable, "-c", code, *map(str, told)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

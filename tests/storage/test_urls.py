@@ -112,13 +112,13 @@ def test_a_run_by_a_signed_link_is_gone_on_with_when_it_is_given_again(
     server: str, verb: Verb, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, out = f"{server}/drive.mcap?{QUERY}", tmp_path / "out" / "run"
-    from vplog import pipeline
+    from vplog.run import back_end
 
     def stop(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "back_end", stop)
+        patch.setattr(back_end, "_solve", stop)
         stopped = verb("run", log, "-o", out, "--threads", 2, *QUICK)
     assert stopped.code == 130
     refused = verb("run", "--resume", "-o", out)

@@ -119,7 +119,8 @@ def again(whole: Path, tmp_path: Path) -> Path:
 
 KILLED = """
 import os, pathlib, signal, sys
-from vplog import cli, parts
+from vplog.cli import main
+from vplog.run import feature_extraction as parts
 parts.PART_KEYFRAMES = {part}
 rename, left = pathlib.Path.replace, [{after}]
 def replace(self, target):
@@ -128,7 +129,7 @@ def replace(self, target):
     rename(self, target)
     if left[0] == 0: os.kill(os.getpid(), signal.SIGKILL)
 pathlib.Path.replace = replace
-cli.main(sys.argv[1:])
+main.main(sys.argv[1:])
 """
 """`vplog`, killed as it writes one file: before that is renamed, or behind it."""
 

@@ -208,7 +208,7 @@ def test_several_read_and_trim_at_once(root: Any, cache: Cache) -> None:
 KILLED = """
 import sys, time
 from pathlib import Path
-from vplog.maps import store
+from vplog.maps.storage import map_store as store
 from vplog.maps.storage.download_cache import cache_in
 from vplog.storage.remote_path import located
 root, cache = located(sys.argv[1]), cache_in(Path(sys.argv[2]), 1.0)
