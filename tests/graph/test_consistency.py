@@ -11,12 +11,10 @@ from tests.graph.drive import ring, without_loops
 from tests.graph.gtsam_graph import edge_factors
 from vplog.data import EdgeKind
 from vplog.geometry import se3
-from vplog.graph import least_squares
 from vplog.graph.consistency import (
     chi2_quantile,
     is_loop,
     keep_odometry_if_worse,
-    odometry_chain,
     residual_before,
     residual_sigma,
 )
@@ -114,17 +112,3 @@ def test_noise_told_a_little_too_small_costs_no_closures_in_large_graphs() -> No
 @pytest.mark.parametrize("probability", [0.9, 0.99, 0.9999, 0.999999])
 def test_quantiles_agree_with_scipy(dof: int, probability: float) -> None:
     assert chi2_quantile(probability, dof) == pytest.approx(stats.chi2(dof).ppf(probability), rel=1e-8)
-
-
-def test_large_graphs_are_measured_as_small_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = ring(60, 8, false=3)
-    kind = [EdgeKind.LOOP if edge == 30 else one for edge, one in enumerate(drive.graph.kind)]  # a gap
-    graph, loops = replace(drive.graph, kind=kind), np.array([62, 59, 66])
-    chain, leads = odometry_chain(graph)
-    every, some = residual_sigma(graph, drive.true), residual_sigma(graph, drive.true, loops)
-    monkeypatch.setattr(least_squares, "LARGE_POSES", 10)
-    found = odometry_chain(graph)
-    np.testing.assert_allclose(found[0], chain, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(found[1], leads)
-    np.testing.assert_allclose(residual_sigma(graph, drive.true), every, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(residual_sigma(graph, drive.true, loops), some, rtol=1e-9, atol=1e-9)
