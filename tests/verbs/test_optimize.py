@@ -21,7 +21,7 @@ from vplog.results.g2o import read_g2o, write_g2o
 from vplog.verbs.optimize import optimize
 
 CITY, FALSE = spoiled(city(200, seed=5), 0.3, 0)
-PUBLIC = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2] / "shared" / "data")) / "posegraphs"
+PUBLIC = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[3] / "shared" / "data")) / "posegraphs"
 EDGE = "1 0 0 100 0 0 100 0 100\n"
 
 

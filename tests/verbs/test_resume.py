@@ -448,9 +448,9 @@ from vplog.features.sift import SiftSettings
 from vplog.features.stereo_depth import StereoSettings
 from vplog.results.previews import PictureSettings
 from types import SimpleNamespace
-from vplog import parts
+from vplog.run import feature_extraction
 from vplog.run.feature_extraction import compute_part, parts_of
-parts.PART_KEYFRAMES = 1
+feature_extraction.PART_KEYFRAMES = 1
 asked = SimpleNamespace(keyframes=KeyframeSettings(), features=SiftSettings(max_features=10), stereo=StereoSettings(),
                         pictures=PictureSettings())
 compute_part(parts_of(Path({str(log)!r}), asked)[0])

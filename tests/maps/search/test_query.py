@@ -184,9 +184,11 @@ def test_of_two_that_have_a_drive_one_counts(made: Map, tmp_path: Path) -> None:
 
 def test_other_recognisers_are_searched_drive_by_drive(made: Map) -> None:
     class Other:
-        """The same recogniser, which the index does not know."""
+        """The same recogniser without inverted lists."""
 
         def __getattr__(self, name: str) -> Any:
+            if name == "lists":
+                raise AttributeError(name)
             return getattr(made.state, name)
 
     views = made.views(4)

@@ -232,7 +232,7 @@ class Store:
         library, settings = record.get("library"), record.get("settings")
         known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
-            raise ResultError(f"{path} has no sound library or settings. Run `vplog batch` again.")
+            raise ResultError(f"{path} lacks a valid library or settings. Run `vplog batch` again.")
         return Head(library, settings)
 
     def write_head(self, head: Head) -> None:
