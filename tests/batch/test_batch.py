@@ -135,7 +135,7 @@ def test_what_is_missing_or_changed_is_done_again(
     before = files(whole)
     asked: list[str] = []
 
-    def refuse(_: LocalEngine, task: Task, cores: int) -> Future[Outcome]:
+    def refuse(_: LocalEngine, task: Task) -> Future[Outcome]:
         asked.append(task.drive)
         future: Future[Outcome] = Future()
         future.set_result(Outcome("not now"))
@@ -181,7 +181,7 @@ def test_a_damaged_drive_is_computed_again_and_stops_no_other(
         (run / name).write_bytes(data)
     asked: list[str] = []
 
-    def refuse(_: LocalEngine, task: Task, cores: int) -> Future[Outcome]:
+    def refuse(_: LocalEngine, task: Task) -> Future[Outcome]:
         asked.append(task.drive)
         future: Future[Outcome] = Future()
         future.set_result(Outcome("not now"))
