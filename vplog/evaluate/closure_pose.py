@@ -133,8 +133,7 @@ def _within(error: Floats, covariance: Floats, b: float) -> Bools:
 
 def _normalised(error: Floats, covariance: Floats) -> Floats:
     """(R,) sqrt(e' C^-1 e); where nothing is claimed, C = 0, it is 0 for an error of 0 alone."""
-    sound = covariance + 1e-18 * np.eye(3)
-    return np.sqrt(np.maximum((error * np.linalg.solve(sound, error[:, :, None])[:, :, 0]).sum(1), 0.0))
+    return np.sqrt(np.maximum(se3.mahalanobis2(error, covariance + 1e-18 * np.eye(3)), 0.0))
 
 
 def _covariance(information: Floats) -> Floats:

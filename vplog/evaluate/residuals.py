@@ -69,8 +69,7 @@ def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:
 
 
 def _normalised(expected: Floats, measured: Floats, covariance: Floats) -> Floats:
-    error = se3.log(se3.between(measured, expected))
-    chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+    chi2 = se3.mahalanobis2(se3.log(se3.between(measured, expected)), covariance)
     return np.sqrt(np.maximum(chi2, 0.0) / 6.0)
 
 

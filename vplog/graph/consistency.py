@@ -92,11 +92,8 @@ class OdometryChain:
         # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
         moved = se3.adjoint(se3.between(poses[:1], poses))[:, axes][:, :, axes]
         total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
-        part, variance = (
-            np.cumsum(leads < 0).astype(np.int64),
-            np.asarray(np.diagonal(step, axis1=1, axis2=2), np.float64),
-        )
-        return cls(poses, part, total, variance, axes)
+        variance = np.asarray(np.diagonal(step, axis1=1, axis2=2), np.float64)
+        return cls(poses, np.cumsum(leads < 0).astype(np.int64), total, variance, axes)
 
     def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
@@ -104,7 +101,7 @@ class OdometryChain:
         covariance = self.covariance(a, b) + np.linalg.inv(informed(graph)[loops])
         error = se3.log(se3.between(graph.a_from_b[loops], se3.between(self.poses[a], self.poses[b])))
         error = error[:, self.axes]
-        chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+        chi2 = se3.mahalanobis2(error, covariance)
         return np.where(self.part[a] == self.part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
 
     def walked(self, unit: Floats) -> Floats:
@@ -183,12 +180,8 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
         return solution
     try:
-        checks = max(
-            round(
-                redundancy(Objective(Factors.of(graph), accepted), solution.world_from_body, np.flatnonzero(odometry))
-            ),
-            1,
-        )
+        objective = Objective(Factors.of(graph), accepted)
+        checks = max(round(redundancy(objective, solution.world_from_body, np.flatnonzero(odometry))), 1)
     except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
         checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))
     bound = chi2_quantile(_SURE, checks)

@@ -136,7 +136,7 @@ def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
 def chi2_of_fixes(poses: Floats, fixes: Fixes, world: Floats) -> Floats:
     """(F,) squared Mahalanobis distance of the fixes, moved to the world of the poses, to the antenna."""
     error = (antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m
-    return (error * np.linalg.solve(fixes.covariance, error[:, :, None])[:, :, 0]).sum(1)
+    return se3.mahalanobis2(error, fixes.covariance)
 
 
 def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, inlier: Floats) -> Objective:

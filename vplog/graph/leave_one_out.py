@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.geometry import se3
-from vplog.graph.build import AXES, informed
+from vplog.graph.build import AXES, informed, parts
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
@@ -94,8 +94,7 @@ def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tu
     covariance = Jr_inv @ edge_covariances(Objective(factors, barely), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
     covariance = covariance + np.linalg.inv(informed(graph)[loops])
     error = error[:, axes]
-    squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
-    return squared, 0.5 * np.linalg.slogdet(covariance)[1]
+    return se3.mahalanobis2(error, covariance), 0.5 * np.linalg.slogdet(covariance)[1]
 
 
 def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
@@ -128,22 +127,14 @@ def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) ->
     first, second = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
     order = np.lexsort((second, first))
     at, to = walked[first[order]], walked[second[order]]
-    root = list(range(len(loops)))
-
-    def find(node: int) -> int:
-        while root[node] != node:
-            root[node] = root[root[node]]
-            node = root[node]
-        return node
-
     # 2: the noise of two closures, each one unit
     starts = np.searchsorted(at, at - 2.0)
-    for this in range(len(loops)):
-        part = slice(starts[this], this)
-        near = np.flatnonzero(at[this] - at[part] + np.abs(to[this] - to[part]) <= 2.0)
-        for other in near.tolist():
-            root[find(starts[this] + other)] = find(this)
-    label = np.unique([find(node) for node in range(len(loops))], return_inverse=True)[1]
+    near = [
+        begun + np.flatnonzero(at[this] - at[begun:this] + np.abs(to[this] - to[begun:this]) <= 2.0)
+        for this, begun in enumerate(starts.tolist())
+    ]
+    this = np.repeat(np.arange(len(loops)), [len(others) for others in near])
+    label = parts(len(loops), np.concatenate([*near, this[:0]]), this)
     by_group = np.argsort(label, kind="stable")
     return [order[part] for part in np.split(by_group, np.cumsum(np.bincount(label))[:-1])]
 

@@ -25,13 +25,13 @@ from pydantic import Field, model_validator
 
 from vplog.data import Boxes
 from vplog.errors import LibraryError
-from vplog.places import expected_votes, library_files
+from vplog.places import expected_votes
 from vplog.places.code_lists import BLOCK, CodeLists, build_lists
 from vplog.places.code_search import CodeIndex
 from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
 from vplog.places.once import Once
-from vplog.places.relearn import relearn
+from vplog.places.relearn import ReferencesState, relearn
 from vplog.places.shared_references import list_shared
 
 if TYPE_CHECKING:
@@ -177,18 +177,16 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class BobbState:
+class BobbState(ReferencesState):
     """A library, indexed when it is first asked to describe. Shared freely between threads."""
 
     settings: BobbSettings
     matcher: Matcher
     learned: Once[Floats]
     """(L,) weight of each reference."""
-    hash: str = field(init=False)
 
     def __post_init__(self) -> None:
         s = self.settings
-        object.__setattr__(self, "hash", library_files.references_hash(self.matcher.references, s))
         object.__setattr__(self, "_windows", expected_votes.even_windows(s.windows_along, s.window_share))
         object.__setattr__(self, "_along_x", expected_votes.box_sums(s.columns, s.patches_x, s.box_columns))
         object.__setattr__(self, "_along_y", expected_votes.box_sums(s.rows, s.patches_y, s.box_rows))
@@ -262,7 +260,7 @@ class BobbState:
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
     @property
-    def references(self) -> list[Reference]:
+    def references(self) -> list[Reference]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The library."""
         return self.matcher.references
 
@@ -366,6 +364,3 @@ class BobbState:
             weights.reshape(-1, s.references),
             boxes.reshape(-1, s.references, s.boxes),
         )
-
-    def save(self, folder: Path) -> None:
-        library_files.save_references(self.matcher.references, self.settings, folder)

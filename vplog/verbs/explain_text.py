@@ -164,18 +164,18 @@ def _change(row: Row, pipeline: Pipeline) -> str:
 
 
 _CHANGES = {
-    "accepted": "It would be rejected with fewer than {needed} inliers, if they covered less than {metric_percent:.0f} % "
-    "of the image, or if the robust solve found it at odds with the rest.",
-    "too_few_matches": "{verify.min_matches} matches are needed (verify.min_matches), or their part among the strongest "
-    "{verify.matching.first_look} features. --set verify.min_matches={matches}, or a verify.matching.ratio above "
-    "{verify.matching.ratio:g}, would verify it, and many false candidates with it.",
+    "accepted": "It would be rejected with fewer than {needed} inliers, if they covered less than "
+    "{metric_percent:.0f} % of the image, or if the robust solve found it at odds with the rest.",
+    "too_few_matches": "{verify.min_matches} matches are needed (verify.min_matches), or their part among the "
+    "strongest {verify.matching.first_look} features. --set verify.min_matches={matches}, or a "
+    "verify.matching.ratio above {verify.matching.ratio:g}, would verify it, and many false candidates with it.",
     "too_few_landmarks": "{verify.metric.min_inliers} matches with a position are needed (verify.metric.min_inliers). "
     "Depth images, or more sideways motion around keyframe {match}, would give more of them one.",
     "too_few_inliers": "{needed} inliers are needed (verify.{kind}.min_inliers{share}), and {inliers} were found.",
     "by_chance": "Enough agree, {needed} being needed, but so many of {compared} may do so by chance "
     "(verify.{kind}.log10_false_alarms).",
-    "poor_spread": "{spread_percent:.0f} % of the image must be covered (verify.{kind}.min_spread): less is one object, "
-    "such as a sign or a parked car, that may stand anywhere.",
+    "poor_spread": "{spread_percent:.0f} % of the image must be covered (verify.{kind}.min_spread): less is one "
+    "object, such as a sign or a parked car, that may stand anywhere.",
     "degenerate_motion": "Depth images, or frames around keyframe {match} that move sideways, would give its features "
     "positions.",
     "no_calibration": "Record the camera's camera_info, or name it with --camera-info-topic: then a pose with "
