@@ -1,14 +1,8 @@
 """Bag of bounding boxes, after Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014.
 
-The paper's three steps: the references that explain an image (section III-A), boxes on each of them where the features
-of a window are found again (section III-B), places alike where their boxes overlap on the same references (Eq. 1).
-`bobb_paper.py` is the paper to the letter. This one departs from it where that recognises better; each departure is a
-setting: matches weighed by relative distance (`reach`), RootSIFT (`root_sift`), no grain (`least_size`), patches
-beside keypoints (`patch_weight`), matches that agree in their motion (`agreement`, `agreement_floor`), popular
-references counting less (`popularity`), weights of the references in the score (`share_power`), a reference that
-explains itself (`own`), even windows (`windows_along`), the expected vote in closed form (`expected_votes.py`), boxes
-of one shape that a byte holds (`columns`, `rows`), and a window compared with its own as well as with the best
-(`pairing`).
+The references that explain an image (section III-A), boxes on each of them where the features of a window are found
+again (section III-B), and the overlap of boxes on shared references as similarity (Eq. 1). `bobb_paper.py` is the paper
+to the letter; here votes have the closed form of `expected_votes.py`, and the other departures are settings.
 """
 
 from __future__ import annotations
@@ -120,7 +114,7 @@ class BobbSettings(WeighedMatchSettings):
         return state
 
     def prepare(self, references: Iterable[Reference], threads: int) -> BobbState:
-        """`learn` without the index, which the first image to describe makes: comparing places needs none."""
+        """`learn` without the index, which the first image described makes: comparing places needs none."""
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
             raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
@@ -178,7 +172,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class BobbState(ReferencesState):
-    """A library, indexed when it is first asked to describe. Shared freely between threads."""
+    """A library, indexed when it first describes. Safe to share between threads."""
 
     settings: BobbSettings
     matcher: Matcher

@@ -1,10 +1,7 @@
 """Matches of an image's features with those of a library, each with a weight.
 
-Features are of two kinds, each compared with its own: keypoints, found again where the view turns or comes nearer, and
-patches at even steps, found again in other light.
-
-The paper takes every neighbour below one absolute distance for the same word. Distances change with light and blur, so
-here a match counts by how much nearer it is than the feature's last neighbour, which nobody takes for the same.
+Keypoints match keypoints, and patches at even steps, which bear other light better, match patches. Where the paper has
+one absolute distance, a match here weighs by how much nearer it is than the feature's last neighbour.
 """
 
 from __future__ import annotations
@@ -88,7 +85,7 @@ class Indexed:
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """The features of L references, indexed when they are first asked for. Shared freely between threads."""
+    """The features of L references, indexed on first use. Safe to share between threads."""
 
     references: list[Reference]
     settings: WeighedMatchSettings

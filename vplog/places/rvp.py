@@ -1,8 +1,7 @@
 """Common pattern discovery by randomized visual phrases: Algorithm 3 of Tanaka et al. 2014.
 
-The voting map of a window is needed only through sums over boxes, and boxes lie on a grid of G x G cells, so the
-kernel keeps the sum of V over each cell: a patch adds its similarity times the pixels it shares with the cell.
-That is the per-pixel algorithm exactly, without touching pixels.
+Boxes lie on a grid of G x G cells, so the kernel keeps the sum of the voting map V over each cell: a patch adds its
+similarity times the pixels it shares with the cell, which is the per-pixel algorithm exactly.
 """
 
 from __future__ import annotations
