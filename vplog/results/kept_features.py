@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _LEVEL = 1
-"""Of zstd: descriptors hardly shrink, by a fifth, and higher levels take their time for nothing."""
+"""Level of zstd: descriptors shrink by a fifth at any level."""
 
 _IN_MEMORY = 128
-"""Keyframes whose features are not read again, some 20 MB: candidates come by match, and queries near each other."""
+"""Keyframes whose features are cached, some 20 MB."""
 
 
 FEATURES = pa.schema(
@@ -48,7 +48,7 @@ HEADER = {
     "vplog.most_features": "Most features of a keyframe.",
     VERSION_KEY: VERSION_ABOUT,
 }
-"""What the file says of itself."""
+"""Metadata of the file."""
 
 
 def write_features(path: Path, count: int, features: Callable[[int], Features], most: int, made_from: str) -> None:

@@ -62,7 +62,7 @@ class DrivePlaces:
     """(P, 4, 4)."""
     descriptors: pa.Array
     header: dict[str, str]
-    """Of the table of descriptors; it names the library."""
+    """Header of the table of descriptors; it names the library."""
     where: Floats | None = None
     """(P, 3) longitude and latitude in degrees and altitude in m; None where nothing says so."""
 
@@ -182,7 +182,7 @@ class AboutMap:
     descriptor: str
     """How its columns are to be taken, as JSON."""
     drives: dict[str, dict[str, Any]]
-    """Of each drive, in order, what is known of it: `inputs`, `topics`, `earth`."""
+    """What is known of each drive, in order: `inputs`, `topics`, `earth`."""
 
 
 def about_map(path: Path) -> AboutMap:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 ROWS_PER_GROUP = 65_536
 """Rows of a row group; 64 Ki rows of the widest table here are about 40 MB in memory."""
 DESCRIPTORS_PER_GROUP = 1_024
-"""The same for descriptors, which may take tens of kB each."""
+"""Rows of a row group of descriptors, which may take tens of kB each."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class TableMetadata:
     """Hash of the place library, empty where none was used."""
 
     def record(self) -> dict[str, str]:
-        """As key and text, for the header of a file."""
+        """Keys and texts of the header of a file."""
         return {
             "vplog.settings": canonical_json(self.settings),
             "vplog.library": self.library,
@@ -388,7 +388,7 @@ def write_descriptors(
 
 
 def _regrouped(batches: Iterable[pa.Array], size: int) -> Iterator[pa.Array]:
-    """The same values in arrays of `size`, the last one shorter."""
+    """The values in arrays of `size`, the last one shorter."""
     waiting: list[pa.Array] = []
     count = 0
     for batch in batches:

@@ -51,7 +51,7 @@ class Evaluation:
     """A run of one drive against a file of poses."""
 
     record: dict[str, Any]
-    """As `evaluate` gives it."""
+    """The record that `evaluate` returns."""
     keyframes: Keyframes
     truth: BodyTruth
     judged: closures.Judgement

@@ -1,4 +1,4 @@
-"""Going on with a run that was killed: what was asked for and what was done are in its cache."""
+"""The request of an unfinished run, read from its cache, for `vplog run --resume`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a run was asked for."""
+class ResumeRequest:
+    """The logs and options of a run."""
 
     logs: list[Path]
     """The parts of one recording, or the drives of one map."""
@@ -35,8 +35,8 @@ class Asked:
     topics: logs.TopicChoice
 
 
-def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
-    """What the unfinished run in `out` was asked for; logs `given` must be its logs.
+def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
+    """The request of the unfinished run in `out`; logs `given` must be its logs.
 
     Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
     """
@@ -67,7 +67,7 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
     where = str(file)
     pipeline = Pipeline.read(recorded(account, file, dict, "settings"), where)
     library = recorded(account, file, str, "library", "from")
-    return Asked(
+    return ResumeRequest(
         paths,
         "logs" in account,
         pipeline,
@@ -88,7 +88,7 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
 
 
 def _place(known: list[str], path: Path) -> int:
-    """Of a log among those of the run; behind all where it is none of them."""
+    """Row of a log among those of the run; behind all where it is none of them."""
     text = str(path.resolve())
     return known.index(text) if text in known else len(known)
 
