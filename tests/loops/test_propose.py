@@ -74,7 +74,7 @@ def test_the_second_lap_finds_the_first() -> None:
     poses = circle(200, 30.0)
     values = [float(i % 100) for i in range(200)]
     chosen = ProposeSettings(per_query=4)
-    found = propose(by_distance(values, candidate_stops(keyframes(poses), chosen), chosen.asked), chosen)
+    found = propose(by_distance(values, candidate_stops(keyframes(poses), chosen), chosen.ranked), chosen)
     best = found.rank == 0
     second = best & (found.query >= 135)
     np.testing.assert_array_equal(found.query[second] - found.match[second], 100)

@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.maps.runs import KIND, LIBRARY, OTHER_LIBRARY, PLACES, make_map, put, put_library
+from tests.results.example import read_map
 from vplog.data import Gps
 from vplog.geometry import geodesy, se3
 from vplog.maps.storage import map_store
 from vplog.results import run_record, tables
-from vplog.results.places_map import read_map
 
 if TYPE_CHECKING:
     from collections.abc import Callable

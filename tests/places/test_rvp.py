@@ -29,7 +29,7 @@ class Case:
 
     points: np.ndarray
     picture: Picture
-    cuts: rvp.Partitions
+    cuts: tuple[np.ndarray, np.ndarray]
     H: Counter[int]
     grid: int
 
@@ -58,14 +58,12 @@ def _fast(case: Case) -> tuple[np.ndarray, Int32s, Int32s]:
     owners = [[f for f, each in enumerate(case.picture.words) if word in each] for word in words]
     start = np.cumsum([0, *map(len, owners)]).astype(np.int32)
     posting = np.array([f for each in owners for f in each], np.int32)
-    patches = rvp.patches_of(case.points, case.cuts.x_cuts, case.cuts.y_cuts)
-    count = (case.cuts.x_cuts.shape[1] - 1) * (case.cuts.y_cuts.shape[1] - 1)
+    patches = rvp.patches_of(case.points, case.cuts[0], case.cuts[1])
+    count = (case.cuts[0].shape[1] - 1) * (case.cuts[1].shape[1] - 1)
     totals = rvp.patch_totals(patches, np.array([len(each) for each in case.picture.words], np.int32), count)
     grid_x, grid_y = rvp.grid_cuts(case.picture.width, case.grid), rvp.grid_cuts(case.picture.height, case.grid)
     H = np.array([case.H[word] for word in words], np.int32)
-    cells = rvp.vote(
-        H, case.H.total(), start, posting, patches, totals, case.cuts.x_cuts, case.cuts.y_cuts, grid_x, grid_y
-    )
+    cells = rvp.vote(H, case.H.total(), start, posting, patches, totals, case.cuts[0], case.cuts[1], grid_x, grid_y)
     return cells, grid_x, grid_y
 
 
@@ -74,7 +72,7 @@ def test_votes_and_box_agree_with_the_literal_algorithm() -> None:
     for seed in range(120):
         case = _case(seed)
         cells, grid_x, grid_y = _fast(case)
-        V = voting_image(case.H, case.picture, case.cuts.x_cuts, case.cuts.y_cuts)
+        V = voting_image(case.H, case.picture, case.cuts[0], case.cuts[1])
         np.testing.assert_allclose(cells, cell_sums(V, grid_x, grid_y), rtol=1e-9, atol=1e-12, err_msg=f"seed {seed}")
         shapes = rvp.box_shapes(case.grid, 0.2, (0.5, 1.0, 2.0)) if case.grid >= 3 else np.array([[1, 1]], np.int32)
         box = rvp.dominant_box(cells, shapes)
@@ -120,7 +118,7 @@ def test_partitions_cover_the_image_once() -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         cuts = rvp.draw_partitions(37, 3, 50, 8, 4, rng)
-        for xs, length, parts in ((cuts.x_cuts, 37, 8), (cuts.y_cuts, 3, 4)):
+        for xs, length, parts in ((cuts[0], 37, 8), (cuts[1], 3, 4)):
             assert xs.shape == (50, parts + 1)
             assert (xs[:, 0] == 0).all()
             assert (xs[:, -1] == length).all()

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.geometry import se3
+from vplog.results.places_map import PLACE, read_drives
 from vplog.results.tables import TableMetadata
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from vplog.data import Floats
 
 COUNT = 30
@@ -27,6 +32,12 @@ class Run:
     trajectory: Trajectory
     odometry: Odometry
     camera: Camera
+
+
+def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
+    """The places of a whole map, and their descriptors."""
+    descriptors = pa.concat_arrays([places.descriptors for places in read_drives(path, kind)])
+    return pq.read_table(path, columns=PLACE.names), descriptors
 
 
 def random_poses(rng: np.random.Generator, count: int) -> Floats:

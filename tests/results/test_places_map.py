@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.results.example import COUNT, METADATA, make_run
+from tests.results.example import COUNT, METADATA, make_run, read_map
 from vplog.errors import ResultError
 from vplog.results import tables
-from vplog.results.places_map import read_map, write_map
+from vplog.results.places_map import write_map
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -100,7 +100,7 @@ def test_a_map_of_another_recogniser_is_refused(tmp_path: Path) -> None:
     write_map(tmp_path / "map", [tmp_path / "0"])
     with pytest.raises(ResultError, match="not a map of places of this recogniser"):
         read_map(tmp_path / "map", TYPES["vlad"])
-    with pytest.raises(ResultError, match="not a map"):
+    with pytest.raises(ResultError, match="not a file of places"):
         read_map(tmp_path / "0" / "keyframes.parquet", BOXES)
     (tmp_path / "text").write_text("no table")
     with pytest.raises(ResultError, match="cannot be read"):

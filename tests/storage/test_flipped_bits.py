@@ -86,7 +86,6 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
         kept: [read_kept],
         exported: [
             lambda path: list(places_map.read_drives(path, KIND)),
-            lambda path: places_map.read_map(path, KIND),
             places_map.about_map,
             places_map.places_by_drive,
         ],

@@ -16,13 +16,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from tests.results.example import read_map
 from vplog.data import Gps, Verdict
 from vplog.geometry import geodesy, se3
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
 from vplog.results import tables
 from vplog.results.layouts import LAYOUTS
-from vplog.results.places_map import read_map
 from vplog.verbs.export import FORMATS
 
 if TYPE_CHECKING:

@@ -243,7 +243,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
         if arguments.gps:
             arguments.set.append("gps.use=true")
         return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
-    from vplog.verbs.resume import asked_for
+    from vplog.verbs.resume import resume_request
 
     if "://" in str(arguments.shown):
         arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
@@ -253,7 +253,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
     if given or not arguments.cache:
         option = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{option}")
-    asked = asked_for(arguments.output, arguments.logs)
+    asked = resume_request(arguments.output, arguments.logs)
     arguments.one_drive, arguments.force = not asked.several, True  # what it replaces, it was asked when it began
     return asked.logs, asked.pipeline, asked.library, asked.topics
 

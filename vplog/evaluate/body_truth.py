@@ -1,7 +1,7 @@
 """The truth as poses of the log's body at any stamp.
 
-A truth file may be of another point (the camera, a marker) and sampled once a second. The drive's own odometry tells
-both: it moves as the truth does, but for a drift that is small over the few metres between two samples.
+A truth file may be of another point (the camera, a marker) and sampled once a second. Both are resolved by the drive's
+odometry, whose drift is small over the few metres between two samples.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Does a probability mean what it says? Of answers given with probability .8, are 8 in 10 right?"""
+"""Reliability of probabilities: the share of right answers by their claimed probability."""
 
 from __future__ import annotations
 

@@ -1,24 +1,20 @@
-"""Is a closure's pose that of the truth? The criterion of `vplog evaluate`.
+"""Whether a closure's pose is that of the truth: the criterion of `vplog evaluate`.
 
-A closure tells match_from_query with an information matrix. Its error is E = truth^-1 closure, in the query's frame: a
-rotation vector r and a translation t, each with the block C of the claimed covariance. It is right where, for both,
+The error E = truth^-1 closure, in the query's frame, is a rotation vector and a translation, each with the block C of
+the claimed covariance. A closure is right where, for both parts e,
 
     e' (b^2 I + k^2 C)^-1 e <= 1   and   |e| <= 2 b
 
-* b of a translation is .04 m sqrt(L / 1 m), 2 m at most. What integrates motion, odometry or the truth itself, is off
-  by a random walk, and two visits of a place are known no better: KITTI's own poses differ by .9 m between two passes
-  of a street over a loop of 1 km, hand-held ones by some cm over some metres. .04 m is .4 % after 100 m, the best
-  odometries of KITTI's table; satellites bound the truth of long drives to the 2 m. L is the path, but no more than
-  once around the drive (pi times its diagonal): who goes round and round in a room stays in the room.
-* b of a rotation is 5 degrees whatever the drive: half of the turn that makes another keyframe.
-* k is 4.0, the 99.9 % bound of three Gaussians: an honest closure is not false for being uncertain. 2 b bounds that in
-  turn: a claim to know nothing does not make a wrong closure right.
-* Where the truth is interpolated or noisy it is uncertain by `TruthAt.error`. A closure that is out of bounds by less
-  than this is not judged, for it may be either; nor is one with an end that the truth does not cover.
+* b of a translation is .04 m sqrt(L / 1 m), 2 m at most: odometry and truth drift as a random walk. .04 m is .4 % after
+  100 m, the best odometries of KITTI's table; GNSS bounds the truth of long drives to 2 m. L is the length of the path,
+  at most pi times the diagonal of the drive.
+* b of a rotation is 5 degrees: half of the turn that makes another keyframe.
+* k is 4.0, the 99.9 % bound of three Gaussians; 2 b bounds what a claimed covariance may excuse.
+* A closure out of bounds by less than the uncertainty of the truth, `TruthAt.error`, is not judged; nor is one with an
+  end that the truth does not cover.
 
-A closure that is good in metres and claims to be better is over-confident, not false: it is counted beside. A claim
-does not tighten the bounds, since a truth that is off between two visits would make right closures false.
-Of a closure without metres turn and direction are judged: the step between the cameras has its length from the truth.
+A right closure further off than its covariance allows is over-confident, not false. Of a closure without metres
+rotation and direction are judged: the step between the cameras has its length from the truth.
 """
 
 from __future__ import annotations
@@ -34,7 +30,7 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Closures, Floats
     from vplog.evaluate.body_truth import TruthAt
 
-_WALK_M = 0.04
+_DRIFT_M = 0.04
 """m after 1 m: see above."""
 _MOST_M = 2.0
 """m: see above."""
@@ -71,7 +67,7 @@ def pose_bounds(*drives: Floats) -> PoseBounds:
         if len(positions):
             path_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
             length_m += min(path_m, float(np.pi * np.linalg.norm(np.ptp(positions, axis=0))))
-    return PoseBounds(min(_WALK_M * float(np.sqrt(length_m)), _MOST_M), length_m=length_m)
+    return PoseBounds(min(_DRIFT_M * float(np.sqrt(length_m)), _MOST_M), length_m=length_m)
 
 
 def pose_errors(
@@ -133,8 +129,7 @@ def _within(error: Floats, covariance: Floats, b: float) -> Bools:
 
 def _normalised(error: Floats, covariance: Floats) -> Floats:
     """(R,) sqrt(e' C^-1 e); where nothing is claimed, C = 0, it is 0 for an error of 0 alone."""
-    sound = covariance + 1e-18 * np.eye(3)
-    return np.sqrt(np.maximum((error * np.linalg.solve(sound, error[:, :, None])[:, :, 0]).sum(1), 0.0))
+    return np.sqrt(np.maximum(se3.mahalanobis2(error, covariance + 1e-18 * np.eye(3)), 0.0))
 
 
 def _covariance(information: Floats) -> Floats:

@@ -1,8 +1,7 @@
-"""Were the loop closures right, and were the revisits found?
+"""Precision of closures and recall of revisits.
 
-Two questions, two criteria. Is the closure's pose right: that of `closure_pose`, for accepted closures. Do its two
-frames show one place: a distance and a heading between the true poses, as in `vplog compare`, for what place
-recognition is asked, candidates and revisits.
+Accepted closures are judged by their pose (`closure_pose`), candidates and revisits by place: a distance and a heading
+between the true poses, as in `vplog compare`.
 """
 
 from __future__ import annotations
@@ -175,7 +174,7 @@ def score_closures(
 
 def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion) -> dict[str, Any]:
     """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
-    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
+    accepted = closures.of(Verdict.ACCEPTED)
     right, wrong = accepted & judged.right, accepted & judged.wrong
     here = accepted & judged.known
     return {
@@ -229,8 +228,7 @@ def in_words(closures: dict[str, Any]) -> list[str]:
 def _score(
     closures: Closures, judged: Judgement, covered: Bools, revisit: Bools, place: PlaceCriterion
 ) -> ClosureScore:
-    accepted = np.array([verdict == Verdict.ACCEPTED for verdict in closures.verdict], bool)
-    direction = np.array([verdict == Verdict.DIRECTION_ONLY for verdict in closures.verdict], bool) & judged.known
+    accepted, direction = closures.of(Verdict.ACCEPTED), closures.of(Verdict.DIRECTION_ONLY) & judged.known
     found = np.unique(closures.query[accepted & judged.right])
     found = found[revisit[found]]
     by_score, by_inliers = (_area(judged.curves.get(name), bool(revisit.any())) for name in ("score", "inliers"))

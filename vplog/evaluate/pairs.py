@@ -27,11 +27,7 @@ _CSV_FORMAT = "A truth table has the header line `query,match`, then one pair of
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The true pairs of Q queries and M map rows, as runs of neighbouring rows.
-
-    A revisit lasts, so runs stay few: two drives that stand still for 20 000 frames are one run a query, not
-    400 million pairs.
-    """
+    """The true pairs of Q queries and M map rows, as runs of neighbouring rows: few, even where drives stand."""
 
     start: Ints
     """(Q + 1,) query q has the runs start[q]..start[q + 1]."""
@@ -69,9 +65,9 @@ class Pairs:
 
 
 def index_pairs(query: Ints, match: Ints, tolerance: int) -> Pairs:
-    """Frame i of one walk shows the place of frame i of the other, give or take `tolerance` frames.
+    """Frame i of one traversal shows the place of frame i of the other, give or take `tolerance` frames.
 
-    `query` (Q,) and `match` (M,) are the frames' numbers in their walks, increasing.
+    `query` (Q,) and `match` (M,) are the frames' numbers in their traversals, increasing.
     """
     first = np.searchsorted(match, query - tolerance, side="left")
     stop = np.searchsorted(match, query + tolerance, side="right")
@@ -193,7 +189,7 @@ def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
 
 
 def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats, Bools]:
-    """Positions (T, D) at increasing stamps (T,), seen at other stamps: (N, D), and (N,) where known, as `poses_at`."""
+    """Positions (T, D) at increasing stamps (T,), at other stamps: (N, D), and (N,) where known, as `poses_at`."""
     _, _, known = around(stamp_ns, at_ns)
     result = np.full((len(at_ns), positions.shape[1]), np.nan)
     if known.any():

@@ -38,7 +38,7 @@ _USES = {
 
 @dataclass(frozen=True)
 class TruthChoice:
-    """How a user tells which frames show the same place."""
+    """The truth as the user names it."""
 
     source: str
     """`index`, `poses`, `gps`, a table FILE.csv, or FILE.tum[,MAPFILE.tum]."""

@@ -1,4 +1,4 @@
-"""Are the covariances of closures honest? Their errors against the truth, normalised by what they claim."""
+"""Errors of closures against the truth, normalised by their claimed covariances."""
 
 from __future__ import annotations
 
@@ -37,9 +37,8 @@ def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) 
     """Score the accepted closures of a ledger."""
     at = truth.at(keyframes.stamp_ns)
     poses, known = at.world_from_body, at.known & truth.oriented
-    accepted = np.array([verdict is Verdict.ACCEPTED for verdict in closures.verdict], bool)
-    usable = accepted & known[closures.query] & known[closures.match] & np.isfinite(closures.information).all((1, 2))
-    rows = np.flatnonzero(usable)
+    usable = closures.of(Verdict.ACCEPTED) & known[closures.query] & known[closures.match]
+    rows = np.flatnonzero(usable & np.isfinite(closures.information).all((1, 2)))
     query, match = closures.query[rows], closures.match[rows]
     measured = closures.match_from_query[rows]
     covariance = np.asarray(np.linalg.inv(closures.information[rows]), np.float64)
@@ -69,8 +68,7 @@ def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:
 
 
 def _normalised(expected: Floats, measured: Floats, covariance: Floats) -> Floats:
-    error = se3.log(se3.between(measured, expected))
-    chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+    chi2 = se3.mahalanobis2(se3.log(se3.between(measured, expected)), covariance)
     return np.sqrt(np.maximum(chi2, 0.0) / 6.0)
 
 

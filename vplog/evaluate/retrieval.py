@@ -1,7 +1,6 @@
-"""How well places are found again: ranks of the true rows, and precision over recall of every query's best answer.
+"""Place retrieval: ranks of the true rows, and precision over recall of every query's best answer.
 
-Rows that score the same are in no order: each figure is its mean over all orders of such rows, so none depends on how
-rows are numbered. Candidates without a score (NaN) come last, and are in no order either.
+Each figure is its mean over all orders of rows of equal score. Candidates without a score (NaN) come last, as equals.
 """
 
 from __future__ import annotations

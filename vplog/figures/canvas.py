@@ -39,8 +39,7 @@ def drawn(
 
 
 def _settle(figure: Figure) -> None:
-    """Lay out once and for all. The solver's last digits hang on where its variables lie in memory, so that the same
-    figure would differ from one process to the next."""
+    """Fix the layout, rounded: the solver's last digits differ from one process to the next."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for part in figure.subfigs:

@@ -170,3 +170,8 @@ def umeyama(source: Floats, target: Floats, with_scale: bool = False) -> tuple[F
     variance = (x**2).sum() / len(source)
     scale = float((d * s).sum() / variance) if with_scale and variance > 0 else 1.0
     return pose(r, mean_target - scale * r @ mean_source), scale
+
+
+def mahalanobis2(error: Floats, covariance: Floats) -> Floats:
+    """(K,) e^T C^-1 e of errors (K, d) with covariances (K, d, d)."""
+    return (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)

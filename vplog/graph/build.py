@@ -47,8 +47,7 @@ def build_graph(
         raise GraphError(f"{n} keyframes need ({n - 1}, 6, 6) edge covariances, not {edge_covariances.shape}.")
     _check_matrices(edge_covariances, "covariance", np.arange(n - 1), np.arange(1, n))
 
-    verdicts = closures.verdict if closures is not None else []
-    rows = np.flatnonzero([verdict == Verdict.ACCEPTED for verdict in verdicts])
+    rows = np.flatnonzero(closures.of(Verdict.ACCEPTED) if closures is not None else [])
     a, b = np.arange(n - 1), np.arange(1, n)
     a_from_b = se3.between(poses[:-1], poses[1:])
     information = np.linalg.inv(edge_covariances)

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph, Solution
 
 _SURE = 0.999999
-"""Probability with which odometry as good as its noise says passes keep_odometry_if_worse: 4.9 sigma of one edge."""
-
-
+"""Probability with which odometry as good as its noise claims passes keep_odometry_if_worse: 4.9 sigma of one edge."""
 KNOWN_TO = 30
 """Degrees of freedom from which the noise of odometry is known at best, as `refine.least_redundancy` has it."""
 
@@ -39,7 +37,7 @@ def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None
 
 
 def degrees_of_freedom(graph: PoseGraph) -> int:
-    """Of one edge: 6, or 3 in the plane."""
+    """Degrees of freedom of one edge: 6, or 3 in the plane."""
     return len(AXES[graph.dimension])
 
 
@@ -83,7 +81,7 @@ class OdometryChain:
         poses, leads = odometry_chain(graph)
         axes = AXES[graph.dimension]
         step = np.linalg.inv(informed(graph)[leads])
-        # noise is told in the frame of an edge's b: moved to the later pose where that is a
+        # noise is in the frame of an edge's b: moved to the later pose where that is a
         back = np.flatnonzero((leads >= 0) & (graph.a[leads] > graph.b[leads]))
         if len(back):
             turned = se3.adjoint(graph.a_from_b[leads[back]])[:, axes][:, :, axes]
@@ -92,11 +90,8 @@ class OdometryChain:
         # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
         moved = se3.adjoint(se3.between(poses[:1], poses))[:, axes][:, :, axes]
         total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
-        part, variance = (
-            np.cumsum(leads < 0).astype(np.int64),
-            np.asarray(np.diagonal(step, axis1=1, axis2=2), np.float64),
-        )
-        return cls(poses, part, total, variance, axes)
+        variance = np.asarray(np.diagonal(step, axis1=1, axis2=2), np.float64)
+        return cls(poses, np.cumsum(leads < 0).astype(np.int64), total, variance, axes)
 
     def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
@@ -104,15 +99,12 @@ class OdometryChain:
         covariance = self.covariance(a, b) + np.linalg.inv(informed(graph)[loops])
         error = se3.log(se3.between(graph.a_from_b[loops], se3.between(self.poses[a], self.poses[b])))
         error = error[:, self.axes]
-        chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+        chi2 = se3.mahalanobis2(error, covariance)
         return np.where(self.part[a] == self.part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
 
-    def walked(self, unit: Floats) -> Floats:
-        """(N,) noise gathered from the first pose on, in multiples of variances (d,), mean over the axes.
-
-        Differences tell how much noise there is between two poses, but for what turns do to positions. Between two
-        pieces of odometry there is more of it than anything is compared with.
-        """
+    def accumulated_noise(self, unit: Floats) -> Floats:
+        """(N,) noise accumulated from the first pose on, in multiples of variances (d,), mean over the axes, without
+        lever arms. Between two pieces of odometry it jumps by 1e12."""
         return np.cumsum((self.step / unit).mean(1) + np.where(np.diff(self.part, prepend=1) > 0, 1e12, 0.0))
 
     def covariance(self, a: Int32s, b: Int32s) -> Floats:
@@ -162,14 +154,9 @@ def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain
 def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int | None = None) -> Solution:
     """The solution, or the odometry poses where the solution bends the odometry more than its noise allows.
 
-    Odometry alone has no residual. If all closures that were kept are true, the sum of chi-squares over the odometry
-    edges is chi-square with as many degrees of freedom as the closures check them with: each edge's own, less what
-    the solution leaves open of it (its redundancy; Foerstner 1979). Beyond the 0.999999 quantile either false closures
-    were believed or the noise is far too small: in both cases the poses cannot be trusted.
-
-    The more closures there are, the less of an error in the noise itself this bears: of 20 000 poses, one of 1.1 is far
-    too much. With `known_to` degrees of freedom as those from which the noise is known at best, it bears the same share
-    of it from so many on.
+    If all inliers are true, the chi-square of the odometry edges has as many degrees of freedom as their redundancy in
+    the solution (Foerstner 1979). Beyond the 0.999999 quantile closures are false or the noise is far too small. Above
+    `known_to` degrees of freedom the bound on chi-square per degree stays, as the noise itself is known no better.
     """
     odometry = ~is_loop(graph)
     accepted = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
@@ -183,12 +170,8 @@ def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int |
     if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
         return solution
     try:
-        checks = max(
-            round(
-                redundancy(Objective(Factors.of(graph), accepted), solution.world_from_body, np.flatnonzero(odometry))
-            ),
-            1,
-        )
+        objective = Objective(Factors.of(graph), accepted)
+        checks = max(round(redundancy(objective, solution.world_from_body, np.flatnonzero(odometry))), 1)
     except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
         checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))
     bound = chi2_quantile(_SURE, checks)

@@ -16,10 +16,9 @@ if TYPE_CHECKING:
 def correct_trajectory(odometry: Odometry, keyframes: Keyframes, world_from_body: Floats) -> Trajectory:
     """Every odometry sample, moved with its keyframes to their solved poses (N, 4, 4).
 
-    A sample hangs on the keyframe before it and on the one after it by the odometry between; the pose goes along the
-    geodesic from the one to the other with its share of the time between them. Before the first and after the last
-    keyframe it hangs on that one alone. So the path is continuous, keyframes are met exactly, and odometry that was
-    not corrected comes back as it was.
+    The poses that the keyframes before and after a sample give it by the odometry are interpolated on the geodesic by
+    its share of the time between them; outside the keyframes the nearest one decides. So the path is continuous, passes
+    through the keyframes, and uncorrected odometry stays as it was.
     """
     keys, poses = keyframes.stamp_ns, keyframes.odom_from_body
     after = np.searchsorted(keys, odometry.stamp_ns, "right")

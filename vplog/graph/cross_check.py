@@ -29,10 +29,8 @@ class CrossCheckSettings(Settings):
 def cross_checked(graph: PoseGraph, solution: Solution, settings: CrossCheckSettings) -> Solution:
     """The solution, or the odometry poses where other methods find that the closures as a body contradict it.
 
-    A method that decides from the start which closures to believe may keep just those that a false story needs, and
-    bend the odometry no further than its noise allows. Kernels that weigh all of them alike tell that story whole: so
-    where much was rejected, and the odometry is bent too far by all that each of two kernels (DCS, Geman-McClure)
-    believes, the closures speak against the odometry and not against each other.
+    Where much was rejected, DCS and Geman-McClure, which weigh all closures alike, solve the graph too. If the inliers
+    of each bend the odometry more than its noise allows, the closures contradict the odometry, not each other.
     """
     loops = is_loop(graph)
     accepted, count = int((solution.weight[loops] > 0.5).sum()), int(loops.sum())

@@ -1,13 +1,9 @@
 """Graduated non-convexity: inconsistent closures are down-weighted, odometry keeps its weight.
 
-Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020. Three things are
-added to it, since it starts from a solve with every closure, which false ones can bend beyond return, and ends
-where no closure has a large residual, which a false one has not either where little else holds the graph:
-
-1. The start is what agrees with the odometry, by the mixture of agreement.py.
-2. Noise is often claimed far too large, and then tells no false closure. So its scale is taken from the solved
-   graph as well.
-3. In the end each closure, and each group of neighbouring ones, is held against what the rest predicts (scrutiny.py).
+Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, with three
+additions: the initial inliers are the closures that agree with the odometry (`odometry_mixture`), the scale of the
+noise is estimated from the solved graph too, and each closure, and each group of neighbouring ones, is tested against
+the prediction of the rest (`outlier_test`).
 """
 
 from __future__ import annotations
@@ -31,7 +27,7 @@ from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import descend
 from vplog.graph.lm import solve_weighted
 from vplog.graph.odometry_mixture import agreement
-from vplog.graph.outlier_test import Scrutiny
+from vplog.graph.outlier_test import OutlierTest
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.sparse.workers import Workers
@@ -41,8 +37,8 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 
 _BRANCHES = 200
-"""Of the search for the largest set of closures between two pieces of odometry: a greedy one and some more. Where
-some hundred closures join two drives, one in a hundred pairs of which disagrees by chance, an exact one never ends."""
+"""Branches of the search for the largest set of closures between two pieces of odometry: an exact search of some
+hundred closures, a hundredth of whose pairs disagree by chance, does not end."""
 
 
 class GncSettings(Settings):
@@ -84,10 +80,10 @@ class GncSettings(Settings):
         weight[loops] = (agreed.probability > 0.5) & ~gated & self._join(graph, loops, chain)
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
         weight, poses = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
-        scrutiny = Scrutiny(
+        outlier_test = OutlierTest(
             factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
         )
-        state = scrutiny(weight, poses)
+        state = outlier_test(weight, poses)
         accepted, far = int(state.weight[loops].sum()), int(gated.sum())
         found = (
             f"{accepted} of {len(loops)} closures were kept; {far} were too far from the odometry, "

@@ -1,4 +1,4 @@
-"""GPS fixes as constraints of a pose graph: which keyframe each hangs on, and which of them are believed."""
+"""GPS fixes as factors of a pose graph: the keyframe of each, and which are inliers."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Fixes:
 def fixes_on(gps: Gps | None, odometry: Odometry, keyframes: Keyframes, settings: GpsSettings) -> Fixes:
     """The fixes of a log on the keyframes nearest in time. Raises GraphError where fewer than three are within reach.
 
-    Fixes that share a keyframe share one fix's say: their errors are those of the same satellites.
+    Fixes that share a keyframe share the information of one: their errors are those of the same satellites.
     """
     keys, warnings = keyframes.stamp_ns, []
     if gps is None:
@@ -136,7 +136,7 @@ def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
 def chi2_of_fixes(poses: Floats, fixes: Fixes, world: Floats) -> Floats:
     """(F,) squared Mahalanobis distance of the fixes, moved to the world of the poses, to the antenna."""
     error = (antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m
-    return (error * np.linalg.solve(fixes.covariance, error[:, :, None])[:, :, 0]).sum(1)
+    return se3.mahalanobis2(error, fixes.covariance)
 
 
 def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, inlier: Floats) -> Objective:
@@ -154,10 +154,10 @@ def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, in
 def inlier_fixes(
     factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings
 ) -> tuple[Floats, Floats]:
-    """Poses (N, 4, 4), pose 0 as given, and which fixes (F,) are believed, 0 or 1: jumps are not.
+    """Poses (N, 4, 4), pose 0 as given, and the inliers (F,) among the fixes, 0 or 1.
 
     Graduated non-convexity with the truncated least squares loss (Yang et al., RA-L 2020) over the fixes, the edges
-    keeping their weights. The first solve believes all of them, so their frame is found whatever the odometry drifted.
+    keeping their weights. The first solve uses all of them, so their frame is found whatever the odometry drifted.
     """
     bound, inlier, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
     mu = 0.0

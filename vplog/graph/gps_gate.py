@@ -1,4 +1,4 @@
-"""Closures held against GPS: what leads further from the fixes than odometry alone is not believed."""
+"""Test of closures against GPS: a solution further from the fixes than odometry alone is rejected."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from vplog.graph.gps_factors import Fixes
 
 _ROUNDS = 10
-"""Alignments, each weighed by what the one before leaves; a jump of fixes loses its say within a few."""
+"""Alignments, each weighed by what the one before leaves; jumps of fixes are down-weighted within a few."""
 
 
 def keep_odometry_if_further(graph: PoseGraph, solution: Solution, fixes: Fixes) -> Solution:

@@ -87,7 +87,7 @@ class Joined:
     maps: list[tuple[int, ...]]
     """Numbers of the drives of each map, in order of their first ones."""
     world_from_body: list[Floats]
-    """Of each drive, in the frame of its map's first drive."""
+    """Poses of each drive, in the frame of its map's first drive."""
     solved: dict[tuple[int, ...], Refined]
     """What came of each map of several drives: its graph has their poses one after the other."""
     weight: list[Floats]
@@ -107,10 +107,9 @@ def join(
 ) -> Joined:
     """The maps that the drives make. Raises GraphError where a graph cannot be solved.
 
-    What is joined by enough closures is solved as one, with all closures between its drives. Pairs of which too few are
-    kept are taken apart, and what is left is solved again, until every join is held by enough: so a drive that joins
-    nothing keeps its own poses. Where odometry bends more than its noise allows, the half of the pairs that closures
-    speak least for goes first, so that one drive does not part all others.
+    Drives joined by enough closures are solved as one, with all closures between them. Pairs with too few inliers are
+    separated and the rest is solved again, until every pair has enough; other drives keep their own poses. Where the
+    odometry bends more than its noise allows, the half of the pairs with fewest inlier places is separated first.
     """
     joined = [_places(one, settings.spacing) >= settings.least_closures for one in between]
     weight = [np.zeros(len(one.query)) for one in between]

@@ -1,9 +1,8 @@
-"""What each closure, and each group of neighbouring ones, costs the rest of a solved graph.
+"""Leave-one-out cost of each closure, and of each group of neighbouring ones, in a solved graph.
 
-A closure between places that little else joins has no residual of its own: the graph bends until it fits. So what is
-tested is not how well a closure fits, but by how much the chi-square of all other edges would fall without it. That is
-its distance to where the others predict it, in units of the prediction's and its own noise (the externally studentised
-residual; Baarda's data snooping, 1968).
+The cost is by how much the chi-square of all other edges falls without the closure: its squared distance to the
+prediction of the others, in units of the prediction's and its own noise (the externally studentised residual; Baarda's
+data snooping, 1968).
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.geometry import se3
-from vplog.graph.build import AXES, informed
+from vplog.graph.build import AXES, informed, parts
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from vplog.graph.sparse.linear import BayesTree, Supernodes
 
 _ALONE = 1e-9
-"""Least share of a closure's say that the rest has, so that no quotient is infinite."""
+"""Least redundancy of a closure, so that no quotient is infinite."""
 _NEAREST = 4
 """Places tried as a way round; the nearest in rows may not be the nearest in noise."""
 _BESIDE = 64
@@ -49,14 +48,14 @@ class Tension:
 
 
 def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Tension:
-    """Of the closures `loops` (K,), all with weight, after least squares over the weighted edges (E,) at `poses`."""
+    """The tension of closures `loops` (K,) of positive weight at the least squares solution `poses`."""
     graph = factors.graph
     axes = AXES[graph.dimension]
     error, Jr_inv = _errors(graph, poses, loops)
     covariance = Jr_inv @ edge_covariances(Objective(factors, weight), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
     information = informed(graph)[loops] * weight[loops, None, None]
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
-    # leverage: the share of the closure's own say in where its ends are, 1 where nothing else tells
+    # leverage: 1 where nothing else constrains the ends of the closure
     leverage, turn = np.linalg.eigh(root @ covariance @ np.swapaxes(root, 1, 2))
     rest = np.clip(1.0 - leverage, _ALONE, 1.0)
     whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
@@ -94,8 +93,7 @@ def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tu
     covariance = Jr_inv @ edge_covariances(Objective(factors, barely), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
     covariance = covariance + np.linalg.inv(informed(graph)[loops])
     error = error[:, axes]
-    squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
-    return squared, 0.5 * np.linalg.slogdet(covariance)[1]
+    return se3.mahalanobis2(error, covariance), 0.5 * np.linalg.slogdet(covariance)[1]
 
 
 def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
@@ -124,38 +122,35 @@ def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) ->
     own: Floats = np.asarray(
         np.median(np.diagonal(np.linalg.inv(informed(graph)[loops]), axis1=1, axis2=2), axis=0), np.float64
     )
-    walked = chain.walked(own)
+    accumulated_noise = chain.accumulated_noise(own)
     first, second = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
     order = np.lexsort((second, first))
-    at, to = walked[first[order]], walked[second[order]]
-    root = list(range(len(loops)))
-
-    def find(node: int) -> int:
-        while root[node] != node:
-            root[node] = root[root[node]]
-            node = root[node]
-        return node
-
+    at, to = accumulated_noise[first[order]], accumulated_noise[second[order]]
     # 2: the noise of two closures, each one unit
     starts = np.searchsorted(at, at - 2.0)
-    for this in range(len(loops)):
-        part = slice(starts[this], this)
-        near = np.flatnonzero(at[this] - at[part] + np.abs(to[this] - to[part]) <= 2.0)
-        for other in near.tolist():
-            root[find(starts[this] + other)] = find(this)
-    label = np.unique([find(node) for node in range(len(loops))], return_inverse=True)[1]
+    near = [
+        begun + np.flatnonzero(at[this] - at[begun:this] + np.abs(to[this] - to[begun:this]) <= 2.0)
+        for this, begun in enumerate(starts.tolist())
+    ]
+    this = np.repeat(np.arange(len(loops)), [len(others) for others in near])
+    label = parts(len(loops), np.concatenate([*near, this[:0]]), this)
     by_group = np.argsort(label, kind="stable")
     return [order[part] for part in np.split(by_group, np.cumsum(np.bincount(label))[:-1])]
 
 
 def group_costs(
-    graph: PoseGraph, poses: Floats, loops: Ints, pull: Tension, places: list[Ints], chain: OdometryChain | None = None
+    graph: PoseGraph,
+    poses: Floats,
+    loops: Ints,
+    single: Tension,
+    places: list[Ints],
+    chain: OdometryChain | None = None,
 ) -> Floats:
-    """At most how much chi-square falls without each place (G,), about.
+    """Approximate upper bound (G,) of how much chi-square falls without each place.
 
-    The members pull as one at their middle one. Against them stands the way round by another place or by the odometry,
-    whatever is shorter, or what of the graph's information on the middle one is left without theirs. Both say too
-    little as a rule, so a large figure is a reason to look closely. What the members pull against each other is added.
+    The members act as one at their middle one, against the better of two estimates of the rest: the way round by
+    another place or by the odometry, and the graph's information on the middle one less theirs. What the members cost
+    each other is added.
     """
     axes = AXES[graph.dimension]
     chain = chain or OdometryChain.of(graph)
@@ -168,7 +163,7 @@ def group_costs(
     at_middle = at_middle[:, axes][:, :, axes]
     back = np.swapaxes(at_middle, 1, 2)
     first = np.cumsum(size) - size
-    force = np.add.reduceat((back @ pull.force[member][:, :, None])[:, :, 0], first, axis=0)
+    force = np.add.reduceat((back @ single.force[member][:, :, None])[:, :, 0], first, axis=0)
     together = np.add.reduceat(back @ information[loops[member]] @ at_middle, first, axis=0)
     own = np.linalg.inv(together)
 
@@ -188,10 +183,10 @@ def group_costs(
         legs = legs + _leg(chain, poses, graph.b[loops[member]], here, there)
     soft = np.add.reduceat(back @ np.linalg.inv(legs) @ at_middle, first, axis=0)
     root = np.swapaxes(np.linalg.cholesky(soft), 1, 2)
-    leverage, turn = np.linalg.eigh(root @ pull.covariance[at] @ np.swapaxes(root, 1, 2))
+    leverage, turn = np.linalg.eigh(root @ single.covariance[at] @ np.swapaxes(root, 1, 2))
     whitened = (np.swapaxes(turn, 1, 2) @ np.linalg.solve(np.swapaxes(root, 1, 2), force[:, :, None]))[:, :, 0]
     left = (whitened**2 / np.maximum(1.0 - leverage, _ALONE)).sum(1)
-    alone = _quadratic(pull.force[member], np.asarray(np.linalg.inv(information[loops[member]]), np.float64))
+    alone = _quadratic(single.force[member], np.asarray(np.linalg.inv(information[loops[member]]), np.float64))
     among = np.add.reduceat(alone, first) - _quadratic(force, own)
     return np.minimum(least, left) + np.maximum(among, 0.0)
 

@@ -1,4 +1,4 @@
-"""Plain least squares: every edge is believed."""
+"""Plain least squares over all edges."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class LmSettings(Settings):
 def solve_weighted(
     factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float, found: str
 ) -> Solution:
-    """Least squares over the weighted edges (E,) from `start`, told as a Solution; `found` opens its reason."""
+    """Least squares over the weighted edges (E,) from `start`, as a Solution; `found` opens its reason."""
     fit = descend(factors, weight, start, max_iterations, tolerance)
     return as_solution(factors.graph, weight, fit, f"{found}Least squares")
 

@@ -1,4 +1,4 @@
-"""Which closures agree with the odometry, with the scale of the noise found along the way."""
+"""Mixture of true and false closures by their distance to the odometry, with the scales of the noise."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from vplog.data import Floats, Ints, PoseGraph
 
 _RANGE = (2.0**-6, 2.0**3)
-"""Scales looked at. Noise is often said far too large; true closures with eight times the noise that is said spread as
-widely as false ones do."""
+"""Scales searched. Claimed noise is often far too large; at eight times it true closures spread as false ones."""
 _COARSE, _FINE = 4.0, 2.0**0.5
 """Factors between scales, first and last: 20 closures do not tell a scale more finely."""
 _LEAST_SIDE = 0.1
@@ -33,9 +32,9 @@ class Agreement:
     odometry_scale: float
     """Sigma of the odometry as a multiple of what its information says."""
     loop_scale: float
-    """The same of the closures."""
+    """Sigma of the closures as a multiple of what their information says."""
     share: float
-    """Of true ones among the closures."""
+    """Share of true closures, 0..1."""
     log_room: float
     """Log of the volume that false closures are spread over, in m and rad."""
 
@@ -44,11 +43,9 @@ def agreement(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None)
     """Fit the mixture to the closures `loops` (K,) of the graph, by greatest likelihood.
 
     A true closure is off the odometry by N(0, s^2 C + t^2 R), C what the chain of odometry from a to b adds up to, R
-    its own noise; a false one lies anywhere in the box that the odometry spans, at any turn. The scales s and t, and
-    the share of true ones, are what makes all closures together most likely: expectation maximisation, as Lee,
-    Fraundorfer and Pollefeys (IROS 2013) sort closures. With the scales found, not said, noise that is said far too
-    large does not hide false closures, and noise said too small does not throw out true ones. As false ones are spread
-    over the whole box, nine in ten of them do not pull the scales. `chain` is the graph's where it is at hand.
+    its own noise; a false one is uniform over the box that the odometry spans and all rotations. The scales s and t are
+    searched and the share of true ones is found by expectation maximisation (Lee, Fraundorfer and Pollefeys, IROS
+    2013), so neither too large nor too small a claimed noise decides. `chain` is the graph's where it is at hand.
     """
     chain = chain or OdometryChain.of(graph)
     room = _log_volume(chain.poses[:, :3, 3], graph.dimension)

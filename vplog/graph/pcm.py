@@ -114,6 +114,5 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChai
         )
         turned = np.swapaxes(after[this], 1, 2)
         covariance = noise[this] + noise[other] + noise_b + after[this] @ noise_a @ turned
-        chi2 = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
-        result[this, other] = result[other, this] = chi2 <= bound
+        result[this, other] = result[other, this] = se3.mahalanobis2(error, covariance) <= bound
     return result

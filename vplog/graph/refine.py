@@ -1,9 +1,4 @@
-"""After the robust solve: how noisy the odometry really was, and by what share its metres are too long or short.
-
-A log's covariance is a figure in a driver more often than an estimate, and wheels and cameras miss the scale by one or
-two percent all the way. Once closures (and GPS) are known to be sound, both can be read off how far the odometry had
-to bend for them.
-"""
+"""The odometry's noise and scale, estimated after the robust solve from the inlier closures and GPS fixes."""
 
 from __future__ import annotations
 
@@ -25,9 +20,9 @@ if TYPE_CHECKING:
     from vplog.graph.gps_factors import GpsSettings
 
 _STEP = 1e-4
-"""Of the scale, for differences: far above rounding, far below what any drive tells."""
+"""Step of the scale for differences: far above rounding, far below what any drive determines."""
 _STEPS = 20
-"""Of least squares at most: each starts from the last round's best poses."""
+"""Most steps of least squares: each starts from the last round's best poses."""
 _LONGEST = 0.05
 """Largest change of the scale in one round."""
 
@@ -55,7 +50,7 @@ class Refined:
     """A solution with what it says of the sensors."""
 
     graph: PoseGraph
-    """As solved: metres of the odometry multiplied by `scale`, its covariance by `noise`."""
+    """The graph as solved: metres of the odometry multiplied by `scale`, its covariance by `noise`."""
     solution: Solution
     noise: float
     """Factor of the odometry's covariance, 1 where it was not judged."""

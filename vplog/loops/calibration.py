@@ -1,4 +1,4 @@
-"""What all closures of a drive share: how far the calibration and the stamps of its camera can be trusted."""
+"""Uncertainty that all closures of a drive share: calibration and stamps of its camera."""
 
 from __future__ import annotations
 

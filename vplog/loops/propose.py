@@ -36,8 +36,8 @@ class ProposeSettings(Settings):
     """Candidates within this many keyframes of a better one of the same query are left out: they show what it shows."""
 
     @property
-    def asked(self) -> int:
-        """Rows to ask of a recogniser: each one kept may suppress 2 x suppress others."""
+    def ranked(self) -> int:
+        """Rows that a recogniser ranks for each query: each one taken may suppress 2 x suppress others."""
         return self.per_query * (2 * self.suppress + 1)
 
 
@@ -83,7 +83,7 @@ def candidate_stops(keyframes: Keyframes, settings: ProposeSettings) -> Ints:
 def propose(rankings: Iterable[tuple[Ranking, Int32s]], settings: ProposeSettings) -> Proposals:
     """Candidates from every keyframe's ranking of the rows below its stop, in order, with the support of each row.
 
-    A ranking holds `settings.asked` rows, or fewer where no more are worth a look.
+    A ranking holds `settings.ranked` rows, or fewer where no more are worth a look.
     """
     found = []
     for ranking, support in rankings:

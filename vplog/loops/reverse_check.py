@@ -1,4 +1,4 @@
-"""The two ways of looking at one pair, from query to match and back: whether they agree, and what they say together."""
+"""Poses from query to match and from match to query: their consistency and their fusion."""
 
 from __future__ import annotations
 

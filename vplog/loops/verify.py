@@ -160,11 +160,7 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
             known = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
             information[at] = (known + known.T) / 2.0
     return Closures(
-        query=proposals.query.astype(np.int32),
-        match=proposals.match.astype(np.int32),
-        rank=proposals.rank.astype(np.int32),
-        score=proposals.score.astype(np.float32),
-        support=proposals.support.astype(np.int32),
+        **vars(proposals),
         shared_references=[np.empty(0, np.uint16)] * count,
         shared_overlap=[np.empty(0, np.float32)] * count,
         matches=np.array([row.matches for row in rows], np.int32),

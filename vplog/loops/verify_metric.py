@@ -1,4 +1,4 @@
-"""The pose between two keyframes from matches of one's features to the other's landmarks, with honest information."""
+"""The pose between two keyframes from matches of one's features to the other's landmarks, with its covariance."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class MetricSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """What geometry says of one pair of keyframes; frames are the cameras', later the bodies'."""
+    """Verdict and pose of one pair of keyframes, between their cameras."""
 
     verdict: Verdict
     inliers: int

@@ -1,14 +1,8 @@
 """Bag of bounding boxes, after Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014.
 
-The paper's three steps: the references that explain an image (section III-A), boxes on each of them where the features
-of a window are found again (section III-B), places alike where their boxes overlap on the same references (Eq. 1).
-`bobb_paper.py` is the paper to the letter. This one departs from it where that recognises better; each departure is a
-setting: matches weighed by relative distance (`reach`), RootSIFT (`root_sift`), no grain (`least_size`), patches
-beside keypoints (`patch_weight`), matches that agree in their motion (`agreement`, `agreement_floor`), popular
-references counting less (`popularity`), weights of the references in the score (`share_power`), a reference that
-explains itself (`own`), even windows (`windows_along`), the expected vote in closed form (`expected_votes.py`), boxes
-of one shape that a byte holds (`columns`, `rows`), and a window compared with its own as well as with the best
-(`pairing`).
+The references that explain an image (section III-A), boxes on each of them where the features of a window are found
+again (section III-B), and the overlap of boxes on shared references as similarity (Eq. 1). `bobb_paper.py` is the paper
+to the letter; here votes have the closed form of `expected_votes.py`, and the other departures are settings.
 """
 
 from __future__ import annotations
@@ -25,13 +19,13 @@ from pydantic import Field, model_validator
 
 from vplog.data import Boxes
 from vplog.errors import LibraryError
-from vplog.places import expected_votes, library_files
+from vplog.places import expected_votes
 from vplog.places.code_lists import BLOCK, CodeLists, build_lists
 from vplog.places.code_search import CodeIndex
 from vplog.places.columns import check_type, check_values, struct_of_lists
 from vplog.places.matches import Matches, WeighedMatchSettings, index_references
 from vplog.places.once import Once
-from vplog.places.relearn import relearn
+from vplog.places.relearn import ReferencesState, relearn
 from vplog.places.shared_references import list_shared
 
 if TYPE_CHECKING:
@@ -120,7 +114,7 @@ class BobbSettings(WeighedMatchSettings):
         return state
 
     def prepare(self, references: Iterable[Reference], threads: int) -> BobbState:
-        """`learn` without the index, which the first image to describe makes: comparing places needs none."""
+        """`learn` without the index, which the first image described makes: comparing places needs none."""
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
             raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
@@ -177,18 +171,16 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class BobbState:
-    """A library, indexed when it is first asked to describe. Shared freely between threads."""
+class BobbState(ReferencesState):
+    """A library, indexed when it first describes. Safe to share between threads."""
 
     settings: BobbSettings
     matcher: Matcher
     learned: Once[Floats]
     """(L,) weight of each reference."""
-    hash: str = field(init=False)
 
     def __post_init__(self) -> None:
         s = self.settings
-        object.__setattr__(self, "hash", library_files.references_hash(self.matcher.references, s))
         object.__setattr__(self, "_windows", expected_votes.even_windows(s.windows_along, s.window_share))
         object.__setattr__(self, "_along_x", expected_votes.box_sums(s.columns, s.patches_x, s.box_columns))
         object.__setattr__(self, "_along_y", expected_votes.box_sums(s.rows, s.patches_y, s.box_rows))
@@ -262,7 +254,7 @@ class BobbState:
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
     @property
-    def references(self) -> list[Reference]:
+    def references(self) -> list[Reference]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The library."""
         return self.matcher.references
 
@@ -366,6 +358,3 @@ class BobbState:
             weights.reshape(-1, s.references),
             boxes.reshape(-1, s.references, s.boxes),
         )
-
-    def save(self, folder: Path) -> None:
-        library_files.save_references(self.matcher.references, self.settings, folder)

@@ -19,15 +19,14 @@ from pydantic import Field, PositiveFloat, model_validator
 from vplog.data import Boxes
 from vplog.errors import LibraryError
 from vplog.places import library as lib
-from vplog.places import library_files, rvp
+from vplog.places import rvp
 from vplog.places.columns import check_type, check_values, struct_of_lists
-from vplog.places.relearn import RelearnedSettings
+from vplog.places.relearn import ReferencesState, RelearnedSettings
 from vplog.places.search import BoxIndex
 from vplog.places.shared_references import list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
 
@@ -107,23 +106,17 @@ def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> _Pa
     order = np.argsort(values, kind="stable")
     words, counts = np.unique(values, return_counts=True)
     width, height = library.size(row)
-    cuts = rvp.draw_partitions(
-        width,
-        height,
-        settings.partitions,
-        settings.columns,
-        settings.rows,
-        np.random.default_rng([settings.seed, 1, row]),
-    )
-    patches = rvp.patches_of(library.points[first:last], cuts.x_cuts, cuts.y_cuts)
+    rng = np.random.default_rng([settings.seed, 1, row])
+    x_cuts, y_cuts = rvp.draw_partitions(width, height, settings.partitions, settings.columns, settings.rows, rng)
+    patches = rvp.patches_of(library.points[first:last], x_cuts, y_cuts)
     return _Pattern(
         words=words.astype(np.int32),
         posting_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
         posting=owners[order],
         patches=patches,
         totals=rvp.patch_totals(patches, np.diff(starts), settings.columns * settings.rows),
-        x_cuts=cuts.x_cuts,
-        y_cuts=cuts.y_cuts,
+        x_cuts=x_cuts,
+        y_cuts=y_cuts,
         grid_x=rvp.grid_cuts(width, settings.grid),
         grid_y=rvp.grid_cuts(height, settings.grid),
     )
@@ -140,7 +133,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class PaperBobbState:
+class PaperBobbState(ReferencesState):
     """A library, indexed and partitioned. Shared freely between threads."""
 
     settings: PaperBobbSettings
@@ -154,11 +147,9 @@ class PaperBobbState:
         corners = rng.uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
         object.__setattr__(self, "_windows", np.concatenate([corners, corners + s.window_share], axis=-1))
         object.__setattr__(self, "_shapes", rvp.box_shapes(s.grid, s.max_box_share, s.aspects))
-        object.__setattr__(self, "hash", library_files.references_hash(self.library.references, s))
 
     _windows: Floats = None  # pyright: ignore[reportAssignmentType]
     _shapes: Int32s = None  # pyright: ignore[reportAssignmentType]
-    hash: str = ""
 
     @property
     def bits(self) -> int:
@@ -211,7 +202,7 @@ class PaperBobbState:
         )  # fmt: skip
 
     @property
-    def references(self) -> list[Reference]:
+    def references(self) -> list[Reference]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The library."""
         return self.library.references
 
@@ -275,9 +266,6 @@ class PaperBobbState:
         if len(boxes) and boxes.max() > s.grid:
             raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
         return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
-
-    def save(self, folder: Path) -> None:
-        library_files.save_references(self.library.references, self.settings, folder)
 
 
 def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:

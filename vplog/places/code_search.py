@@ -1,11 +1,8 @@
 """Eq. (1) over a map of places whose boxes are numbers, with weights of the references: exact, in whole numbers.
 
-Only boxes on a shared reference overlap, so a query visits the lists of its own references and nothing else. Overlaps
-are read from a table, summed as integers and scaled once: no order of summing changes a score.
-
-Lists are read side by side, one block of rows after the other, so that what is summed stays in the cache. A search for
-the best places sums an upper bound of every place first, and compares boxes only where that bound reaches
-the best places found so far: nothing that could be among them is left out.
+Only boxes on a shared reference overlap, so a query visits the lists of its own references, block by block of rows, so
+that sums stay in the cache. Overlaps are read from a table, summed as integers and scaled once. A search for the best
+places compares boxes only where an upper bound of the score reaches the best found so far.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
 """Coverage of a drive by reference images: to choose them by, and for the record of a run.
 
-A reference explains a frame as far as the frame's features are found on it. Which frames explain which is measured
-once, by near descriptors of few strong features; references are then chosen greedily, which for a sum like this comes
-within 1 - 1/e of the best choice there is (Nemhauser, Wolsey & Fisher 1978, section 4).
-
-A finished run asks more: near descriptors are found on any picture of trees. There, matches count that keep their
-arrangement, beyond as many as ever do so when the same matches are paired up anew. The level of chance is thus the
-image pair's own, and asks nothing of other places: one room seen all the time is explained, a forest by another forest
-is not.
+A reference explains a frame as far as the frame's features are found on it, by near descriptors of few strong features.
+References are chosen greedily, within 1 - 1/e of the best choice (Nemhauser, Wolsey & Fisher 1978, section 4). For the
+record of a run only matches that keep their arrangement count, less the most that do so in permutations of the matches.
 """
 
 from __future__ import annotations
@@ -43,14 +38,13 @@ _NEIGHBOURS = 10
 _MAX_L1 = 0.4
 """L1 distance of two descriptors of unit length that are the same (Tanaka et al. 2014, section III-B)."""
 _ENOUGH = 0.5
-"""Of what a frame's best candidate explains, the share that will do. By R@1 and ANR of the other walk of Gardens Point,
-20 and 50 references, half is better than the plain sum of shares, its root, or fixed caps of 4 and 8 %."""
+"""Share of what a frame's best candidate explains that is enough. By R@1 and ANR on Gardens Point with 20 and 50
+references, half is better than the plain sum of shares, its root, or fixed caps of 4 and 8 %."""
 
 _SHOWN = 200
 """Frames that the figure of a run is measured on, evenly along it: one standard error is 3.5 % at most."""
 _FIRST = 48
-"""Frames of those that are looked at first: one standard error is 7 % at most, and where `POOR` is three of them away,
-as of nearly every drive, the others would decide nothing."""
+"""Frames measured first: one standard error is 7 % at most, and where `POOR` is three away the others do not matter."""
 _MEASURED = 400
 """Strongest features of a frame that are translated: half of what describes a place, for half of the time."""
 _BEST = 4
@@ -60,17 +54,13 @@ _NEAR = 0.2
 _AGREE = 0.03
 """Neighbours that move together differ in their displacement by less than this share of the image's sides."""
 _PAIRINGS = 8
-"""Times that the matches are paired up anew to learn what chance does."""
+"""Permutations of the matches by which the level of chance is estimated."""
 EXPLAINED = 0.01
 """Share of a frame's features, beyond chance, from which on it counts as explained: four of 400. Frames of another site
-or light have a median of 0 and .003 to .013 at the 90th percentile; frames of the library's own drive a median of .010
-(Gardens Point at night, every eighth frame a reference) to .30 (7-Scenes), of the same walk a few metres beside .010 to
-.024."""
+or light have a median of 0 and at most .013 at the 90th percentile, those of the library's drive .010 to .30."""
 POOR = 1 / 3
-"""Share of explained frames below which a run is warned. Libraries of 15 to 100 references of the drive explain .52 to
-1.0 of the frames, of the same walk in the same light .51 to .77, of the other light .05 to .11, of another site 0 to
-.09. BoBB, day walk in day walk with 60 references, has R@1 .67 by a library of either, .35 of the night, .21 to .26 of
-elsewhere."""
+"""Share of explained frames below which a run is warned. Libraries of the drive or its route in the same light explain
+.51 to 1.0 of the frames, of another light or site 0 to .11, by which R@1 falls from .67 to .35 and less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +150,7 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -
 def greedy_cover(found: Explanations, size: int) -> Ints:
     """At most `size` candidates, the one that adds most first; fewer where none adds anything.
 
-    What is made as large as can be is the sum over the frames of what their best reference is worth to them, see
-    `_worth`. Ties go to the first.
+    Maximises the sum over the frames of the worth of their best reference, see `_worth`. Ties go to the first.
     """
     worth = _worth(found)
     order = np.argsort(found.candidate, kind="stable")
@@ -174,7 +163,7 @@ def _worth(found: Explanations) -> Floats:
     """0..1, of each candidate to each frame: 1 where it explains half as much as the frame's best candidate does.
 
     Relative to the frame's best, so that a bare wall counts as much as a facade; capped, so that the frames of one
-    place share a reference instead of each asking for its neighbour.
+    place share a reference.
     """
     owner = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
     best = np.zeros(len(found.start) - 1)
@@ -262,9 +251,9 @@ def explained_share(
 ) -> float:
     """Share 0..1 of an image's features that the reference explaining it best explains, beyond chance.
 
-    `words` of M features at `points` (M, 2) px of an image of `size` (width, height) px. A match is counted where
-    another one near it in the image moves the same way; from that is taken the largest count of the same matches
-    paired up anew. Reference `leave_out` does not count: the image itself.
+    `words` of M features at `points` (M, 2) px of an image of `size` (width, height) px. Counted are matches with
+    another one near them in the image that moves the same way, less the largest such count of their permutations.
+    Reference `leave_out`, the image itself, does not count.
     """
     if len(points) == 0:
         return 0.0

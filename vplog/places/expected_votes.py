@@ -1,9 +1,8 @@
 """Common pattern discovery in closed form: what Algorithm 3 of Tanaka et al. 2014 gives on average.
 
 M - 1 random cuts of a side of length 1 leave two points dx apart in one of the M patches with the probability
-(1 - dx)^(M - 1), so the average over partitions votes (1 - |dx|)^(M - 1) (1 - |dy|)^(N - 1) around every match, and
-none need be drawn.
-Votes are summed over a coarse grid; as the sum over a box is all that is asked, kernel and box become one matrix each.
+(1 - dx)^(M - 1), so the average over partitions votes (1 - |dx|)^(M - 1) (1 - |dy|)^(N - 1) around every match. Votes
+are summed over a coarse grid, by one matrix of kernel and box for each side.
 """
 
 from __future__ import annotations

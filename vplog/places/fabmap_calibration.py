@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     Words = NDArray[np.uint16]
 
 _LEAST_IMAGES = 10
-"""A drive with fewer images tells nothing of how much to trust the evidence."""
+"""Least images of a drive to calibrate on."""
 _MOST_QUERIES = 200
-"""So many references are asked of, spread evenly; more would not change the second digit of the weight."""
+"""Most references used as queries, spread evenly; more do not change the second digit of the weight."""
 _NEAR_SHARE = 10
 """An image's place may be seen from a tenth of the drive's images before and after it; the others are far."""
 _WEIGHTS = np.geomspace(0.01, 1.0, 201)
@@ -33,20 +33,18 @@ def calibrate(
 ) -> tuple[float, float]:
     """The weight of the evidence, and nats to add to that of a new place, from the references alone.
 
-    References are queries in turn, and the others of the same drive are the places: those next to it in time show its
-    place, those far from it in time do not, and no truth is needed. The weight is an exponent of the likelihood (a
-    temperature: Guo et al., On calibration of modern neural networks, ICML 2017, section 4.2; Ribatet, Cooley &
-    Davison, Statistica Sinica 22, 2012, adjust composite likelihoods by it), here the one that makes the neighbours
-    most likely. The tree has seen the query too; trees without it give a weight within 3 %.
-    The nats make a new place come out as often as there is one, where every query is asked twice: with all the other
-    places, and with the far ones only. The papers' own (1, 0) where too few references have neighbours.
+    References are queries in turn, and the others of the same drive are the places: neighbours in time show the query's
+    place, those far in time do not. The weight is the exponent of the likelihood that makes the neighbours most likely
+    (a temperature: Guo et al., On calibration of modern neural networks, ICML 2017, section 4.2; Ribatet, Cooley &
+    Davison, Statistica Sinica 22, 2012). With the nats a new place is as probable as it is frequent when each query is
+    posed twice, with all other places and with the far ones only. The papers' (1, 0) without enough neighbours.
     """
-    asked, others, neighbour, far = _by_time(references)
-    if len(asked) < _LEAST_IMAGES:
+    queries, others, neighbour, far = _by_time(references)
+    if len(queries) < _LEAST_IMAGES:
         return 1.0, 0.0
     evidence = Evidence(images, model)
-    log_ratio = np.empty((len(asked), len(images)))
-    for k, row in enumerate(asked):
+    log_ratio = np.empty((len(queries), len(images)))
+    for k, row in enumerate(queries):
         log_ratio[k] = evidence(images[row], len(images))[0]
         new_place = average_place(images[row], model) if drawn is None else log_mean(log_ratio[k, drawn[drawn != row]])
         log_ratio[k] -= new_place
@@ -56,22 +54,22 @@ def calibrate(
     weight = float(_WEIGHTS[np.argmin(surprise)])
     # both questions together have a new place half of the time: even odds against the mean of the places
     known = [_log_sum(weight * log_ratio, places) - np.log(places.sum(axis=1)) for places in (others, far)]
-    return weight, _even_odds(np.concatenate(known), len(asked)) / weight
+    return weight, _even_odds(np.concatenate(known), len(queries)) / weight
 
 
 def _by_time(references: Sequence[Reference]) -> tuple[NDArray[np.int64], Bools, Bools, Bools]:
-    """(A,) rows to ask of, and (A, L) which are the other places of the drive, which its neighbours, which are far."""
+    """(A,) rows of queries, and (A, L) which are the other places of the drive, which its neighbours, which are far."""
     names = {name: number for number, name in enumerate(sorted({reference.drive for reference in references}))}
     drive = np.array([names[reference.drive] for reference in references])
     order = np.lexsort((np.arange(len(drive)), np.array([reference.stamp_ns for reference in references]), drive))
     size = np.bincount(drive)
     position = np.empty(len(drive), np.int64)
     position[order] = np.arange(len(drive)) - (np.cumsum(size) - size)[drive[order]]
-    asked = np.flatnonzero(size[drive] >= _LEAST_IMAGES)
-    asked = asked[:: -(-len(asked) // _MOST_QUERIES) or 1]
-    same = drive[asked, None] == drive
-    gap = np.abs(position[asked, None] - position)
-    return asked, same & (gap > 0), same & (gap == 1), same & (gap > size[drive] / _NEAR_SHARE) & (gap > 1)
+    queries = np.flatnonzero(size[drive] >= _LEAST_IMAGES)
+    queries = queries[:: -(-len(queries) // _MOST_QUERIES) or 1]
+    same = drive[queries, None] == drive
+    gap = np.abs(position[queries, None] - position)
+    return queries, same & (gap > 0), same & (gap == 1), same & (gap > size[drive] / _NEAR_SHARE) & (gap > 1)
 
 
 def _log_sum(logs: Floats, chosen: Bools) -> Floats:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Words = NDArray[np.uint16]
 
-_UNSEEN, _SEEN, _AVERAGE = 0, 1, 2
+_ABSENT, _PRESENT, _AVERAGE = 0, 1, 2
 """States of a word at a place: its one image lacks it, has it, or there is no image."""
 
 
@@ -40,7 +40,7 @@ def log_likelihood_table(tree: ChowLiuTree, seen_if_there: float, seen_if_absent
     # The place model: the prior p(e_q = 1) is how often the word occurs at all, and the place's one image updates it
     # by Bayes' rule (2008, on the update of the place model).
     exists = np.empty((len(tree), 3))
-    for known in (_UNSEEN, _SEEN):
+    for known in (_ABSENT, _PRESENT):
         there, absent = detector[1, known] * tree.present, detector[0, known] * (1 - tree.present)
         exists[:, known] = there / (there + absent)
     exists[:, _AVERAGE] = tree.present
@@ -61,9 +61,8 @@ class Model:
 class Evidence:
     """ln p(Z | L) of every place at once: FAB-MAP 2.0's inverted index.
 
-    Almost all words are absent from both image and place. What a place is worth to an image without any word is
-    summed beforehand; then only words of the image and their children in the tree are corrected for, and only at the
-    places that have the word. Rows are in the order given.
+    The likelihood of an image without any word is summed beforehand, and corrected for the words of the image and their
+    children in the tree, at the places that have the word. Rows are in the order given.
     """
 
     def __init__(self, places: Sequence[Words], model: Model) -> None:
@@ -75,8 +74,8 @@ class Evidence:
         self._list_start = np.searchsorted(words[order], np.arange(len(model.tree) + 1)).astype(np.int64)
         self._list_place = owners[order]
         silent = model.table[:, :, 0, 0]
-        gain = (silent[:, _SEEN] - silent[:, _UNSEEN])[words]
-        self._base = silent[:, _UNSEEN].sum() + np.bincount(owners, gain, minlength=len(places))
+        gain = (silent[:, _PRESENT] - silent[:, _ABSENT])[words]
+        self._base = silent[:, _ABSENT].sum() + np.bincount(owners, gain, minlength=len(places))
 
     def __len__(self) -> int:
         return self._count

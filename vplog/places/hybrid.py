@@ -1,10 +1,8 @@
 """BoBB, with visual words where the library does not explain the scene: Tanaka et al., IROS 2014, section V.
 
-A library of few images explains few scenes. What their features look like is learned from far less: a handful of visual
-words, and in which directions features differ from them, keypoints and patches alike. An image is then, beside its
-boxes, one bit for each word and direction: to which side the image's features of that word lie, all together. These
-are the signs of a VLAD (Jegou et al., CVPR 2010) of residuals of unit length (Delhumeau et al., Revisiting the VLAD
-image representation, ACM MM 2013), with where a feature lies in the image as two more values of its descriptor.
+Beside its boxes an image is one bit for each of a few visual words and each principal direction of descriptors: the
+signs of a VLAD (Jegou et al., CVPR 2010) of residuals of unit length (Delhumeau et al., Revisiting the VLAD image
+representation, ACM MM 2013) of keypoints and patches, with the position in the image as two more values.
 """
 
 from __future__ import annotations
@@ -90,7 +88,7 @@ class HybridSettings(RelearnedSettings):
 
 @dataclass(frozen=True, eq=False)
 class Words:
-    """W words in a space of 64 principal directions of descriptors and 2 of positions, whose signs are asked for."""
+    """W words in a space of 64 principal directions of descriptors and 2 of positions."""
 
     mean: Float32s
     """(128,) of RootSIFT."""

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.library_files import strongest
+from vplog.places.relearn import keep_references
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -83,9 +83,7 @@ def build_library(references: Iterable[Reference], settings: WordSettings, threa
 
     Raises LibraryError where there is no feature.
     """
-    kept = [strongest(reference, settings.features) for reference in references]
-    if not kept:
-        raise LibraryError("A library needs at least one reference image; none was given.")
+    kept = keep_references(references, settings.features)
     start = np.concatenate([[0], np.cumsum([len(reference.features) for reference in kept])]).astype(np.int32)
     if start[-1] == 0:
         raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")

@@ -1,4 +1,4 @@
-"""A reference library on disk: images, features and settings. The same files for every recogniser."""
+"""A reference library on disk, for every recogniser: images, features and settings."""
 
 from __future__ import annotations
 

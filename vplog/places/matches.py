@@ -1,10 +1,7 @@
 """Matches of an image's features with those of a library, each with a weight.
 
-Features are of two kinds, each compared with its own: keypoints, found again where the view turns or comes nearer, and
-patches at even steps, found again in other light.
-
-The paper takes every neighbour below one absolute distance for the same word. Distances change with light and blur, so
-here a match counts by how much nearer it is than the feature's last neighbour, which nobody takes for the same.
+Keypoints match keypoints, and patches at even steps, which bear other light better, match patches. Where the paper has
+one absolute distance, a match here weighs by how much nearer it is than the feature's last neighbour.
 """
 
 from __future__ import annotations
@@ -20,13 +17,14 @@ from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 from vplog.places.once import Once
 from vplog.places.patches import describe_patches
+from vplog.places.relearn import keep_references
 from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from vplog.data import Bytes, Features, Float32s, Int32s, Reference
+    from vplog.data import Features, Float32s, Int32s, Reference
 
     Both = tuple["Indexed | None", "Indexed | None"]
 
@@ -87,7 +85,7 @@ class Indexed:
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """The features of L references, indexed when they are first asked for. Shared freely between threads."""
+    """The features of L references, indexed on first use. Safe to share between threads."""
 
     references: list[Reference]
     settings: WeighedMatchSettings
@@ -150,7 +148,8 @@ def shares(features: Features) -> Float32s:
 def keypoints_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
     """Descriptors (M, 128) float32, whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
     used = large_enough(features, settings)
-    return _comparable(used.descriptors, settings), shares(used)
+    values = root_sift_steps(used.descriptors) if settings.root_sift else used.descriptors.astype(np.float32)
+    return values, shares(used)
 
 
 def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
@@ -162,9 +161,7 @@ def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Floa
 
 def index_references(references: Iterable[Reference], settings: WeighedMatchSettings) -> Matcher:
     """The references' features, not yet indexed. Raises LibraryError where they have none."""
-    kept = [replace(r, features=large_enough(r.features, settings)) for r in references]
-    if not kept:
-        raise LibraryError("A library needs at least one reference image; none was given.")
+    kept = [replace(r, features=large_enough(r.features, settings)) for r in keep_references(references)]
     matcher = Matcher(kept, settings)
     if not any(len(r.features) for r in kept) and matcher.patches is None:
         raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")
@@ -188,13 +185,6 @@ def _index(
     graph = hnsw(values, settings.hnsw_links, settings.hnsw_ef_construction, settings.neighbours)
     owner = np.repeat(np.arange(len(described), dtype=np.int32), [len(values) for values, _ in described])
     return Indexed(owner, np.concatenate([points for _, points in described]), graph, weight)
-
-
-def _comparable(descriptors: Bytes, settings: WeighedMatchSettings) -> Float32s:
-    """(M, 128) float32 whole numbers 0..255."""
-    if not settings.root_sift:
-        return descriptors.astype(np.float32)
-    return root_sift_steps(descriptors)
 
 
 @numba.njit(cache=True, nogil=True)

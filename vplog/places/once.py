@@ -1,4 +1,4 @@
-"""A value that takes long to make and is not always needed."""
+"""A value made on first use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 
 class Once(Generic[Value]):
-    """Made when it is first asked for, by whichever thread; the others wait for it."""
+    """A value made by the first call, from whichever thread; the others wait for it."""
 
     def __init__(self, make: Callable[[], Value]) -> None:
         self._make, self._made, self._lock = make, list[Value](), threading.Lock()

@@ -1,9 +1,8 @@
 """Patches of an image's thumbnail at even steps, described by the directions of their edges.
 
-Where light is poor or its colour changes, detectors fire elsewhere and what stays is the layout; patches that are
-taken everywhere need no detector (Torii et al., 24/7 place recognition by view synthesis, CVPR 2015). A patch is 4 x 4
-cells of 8 directions, as SIFT's (Lowe 2004), upright as the vehicle is. An edge and its negative count as the same
-direction (Dalal & Triggs, CVPR 2005): windows are dark by day and bright by night.
+Dense patches need no detector, which fires elsewhere in other light (Torii et al., 24/7 place recognition by view
+synthesis, CVPR 2015). A patch is 4 x 4 cells of 8 directions, as SIFT's (Lowe 2004), upright; an edge and its negative
+have one direction (Dalal & Triggs, CVPR 2005).
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ def describe_patches(thumbnail: Bytes) -> tuple[Float32s, Float32s]:
     `thumbnail` is the grey image (S, S) uint8. Patches without any edge are left out.
     """
     values, points = _describe(_edges(np.sqrt(np.arange(256.0))[thumbnail], CELL, DIRECTIONS), CELLS, _MOST)
-    seen = values.any(axis=1)
-    return np.minimum(np.rint(np.sqrt(values[seen]) * ROOT_STEPS), 255.0).astype(np.float32), points[seen]
+    used = values.any(axis=1)
+    return np.minimum(np.rint(np.sqrt(values[used]) * ROOT_STEPS), 255.0).astype(np.float32), points[used]
 
 
 @numba.njit(cache=True, nogil=True)

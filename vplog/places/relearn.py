@@ -51,7 +51,7 @@ def keep_references(references: Iterable[Reference], features: int | None = None
 
 
 def relearn(settings: Any, folder: Path, threads: int, learn: Callable[..., Any] | None = None) -> Any:
-    """State of a folder written by `stored.save_references`, whose own settings count; `settings` is their class, and
+    """State of a folder written by `save_references`, whose own settings count; `settings` is their class, and
     `learn` of its methods the one that makes the state.
 
     Raises LibraryError where the folder is damaged or gives another hash.

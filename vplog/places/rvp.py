@@ -1,14 +1,12 @@
 """Common pattern discovery by randomized visual phrases: Algorithm 3 of Tanaka et al. 2014.
 
-The voting map of a window is needed only through sums over boxes, and boxes lie on a grid of G x G cells, so the
-kernel keeps the sum of V over each cell: a patch adds its similarity times the pixels it shares with the cell.
-That is the per-pixel algorithm exactly, without touching pixels.
+Boxes lie on a grid of G x G cells, so the kernel keeps the sum of the voting map V over each cell: a patch adds its
+similarity times the pixels it shares with the cell, which is the per-pixel algorithm exactly.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numba
@@ -20,25 +18,16 @@ if TYPE_CHECKING:
     from vplog.data import Floats, Int32s
 
 
-@dataclass(frozen=True, eq=False)
-class Partitions:
-    """K random partitions of one reference image into M columns x N rows."""
-
-    x_cuts: Int32s
-    """(K, M + 1) px, from 0 to the width."""
-    y_cuts: Int32s
-    """(K, N + 1) px, from 0 to the height."""
-
-
-def draw_partitions(width: int, height: int, K: int, M: int, N: int, rng: np.random.Generator) -> Partitions:
-    """K independent partitions, cuts uniform over the pixel borders (Alg. 3 line 6)."""
+def draw_partitions(width: int, height: int, K: int, M: int, N: int, rng: np.random.Generator) -> tuple[Int32s, Int32s]:
+    """Cuts in px, (K, M + 1) from 0 to the width and (K, N + 1) from 0 to the height, of K independent partitions into
+    M columns x N rows, uniform over the pixel borders (Alg. 3 line 6)."""
 
     def cuts(length: int, parts: int) -> Int32s:
         inner = np.sort(rng.integers(0, length + 1, (K, parts - 1)), axis=1)
         ends = np.zeros((K, 1), np.int64), np.full((K, 1), length)
         return np.concatenate([ends[0], inner, ends[1]], axis=1).astype(np.int32)
 
-    return Partitions(cuts(width, M), cuts(height, N))
+    return cuts(width, M), cuts(height, N)
 
 
 def grid_cuts(length: int, cells: int) -> Int32s:

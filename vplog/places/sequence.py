@@ -1,8 +1,8 @@
 """Sequences of views instead of single ones, over any recogniser's scores: a return runs along a line of the matrix.
 
-The idea is that of Milford & Wyeth, SeqSLAM, ICRA 2012: with query q at row m, the views around q are at the rows
-around m. Here every view's scores are first taken relative to what is usual, then averaged along such lines, and a
-line that is only half there, because the return has just begun or is about to end, counts by what its half is worth.
+After Milford & Wyeth, SeqSLAM, ICRA 2012: with query q at row m, the views around q are at the rows around m. Scores
+are taken relative to their mean by view and by row, then averaged along such lines, or along either half of them, where
+a return begins or ends.
 """
 
 from __future__ import annotations
@@ -143,20 +143,19 @@ def _mapping(threads: int) -> Iterator[Mapping]:
 
 
 def _usual(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, mapped: Mapping) -> Float32s:
-    """(W,) how much more alike than others each row is to any view: a blank wall is a bit like everything.
+    """(W,) mean score of each row over views spread evenly over the drive.
 
-    The mean over views spread evenly over the drive. A row that few of them may match is drawn to 0, as if `length`
-    views more had found it usual: else the window of its only return would cancel itself.
+    Shrunk towards 0 as by `length` more views, so that the only return to a row does not cancel itself.
     """
     queries = np.flatnonzero(stops > 0)
     queries = queries[np.unique(np.linspace(0, len(queries) - 1, min(_USUAL_VIEWS, len(queries))).round().astype(int))]
-    total, seen = np.zeros(stops.max(initial=0)), np.zeros(stops.max(initial=0), np.int64)
+    total, count = np.zeros(stops.max(initial=0)), np.zeros(stops.max(initial=0), np.int64)
     for first in range(0, len(queries), _BLOCK):
         block = queries[first : first + _BLOCK].tolist()
         for row in mapped(lambda query: _centred(row_of_scores(query)), block):  # in order: a sum of its own bytes
             total[: len(row)] += row
-            seen[: len(row)] += 1
-    return (total / (seen + length)).astype(np.float32)
+            count[: len(row)] += 1
+    return (total / (count + length)).astype(np.float32)
 
 
 def _centred(row: Float32s) -> Float32s:

@@ -23,11 +23,11 @@ ROOT_STEPS = np.float32(512)
 """Steps of 1 that roots of descriptors are whole multiples of: a byte of them reaches 0.498, and SIFT's own cut at 0.2
 keeps values below that."""
 _FEATURES_PER_WORD = 4
-"""A centre that is the mean of fewer features is one image's noise, and its word would never be seen again."""
+"""Least features a word: the mean of fewer is one image's noise."""
 _ITERATIONS = 6
 """Iterations of k-means; with five features a word the mean distance to the centre stops falling after the fifth."""
 _MOST_FEATURES_PER_WORD = 256
-"""More do not move a centre noticeably: a random choice of so many is learned from, as faiss' own k-means does."""
+"""Largest random sample that is learned from, as in faiss' own k-means."""
 _EXACT_WORDS = 1024
 """Up to so many words all distances are quicker than a graph."""
 _LINKS, _EF_CONSTRUCTION, _EF_LEARN, _EF_SEARCH = 16, 40, 16, 64

@@ -114,7 +114,7 @@ def image(stamp_ns: int, frame_id: str, data: bytes) -> CompressedImage:
 
 
 def calibration(stamp_ns: int, camera: Camera, size: tuple[int, int]) -> CameraCalibration:
-    """Of the camera's images at another size in px; (0, 0) is the centre of the top-left pixel before and after."""
+    """The calibration of images resized to `size` px; (0, 0) is the centre of the top-left pixel before and after."""
     width, height = size
     message = CameraCalibration(frame_id=CAMERA, width=width, height=height)
     message.timestamp.FromNanoseconds(stamp_ns)

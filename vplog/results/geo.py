@@ -40,8 +40,7 @@ def feature_collection(earth: Earth, world_from_body: Floats, stamp_ns: Ints, cl
     if len(where) > 1:
         about = {"name": "optimised", "start_ns": str(stamp_ns[0]), "end_ns": str(stamp_ns[-1])}
         features.append(_line(where, about))
-    accepted = [row for row, verdict in enumerate(closures.verdict) if verdict == Verdict.ACCEPTED]
-    for row in accepted:
+    for row in np.flatnonzero(closures.of(Verdict.ACCEPTED)).tolist():
         query, match = int(closures.query[row]), int(closures.match[row])
         about = {"name": "closure", "closure": row, "query": query, "match": match}
         features.append(_line([where[match], where[query]], about))

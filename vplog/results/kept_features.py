@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from vplog.data import Features
 from vplog.errors import ResultError
+from vplog.results.tables import FLOAT32_LIST, column
 from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY, check_columns, open_table, table_writer
 from vplog.storage.scratch import replacing
 
@@ -22,27 +23,22 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _LEVEL = 1
-"""Of zstd: descriptors hardly shrink, by a fifth, and higher levels take their time for nothing."""
+"""Level of zstd: descriptors shrink by a fifth at any level."""
 
 _IN_MEMORY = 128
-"""Keyframes whose features are not read again, some 20 MB: candidates come by match, and queries near each other."""
+"""Keyframes whose features are cached, some 20 MB."""
 
 
-def _column(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Field:
-    return pa.field(name, kind, False, metadata={"unit": unit, "description": description})
-
-
-_FLOATS = pa.list_(pa.field("element", pa.float32(), nullable=False))
 FEATURES = pa.schema(
     [
-        _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
-        _column("width", pa.int32(), "px", "Width of the image."),
-        _column("height", pa.int32(), "px", "Height of the image."),
-        _column("x", _FLOATS, "px", "Column of each feature, strongest first; 0 is the centre of the left pixel."),
-        _column("y", _FLOATS, "px", "Row of each feature; 0 is the centre of the topmost pixel."),
-        _column("size", _FLOATS, "px", "Diameter of the described neighbourhood."),
-        _column("depth", _FLOATS, "m", "Depth along the camera's z, NaN where unknown."),
-        _column("descriptors", pa.binary(), "bytes", "128 bytes of SIFT for each feature, one after the other."),
+        column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
+        column("width", pa.int32(), "px", "Width of the image."),
+        column("height", pa.int32(), "px", "Height of the image."),
+        column("x", FLOAT32_LIST, "px", "Column of each feature, strongest first; 0 is the centre of the left pixel."),
+        column("y", FLOAT32_LIST, "px", "Row of each feature; 0 is the centre of the topmost pixel."),
+        column("size", FLOAT32_LIST, "px", "Diameter of the described neighbourhood."),
+        column("depth", FLOAT32_LIST, "m", "Depth along the camera's z, NaN where unknown."),
+        column("descriptors", pa.binary(), "bytes", "128 bytes of SIFT for each feature, one after the other."),
     ]
 )
 
@@ -52,7 +48,7 @@ HEADER = {
     "vplog.most_features": "Most features of a keyframe.",
     VERSION_KEY: VERSION_ABOUT,
 }
-"""What the file says of itself."""
+"""Metadata of the file."""
 
 
 def write_features(path: Path, count: int, features: Callable[[int], Features], most: int, made_from: str) -> None:
@@ -71,7 +67,7 @@ def write_features(path: Path, count: int, features: Callable[[int], Features], 
                 pa.Table.from_arrays(
                     [
                         *(pa.array([value], pa.int32()) for value in (row, own.width, own.height)),
-                        *(pa.array([np.ascontiguousarray(values, np.float32)], _FLOATS) for values in floats),
+                        *(pa.array([np.ascontiguousarray(values, np.float32)], FLOAT32_LIST) for values in floats),
                         pa.array([own.descriptors[:most].tobytes()], pa.binary()),
                     ],
                     schema=writer.schema,

@@ -35,6 +35,6 @@ LAYOUTS: dict[str, list[tuple[str, str, str]]] = {
 
 
 def layouts() -> dict[str, list[dict[str, str]]]:
-    """The same as plain objects."""
+    """`LAYOUTS` as plain objects."""
     keys = ("name", "type", "description")
     return {name: [dict(zip(keys, part, strict=True)) for part in parts] for name, parts in LAYOUTS.items()}

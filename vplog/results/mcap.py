@@ -113,8 +113,8 @@ def write_mcap(
                 writer.add_attachment(start_ns, start_ns, f"reference-{number}.jpg", "image/jpeg", data)
         channels = _Channels(writer, camera)
         solved = _solved(keyframes, world_from_body, graph, closures, camera, shown)
-        seen = _seen(keyframes, closures, camera, shown) if camera is not None else iter(())
-        for stamp_ns, topic, message in heapq.merge(solved, seen, _fixes(shown), key=lambda timed: timed[0]):
+        pictured = _camera_messages(keyframes, closures, camera, shown) if camera is not None else iter(())
+        for stamp_ns, topic, message in heapq.merge(solved, pictured, _fixes(shown), key=lambda timed: timed[0]):
             channels.write(stamp_ns, topic, message)
         writer.finish()
 
@@ -154,7 +154,7 @@ def _solved(
             yield stamp_ns, "/path/optimised", foxglove.path(stamp_ns, bodies)
 
 
-def _seen(keyframes: Keyframes, closures: Closures, camera: Camera, shown: Shown) -> Iterator[Timed]:
+def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, shown: Shown) -> Iterator[Timed]:
     """The camera's pictures with what was found in them, at their exact stamps, and the pictures of closures."""
     topic, size = camera_topic(camera), shown.image_size
     if shown.image is None:
@@ -234,22 +234,15 @@ def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: C
     ends = world_from_body[:, :3, 3]
     named = [("odometry", np.stack([ends[graph.a[odometry]], ends[graph.b[odometry]]], 1), foxglove.GREY)]
     for name, (fate, color) in _FATES.items():
-        rows = [row for row, verdict in enumerate(closures.verdict) if verdict == fate]
-        named.append((name, _between(ends, closures, rows), color))
+        named.append((name, closures.lines(ends, closures.of(fate)), color))
     return foxglove.lines(stamp_ns, named)
 
 
 def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
     """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
-    given = {fate for fate, _ in _FATES.values()}
-    rows = [row for row, verdict in enumerate(closures.verdict) if verdict not in given]
-    ends = _between(world_from_body[:, :3, 3], closures, rows)
+    given = closures.of(*(fate for fate, _ in _FATES.values()))
+    ends = closures.lines(world_from_body[:, :3, 3], ~given)
     return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
-
-
-def _between(positions: Floats, closures: Closures, rows: list[int]) -> Floats:
-    """(S, 2, 3) the ends of closures."""
-    return np.stack([positions[closures.match[rows]], positions[closures.query[rows]]], axis=1).reshape(-1, 2, 3)
 
 
 def _loop_closure(

@@ -1,4 +1,4 @@
-"""What result.mcap holds that no table does, read back: pictures, references, fixes."""
+"""Reader of what only result.mcap holds: pictures, references, fixes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class CameraPicture:
     """One picture of the camera."""
 
     stamp_ns: int
@@ -57,7 +57,7 @@ class Seen:
 
 
 def read_pictures(path: Path) -> Found:
-    """Of a result.mcap. Raises ResultError where it is not there or damaged."""
+    """The pictures, references and fixes of a result.mcap. Raises ResultError where it is missing or damaged."""
     pictures, references, fixes = {}, {}, []
     with _reading(path) as reader:
         for attachment in reader.iter_attachments():
@@ -80,7 +80,7 @@ def read_fixes(path: Path) -> Gps | None:
     return _gps(fixes) if fixes else None
 
 
-def read_images(path: Path) -> Iterator[Seen]:
+def read_images(path: Path) -> Iterator[CameraPicture]:
     """The camera's pictures in order of time, one in memory at a time. Raises ResultError as above."""
     with _reading(path) as reader:
         summary = reader.get_summary()
@@ -90,12 +90,10 @@ def read_images(path: Path) -> Iterator[Seen]:
         for _, channel, message in reader.iter_messages(topics=wanted) if wanted else ():
             if channel.topic.endswith("/calibration"):
                 camera = CameraCalibration.FromString(message.data)
-                matrix, size = (
-                    np.reshape(camera.K, (3, 3)) if len(camera.K) == 9 else None,
-                    (camera.width, camera.height),
-                )
+                matrix = np.reshape(camera.K, (3, 3)) if len(camera.K) == 9 else None
+                size = camera.width, camera.height
             else:
-                yield Seen(message.log_time, CompressedImage.FromString(message.data).data, matrix, size)
+                yield CameraPicture(message.log_time, CompressedImage.FromString(message.data).data, matrix, size)
 
 
 def read_camera_pose(path: Path) -> Floats | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
+from vplog.results.tables import column
 from vplog.storage.parquet_limits import write_table
 from vplog.storage.scratch import replacing
 
@@ -16,20 +17,16 @@ if TYPE_CHECKING:
     from vplog.results.tables import TableMetadata
 
 
-def _column(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Field:
-    return pa.field(name, kind, False, metadata={"unit": unit, "description": description})
-
-
 PLACED = pa.schema(
     [
-        _column("query", pa.int32(), "row", "View of the log, 0 is the first."),
-        _column("query_stamp_ns", pa.int64(), "ns", "Stamp of the view, in the log's clock."),
-        _column("rank", pa.int32(), "1", "0 is the view's best answer."),
-        _column("drive", pa.string(), "", "Drive of the place; with keyframe it joins with MAP/keyframes."),
-        _column("keyframe", pa.int32(), "row", "Keyframe of that drive, 0 is the first."),
-        _column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
-        _column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
-        _column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
+        column("query", pa.int32(), "row", "View of the log, 0 is the first."),
+        column("query_stamp_ns", pa.int64(), "ns", "Stamp of the view, in the log's clock."),
+        column("rank", pa.int32(), "1", "0 is the view's best answer."),
+        column("drive", pa.string(), "", "Drive of the place; with keyframe it joins with MAP/keyframes."),
+        column("keyframe", pa.int32(), "row", "Keyframe of that drive, 0 is the first."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
+        column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
+        column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
     ]
 )
 """What a query answers, in order of the views, then of rank."""

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results import geo, run_record, tables
-from vplog.storage.parquet_limits import check_size, filled, open_table, read_schema, read_table, table_writer
+from vplog.storage.parquet_limits import check_size, filled, open_table, read_schema, table_writer
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ ROWS_PER_GROUP = 16_384
 """Places of a row group: 2 MB of the default's descriptors."""
 ZSTD_LEVEL = 3
 """Level 1 is 1 % larger and no faster; 9 is 1 % smaller and takes twice as long to write."""
-_MOST_TOLD = 2**25
+_MOST_HEADER = 2**25
 """Bytes of a header's list of drives: it is in the file twice."""
 _MOST_ROWS = 2**20
 """Rows of a group that is read at once: as many as other writers put into one."""
@@ -62,7 +62,7 @@ class DrivePlaces:
     """(P, 4, 4)."""
     descriptors: pa.Array
     header: dict[str, str]
-    """Of the table of descriptors; it names the library."""
+    """Header of the table of descriptors; it names the library."""
     where: Floats | None = None
     """(P, 3) longitude and latitude in degrees and altitude in m; None where nothing says so."""
 
@@ -128,7 +128,7 @@ def write_places(
     about = {
         **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
         "vplog.table": "map",
-        "vplog.drives": _told_drives(drives),
+        "vplog.drives": _drives_header(drives),
         "vplog.descriptor": json.dumps([_described(name, part) for name, part in described]),
         **({} if bounds is None else geo.geo_header(*bounds)),
     }
@@ -157,10 +157,10 @@ def write_places(
     return {"written": str(path), "drives": names, "places": places, "library": library}
 
 
-def _told_drives(drives: Mapping[str, dict[str, Any]]) -> str:
-    """The header's list of drives; of very many the IDs alone, as readers take headers of up to 100 MB."""
-    told = json.dumps(drives)
-    return told if len(told) <= _MOST_TOLD else json.dumps({drive: {} for drive in drives})
+def _drives_header(drives: Mapping[str, dict[str, Any]]) -> str:
+    """The drives as JSON; their IDs alone where that is too long, as readers take headers of up to 100 MB."""
+    header = json.dumps(drives)
+    return header if len(header) <= _MOST_HEADER else json.dumps({drive: {} for drive in drives})
 
 
 def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
@@ -173,25 +173,6 @@ def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
     return [drive, pa.array(part.keyframe), pa.array(part.stamp_ns), *map(pa.array, where), *packed]
 
 
-def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
-    """The table of places without descriptors, and these in the recogniser's own type. Raises ResultError."""
-    try:
-        with open_table(path) as file:
-            table = read_table(path, file)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
-    parts = list(_parts(kind, ""))
-    header = table.schema.metadata or {}
-    described = header.get(b"vplog.descriptor", b"").decode()
-    if header.get(b"vplog.table") != b"map" or described != json.dumps([_described(*part) for part in parts]):
-        raise ResultError(
-            f"{path} is not a map of places of this recogniser. "
-            "Write one with `vplog map export RUN... -o FILE.parquet`."
-        )
-    columns = iter([_unpacked(table[name].combine_chunks(), part) for name, part in parts])
-    return filled(table, PLACE), _joined(kind, columns)
-
-
 @dataclass(frozen=True)
 class AboutMap:
     """What the header of a map of places says."""
@@ -201,19 +182,17 @@ class AboutMap:
     descriptor: str
     """How its columns are to be taken, as JSON."""
     drives: dict[str, dict[str, Any]]
-    """Of each drive, in order, what is known of it: `inputs`, `topics`, `earth`."""
+    """What is known of each drive, in order: `inputs`, `topics`, `earth`."""
 
 
 def about_map(path: Path) -> AboutMap:
     """The header of a map of places. Raises ResultError where it is none."""
-    try:
+    with _reading(path):
         header = {key.decode(): value.decode() for key, value in (read_schema(path).metadata or {}).items()}
         settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
         run_record.canonical_json([settings, drives])  # not nested deeper than can be written again
-    except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
     sound = isinstance(settings, dict) and isinstance(drives, dict)
-    sound = sound and all(isinstance(told, dict) for told in drives.values())
+    sound = sound and all(isinstance(known, dict) for known in drives.values())
     if header.get("vplog.table") != "map" or not sound:
         raise ResultError(
             f"{path} is not a file of places with its drives. Write one: vplog map export MAP -o FILE.parquet"
@@ -224,14 +203,11 @@ def about_map(path: Path) -> AboutMap:
 def places_by_drive(path: Path) -> dict[str, int]:
     """How many places of each drive are in a map. Raises ResultError."""
     found: dict[str, int] = {}
-    try:
-        with _opened(path, ["drive"]) as file:
-            for batch in file.iter_batches(ROWS_PER_GROUP, columns=["drive"]):
-                for value in batch.column(0).value_counts():
-                    drive = str(value["values"])
-                    found[drive] = found.get(drive, 0) + value["counts"].as_py()
-    except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
+    with _reading(path), _opened(path, ["drive"]) as file:
+        for batch in file.iter_batches(ROWS_PER_GROUP, columns=["drive"]):
+            for value in batch.column(0).value_counts():
+                drive = str(value["values"])
+                found[drive] = found.get(drive, 0) + value["counts"].as_py()
     return found
 
 
@@ -243,24 +219,21 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
         raise ResultError(f"{path} is not a map of places of this recogniser.")
     schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])
     done, waiting = set[str](), list[pa.Table]()
-    try:
-        with _opened(path, schema.names) as file:
-            for number in range(file.num_row_groups):
-                if (rows := file.metadata.row_group(number).num_rows) > _MOST_ROWS:
-                    raise ResultError(f"{path} has {rows} places in a row group; write it with at most {_MOST_ROWS}.")
-                table = filled(file.read_row_group(number, columns=schema.names), schema)
-                for drive, rows in _stretches(table):
-                    if waiting and waiting[0]["drive"][0].as_py() != drive:
-                        yield _places_of(waiting, path, parts, kind)
-                        waiting = []
-                    if drive in done and not waiting:
-                        raise ResultError(f"{path} holds the places of {drive} in two stretches.")
-                    done.add(drive)
-                    waiting.append(rows)
+    with _reading(path), _opened(path, schema.names) as file:
+        for number in range(file.num_row_groups):
+            if (rows := file.metadata.row_group(number).num_rows) > _MOST_ROWS:
+                raise ResultError(f"{path} has {rows} places in a row group; write it with at most {_MOST_ROWS}.")
+            table = filled(file.read_row_group(number, columns=schema.names), schema)
+            for drive, rows in _stretches(table):
+                if waiting and waiting[0]["drive"][0].as_py() != drive:
+                    yield _places_of(waiting, path, parts, kind)
+                    waiting = []
+                if drive in done and not waiting:
+                    raise ResultError(f"{path} holds the places of {drive} in two stretches.")
+                done.add(drive)
+                waiting.append(rows)
         if waiting:
             yield _places_of(waiting, path, parts, kind)
-    except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
 
 
 @contextmanager
@@ -272,9 +245,16 @@ def _opened(path: Path, columns: list[str]) -> Iterator[pq.ParquetFile]:
         yield file
 
 
-def _unreadable(path: Path, error: Exception) -> ResultError:
-    why = next(iter(str(error).splitlines()), type(error).__name__)
-    return ResultError(f"{path} cannot be read: {why} Write it again: vplog map export MAP -o FILE.parquet")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raises ResultError in place of the errors of a damaged file."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, RecursionError, pa.ArrowException) as error:
+        why = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ResultError(
+            f"{path} cannot be read: {why} Write it again: vplog map export MAP -o FILE.parquet"
+        ) from None
 
 
 def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
@@ -291,11 +271,9 @@ def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
 def _places_of(tables_of_drive: list[pa.Table], path: Path, parts: list[Any], kind: pa.DataType) -> DrivePlaces:
     table = pa.concat_tables(tables_of_drive).combine_chunks()
     columns = iter([_unpacked(table[name].combine_chunks(), part) for name, part in parts])
-    values = {name: table[name].to_numpy() for name in PLACE.names if name != "drive"}
-    moved = np.stack([values[f"world_{name}"] for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")], 1)
-    poses = se3.pose(se3.rotation(moved[:, 3:]), moved[:, :3])
-    drive = table["drive"][0].as_py()
-    return DrivePlaces(drive, path, values["keyframe"], values["stamp_ns"], poses, _joined(kind, columns), {})
+    keyframe, stamp_ns = (table[name].to_numpy() for name in ("keyframe", "stamp_ns"))
+    drive, poses = table["drive"][0].as_py(), tables.read_poses(table, "world_")
+    return DrivePlaces(drive, path, keyframe, stamp_ns, poses, _joined(kind, columns), {})
 
 
 def names_of(folders: Sequence[Path]) -> list[str]:
@@ -345,19 +323,19 @@ def _stored(kind: pa.DataType) -> pa.DataType:
 
 
 def _described(name: str, kind: pa.DataType) -> dict[str, Any]:
-    """How the header tells a column: the type of its numbers and how many, or its own type alone."""
+    """A column in the header: the type of its numbers and how many, or its own type alone."""
     if _is_bytes(kind):
         return {"name": name, "type": str(kind.value_type), "length": kind.list_size}
-    return {"name": name, "type": _told(kind)}
+    return {"name": name, "type": _type_name(kind)}
 
 
-def _told(kind: pa.DataType) -> str:
+def _type_name(kind: pa.DataType) -> str:
     """A type in words that do not hang on the names of list items, which Parquet changes."""
     if pa.types.is_struct(kind):
-        return f"({', '.join(f'{_told(part.type)} {part.name}' for part in kind)})"
+        return f"({', '.join(f'{_type_name(part.type)} {part.name}' for part in kind)})"
     if pa.types.is_fixed_size_list(kind):
-        return f"{_told(kind.value_type)}[{kind.list_size}]"
-    return f"{_told(kind.value_type)}[]" if pa.types.is_list(kind) else str(kind)
+        return f"{_type_name(kind.value_type)}[{kind.list_size}]"
+    return f"{_type_name(kind.value_type)}[]" if pa.types.is_list(kind) else str(kind)
 
 
 def _packed(part: pa.Array) -> pa.Array:

@@ -67,9 +67,8 @@ def _log(
         ("without_metres", Verdict.DIRECTION_ONLY, _AMBER),
         ("rejected_by_solver", Verdict.REJECTED_BY_SOLVER, _RED),
     ):
-        rows = [row for row, one in enumerate(closures.verdict) if one == verdict]
-        lines = np.stack([ends[closures.match[rows]], ends[closures.query[rows]]], axis=1).reshape(-1, 2, 3)
-        recording.log(f"map/closures/{name}", rr.LineStrips3D(lines, colors=[colour]), static=True)
+        lines = rr.LineStrips3D(closures.lines(ends, closures.of(verdict)), colors=[colour])
+        recording.log(f"map/closures/{name}", lines, static=True)
     if earth is not None:
         where = on_earth(earth, after.world_from_body)[:, [1, 0]]
         recording.log("earth/optimised", rr.GeoLineStrings(lat_lon=[where], colors=[_BLUE]), static=True)

@@ -111,6 +111,15 @@ def read_single_run(folder: Path) -> dict[str, Any]:
     return record
 
 
+def recorded(record: Any, path: Path, kind: type, *names: str) -> Any:
+    """The value of a record under these names. Raises ResultError where there is none, or one of another kind."""
+    for name in names:
+        record = record.get(name) if isinstance(record, dict) else None
+    if not isinstance(record, kind):
+        raise ResultError(f"{path} lacks {'.'.join(names)}. Compute it again with `vplog run`.")
+    return record
+
+
 def canonical_json(tree: Any) -> str:
     """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
     return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)

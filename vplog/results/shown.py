@@ -38,7 +38,7 @@ class Earth:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """All of it is optional: a run without a camera's pictures, boxes or GPS is shown without."""
+    """What result.mcap shows beside the tables, all of it optional."""
 
     image: Callable[[int], bytes] | None = None
     """JPEG of a keyframe by its row."""

@@ -2,13 +2,13 @@
 
 Poses are scalar columns `tx ty tz` (m) and `qx qy qz qw` (unit, w >= 0), which DuckDB and Polars query directly;
 6x6 matrices are lists of 36, row by row, rotation first. What is NaN in our arrays because it is not known is null in
-a table, as queries expect. Same input, same bytes: no clock, path or thread count
-enters a file, and row groups have a fixed size.
+a table. No clock, path or thread count enters a file, and row groups have a fixed size.
 """
 
 from __future__ import annotations
 
 import io
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 ROWS_PER_GROUP = 65_536
 """Rows of a row group; 64 Ki rows of the widest table here are about 40 MB in memory."""
 DESCRIPTORS_PER_GROUP = 1_024
-"""The same for descriptors, which may take tens of kB each."""
+"""Rows of a row group of descriptors, which may take tens of kB each."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class TableMetadata:
     """Hash of the place library, empty where none was used."""
 
     def record(self) -> dict[str, str]:
-        """As key and text, for the header of a file."""
+        """Keys and texts of the header of a file."""
         return {
             "vplog.settings": canonical_json(self.settings),
             "vplog.library": self.library,
@@ -61,21 +61,22 @@ class TableMetadata:
         }
 
 
-def _column(name: str, kind: pa.DataType, unit: str, description: str, nullable: bool = False) -> pa.Field:
+def column(name: str, kind: pa.DataType, unit: str, description: str, nullable: bool = False) -> pa.Field:
+    """A column of a table with its unit and description."""
     return pa.field(name, kind, nullable, metadata={"unit": unit, "description": description})
 
 
 def _pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Field]:
     return [
-        *(_column(f"{prefix}t{axis}", pa.float64(), "m", f"{text}: position, {axis}.", nullable) for axis in "xyz"),
-        *(_column(f"{prefix}q{axis}", pa.float64(), "1", f"{text}: quaternion, {axis}.", nullable) for axis in "xyzw"),
+        *(column(f"{prefix}t{axis}", pa.float64(), "m", f"{text}: position, {axis}.", nullable) for axis in "xyz"),
+        *(column(f"{prefix}q{axis}", pa.float64(), "1", f"{text}: quaternion, {axis}.", nullable) for axis in "xyzw"),
     ]
 
 
 _MATRIX = pa.list_(pa.field("element", pa.float64(), nullable=False), 36)
 _POSE = pa.list_(pa.field("element", pa.float64(), nullable=False), 16)
 _NUMBERS = pa.list_(pa.field("element", pa.uint16(), nullable=False))
-_SHARES = pa.list_(pa.field("element", pa.float32(), nullable=False))
+FLOAT32_LIST = pa.list_(pa.field("element", pa.float32(), nullable=False))
 _OPEN_SHARE = 1e-12
 """Least eigenvalue of an information matrix as a share of its largest, below which nothing is known along it: a turn
 known to 0.01 degrees and a shift to 10 m are 3e-10 apart."""
@@ -83,63 +84,61 @@ _INFORMATION_UNIT = "rad^-2, rad^-1 m^-1, m^-2"
 
 KEYFRAMES = pa.schema(
     [
-        _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
-        _column("drive", pa.string(), "", "Name of the drive."),
-        _column("stamp_ns", pa.int64(), "ns", "Stamp of the frame, in the log's clock."),
+        column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
+        column("drive", pa.string(), "", "Name of the drive."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the frame, in the log's clock."),
         *_pose_columns("odom_", "odom_from_body, as the odometry has it"),
         *_pose_columns("world_", "world_from_body, optimised"),
     ]
 )
 CLOSURES = pa.schema(
     [
-        _column("query", pa.int32(), "row", "Keyframe, the later one."),
-        _column("match", pa.int32(), "row", "Keyframe, the earlier one."),
-        _column("query_stamp_ns", pa.int64(), "ns", "Stamp of the query keyframe."),
-        _column("match_stamp_ns", pa.int64(), "ns", "Stamp of the match keyframe."),
-        _column("rank", pa.int32(), "1", "Place among the query's candidates, 0 is the best."),
-        _column("score", pa.float32(), "1", "The recogniser's similarity, on its own scale."),
-        _column("support", pa.int32(), "pairs", "Neighbours of the pair that agree by sequence; 0 without a sequence."),
-        _column("shared_references", _NUMBERS, "1", "Library references that explain both; empty without boxes."),
-        _column("shared_overlap", _SHARES, "1", "Of each, the share of a box that the two have in common, 0 to 1."),
-        _column("matches", pa.int32(), "features", "Feature matches that passed the ratio and mutual tests."),
-        _column("landmarks", pa.int32(), "features", "Matches with a known 3D position in the map frame."),
-        _column("inliers", pa.int32(), "features", "Matches that agree with the pose, or with the epipolar geometry."),
-        _column("spread", pa.float32(), "1", "Share of the query image that the inliers' bounding box covers."),
-        _column("reverse_inliers", pa.int32(), "features", "Inliers from match to query, -1 where not tried."),
-        _column("scale", pa.string(), "", "Where the metres come from: `odometry`, `depth`, `stereo` or `none`."),
+        column("query", pa.int32(), "row", "Keyframe, the later one."),
+        column("match", pa.int32(), "row", "Keyframe, the earlier one."),
+        column("query_stamp_ns", pa.int64(), "ns", "Stamp of the query keyframe."),
+        column("match_stamp_ns", pa.int64(), "ns", "Stamp of the match keyframe."),
+        column("rank", pa.int32(), "1", "Place among the query's candidates, 0 is the best."),
+        column("score", pa.float32(), "1", "The recogniser's similarity, on its own scale."),
+        column("support", pa.int32(), "pairs", "Neighbours of the pair that agree by sequence; 0 without a sequence."),
+        column("shared_references", _NUMBERS, "1", "Library references that explain both; empty without boxes."),
+        column("shared_overlap", FLOAT32_LIST, "1", "Of each, the share of a box that the two have in common, 0 to 1."),
+        column("matches", pa.int32(), "features", "Feature matches that passed the ratio and mutual tests."),
+        column("landmarks", pa.int32(), "features", "Matches with a known 3D position in the map frame."),
+        column("inliers", pa.int32(), "features", "Matches that agree with the pose, or with the epipolar geometry."),
+        column("spread", pa.float32(), "1", "Share of the query image that the inliers' bounding box covers."),
+        column("reverse_inliers", pa.int32(), "features", "Inliers from match to query, -1 where not tried."),
+        column("scale", pa.string(), "", "Where the metres come from: `odometry`, `depth`, `stereo` or `none`."),
         *_pose_columns("", "match_from_query between body frames, null where no pose was found", nullable=True),
-        _column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of match_from_query, in the query's body frame.", True),
-        _column("covariance", _MATRIX, "rad^2, rad m, m^2", "The inverse of the information.", True),
-        _column("verdict", pa.string(), "", "What became of the candidate."),
-        _column("reason", pa.string(), "", "The verdict in one sentence."),
-        _column(
-            "residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True
-        ),
-        _column("residual_after", pa.float64(), "sigma", "Mahalanobis distance to the solution, null if unused.", True),
-        _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
+        column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of match_from_query, in the query's body frame.", True),
+        column("covariance", _MATRIX, "rad^2, rad m, m^2", "The inverse of the information.", True),
+        column("verdict", pa.string(), "", "What became of the candidate."),
+        column("reason", pa.string(), "", "The verdict in one sentence."),
+        column("residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True),
+        column("residual_after", pa.float64(), "sigma", "Mahalanobis distance to the solution, null if unused.", True),
+        column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
     ]
 )
 JOINS = pa.schema(
     [
-        _column("query_drive", pa.string(), "", "Drive of the query keyframe, the later one given."),
-        _column("match_drive", pa.string(), "", "Drive of the match keyframe."),
+        column("query_drive", pa.string(), "", "Drive of the query keyframe, the later one given."),
+        column("match_drive", pa.string(), "", "Drive of the match keyframe."),
         *CLOSURES,
     ]
 )
 EDGES = pa.schema(
     [
-        _column("a", pa.int32(), "row", "Keyframe."),
-        _column("b", pa.int32(), "row", "Keyframe."),
-        _column("kind", pa.string(), "", "`odometry` or `loop`. GPS fixes are no edges: see run.json."),
+        column("a", pa.int32(), "row", "Keyframe."),
+        column("b", pa.int32(), "row", "Keyframe."),
+        column("kind", pa.string(), "", "`odometry` or `loop`. GPS fixes are no edges: see run.json."),
         *_pose_columns("", "a_from_b, as measured"),
-        _column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
-        _column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1."),
-        _column("residual", pa.float64(), "sigma", "Mahalanobis distance of the measurement to the solution."),
+        column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
+        column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1."),
+        column("residual", pa.float64(), "sigma", "Mahalanobis distance of the measurement to the solution."),
     ]
 )
 TRAJECTORY = pa.schema(
     [
-        _column("stamp_ns", pa.int64(), "ns", "Stamp of the odometry sample, in the log's clock."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the odometry sample, in the log's clock."),
         *_pose_columns("", "world_from_body, optimised"),
         *_pose_columns("odom_", "odom_from_body, as logged"),
     ]
@@ -150,9 +149,9 @@ def descriptors_schema(descriptor: pa.DataType) -> pa.Schema:
     """Schema of the descriptors of a recogniser that stores one place as `descriptor`."""
     return pa.schema(
         [
-            _column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
-            _column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe."),
-            _column("descriptor", descriptor, "", "The place, in the recogniser's own Arrow type."),
+            column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
+            column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe."),
+            column("descriptor", descriptor, "", "The place, in the recogniser's own Arrow type."),
         ]
     )
 
@@ -174,8 +173,8 @@ def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:
     """The keyframes and their optimised poses (N, 4, 4). The drive of an empty table is ``."""
     table = _read(path, "keyframes", KEYFRAMES)
     drive = table["drive"][0].as_py() if len(table) else ""
-    keyframes = Keyframes(drive, _values(table, "stamp_ns"), _poses(table, "odom_"))
-    return keyframes, _poses(table, "world_")
+    keyframes = Keyframes(drive, _values(table, "stamp_ns"), read_poses(table, "odom_"))
+    return keyframes, read_poses(table, "world_")
 
 
 def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadata: TableMetadata) -> None:
@@ -248,7 +247,7 @@ EXACT_LEDGER = pa.schema(
     [
         *(CLOSURES.field(name) for name in (*_PLAIN_LEDGER, "shared_references", "shared_overlap", "scale")),
         *(CLOSURES.field(name) for name in ("information", "verdict")),
-        _column("match_from_query", _POSE, "", "4x4, row by row; NaN where no pose was found."),
+        column("match_from_query", _POSE, "", "4x4, row by row; NaN where no pose was found."),
     ]
 )
 """Columns of a ledger as it is computed: closures.parquet rounds poses to quaternions."""
@@ -270,7 +269,7 @@ def ledger_of(table: pa.Table) -> Closures:
 def read_closures(path: Path) -> Closures:
     """The ledger."""
     table = _read(path, "closures", CLOSURES)
-    return _ledger_from(table, path, _poses(table, ""))
+    return _ledger_from(table, path, read_poses(table, ""))
 
 
 def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
@@ -281,7 +280,7 @@ def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
     for row, pair in enumerate(drives):
         rows.setdefault(pair, []).append(row)
     found = {pair: table.take(pa.array(own)) for pair, own in rows.items()}
-    return {pair: _ledger_from(own, path, _poses(own, "")) for pair, own in found.items()}
+    return {pair: _ledger_from(own, path, read_poses(own, "")) for pair, own in found.items()}
 
 
 def _ledger_from(table: pa.Table, path: Path | str, match_from_query: Floats) -> Closures:
@@ -343,7 +342,7 @@ def read_edges(path: Path, world_from_body: Floats) -> tuple[PoseGraph, Floats, 
         kind = [EdgeKind(text) for text in table["kind"].to_pylist()]
     except ValueError as error:
         raise ResultError(f"{path}: {error}. Kinds: {', '.join(EdgeKind)}.") from None
-    graph = PoseGraph(world_from_body, a, b, _poses(table, ""), _matrices(table, "information"), kind)
+    graph = PoseGraph(world_from_body, a, b, read_poses(table, ""), _matrices(table, "information"), kind)
     return graph, _values(table, "weight"), _values(table, "residual")
 
 
@@ -361,7 +360,7 @@ def read_trajectory(path: Path) -> tuple[Trajectory, Odometry]:
     """The optimised trajectory and the odometry it corrects (its covariance is not in the file)."""
     table = _read(path, "trajectory", TRAJECTORY)
     stamp_ns = _values(table, "stamp_ns")
-    return Trajectory(stamp_ns, _poses(table, "")), Odometry(stamp_ns, _poses(table, "odom_"), None)
+    return Trajectory(stamp_ns, read_poses(table, "")), Odometry(stamp_ns, read_poses(table, "odom_"), None)
 
 
 def write_descriptors(
@@ -389,7 +388,7 @@ def write_descriptors(
 
 
 def _regrouped(batches: Iterable[pa.Array], size: int) -> Iterator[pa.Array]:
-    """The same values in arrays of `size`, the last one shorter."""
+    """The values in arrays of `size`, the last one shorter."""
     waiting: list[pa.Array] = []
     count = 0
     for batch in batches:
@@ -414,42 +413,32 @@ def _own(array: pa.Array) -> pa.Array:
 
 def read_descriptors(path: Path) -> tuple[pa.Array, str]:
     """The descriptors in the order of the keyframes, and the hash of the library they belong to."""
-    try:
-        with open_table(path) as file:
-            _check_name(path, "descriptors", file.schema_arrow)
-            table = read_table(path, file, ["descriptor"])
+    with _reading(path), open_table(path) as file:
+        _check_name(path, "descriptors", file.schema_arrow)
+        table = read_table(path, file, ["descriptor"])
         return table["descriptor"].combine_chunks(), (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
 
 
 def read_stamps(path: Path) -> Ints:
     """Stamps (N,) of the rows of a table of descriptors, in ns. Raises ResultError."""
-    try:
-        with open_table(path) as file:
-            column = read_table(path, file, ["stamp_ns"])["stamp_ns"]
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
-    if column.type != pa.int64() or column.null_count:
+    with _reading(path), open_table(path) as file:
+        stamp_ns = read_table(path, file, ["stamp_ns"])["stamp_ns"]
+    if stamp_ns.type != pa.int64() or stamp_ns.null_count:
         raise ResultError(f"{path} has stamps that are no whole numbers of nanoseconds, so it is damaged.")
-    return np.asarray(column.to_numpy(), np.int64)
+    return np.asarray(stamp_ns.to_numpy(), np.int64)
 
 
 def descriptors_type(path: Path) -> pa.DataType:
     """The recogniser's own type of a table of descriptors, of which the footer alone is read. Raises ResultError."""
-    try:
+    with _reading(path):
         return read_schema(path).field("descriptor").type
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
-    try:
+    with _reading(path):
         header = read_schema(path).metadata or {}
         return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
 
 
 def _write(path: Path, name: str, schema: pa.Schema, columns: dict[str, Any], metadata: TableMetadata) -> None:
@@ -468,7 +457,7 @@ def _write_table(path: Path, name: str, table: pa.Table, metadata: TableMetadata
 
 def _array(values: Any, column: pa.Field) -> pa.Array:
     """The values of a column; NaN is null where the column may be null."""
-    if column.type in (_NUMBERS, _SHARES):
+    if column.type in (_NUMBERS, FLOAT32_LIST):
         offsets = np.cumsum([0, *map(len, values)], dtype=np.int32)
         flat = pa.array(np.concatenate([*values, np.empty(0)]), column.type.value_type)
         return pa.ListArray.from_arrays(offsets, flat, type=column.type)
@@ -485,16 +474,13 @@ def _with_metadata(schema: pa.Schema, name: str, metadata: TableMetadata) -> pa.
 
 def _read(path: Path, name: str, schema: pa.Schema) -> pa.Table:
     """The table with the columns of the schema, checked; null where an older vplog wrote none. Raises ResultError."""
-    try:
-        with open_table(path) as file:
-            _check_name(path, name, file.schema_arrow)
-            check_columns(file.schema_arrow, schema)
-            table = filled(read_table(path, file, schema.names), schema)
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
-    for column in schema:
-        if not column.nullable and table[column.name].null_count:
-            raise ResultError(f"{path} holds nulls in column {column.name}. Run `vplog run` again.")
+    with _reading(path), open_table(path) as file:
+        _check_name(path, name, file.schema_arrow)
+        check_columns(file.schema_arrow, schema)
+        table = filled(read_table(path, file, schema.names), schema)
+    for field in schema:
+        if not field.nullable and table[field.name].null_count:
+            raise ResultError(f"{path} holds nulls in column {field.name}. Run `vplog run` again.")
     return table
 
 
@@ -504,22 +490,30 @@ def _check_name(path: Path, name: str, schema: pa.Schema) -> None:
         raise ResultError(f"{path} is not a {name} table of vplog (it says {found!r}). Give the folder of a run.")
 
 
-def _unreadable(path: Path, error: Exception) -> ResultError:
-    if isinstance(error, FileNotFoundError):
-        return ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.")
-    why = next(iter(str(error).splitlines()), type(error).__name__)
-    return ResultError(f"{path} cannot be read: {why} Run `vplog run` again.")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raises ResultError in place of the errors of a missing or damaged table."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.") from None
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        why = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
+
+
+_POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
-    names = [f"{prefix}{name}" for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
+    names = [f"{prefix}{name}" for name in _POSE_COLUMNS]
     values = np.concatenate([poses[:, :3, 3], se3.quaternion(poses[:, :3, :3])], axis=1)
     return dict(zip(names, np.ascontiguousarray(values.T), strict=True))
 
 
-def _poses(table: pa.Table, prefix: str) -> Floats:
+def read_poses(table: pa.Table, prefix: str) -> Floats:
     """(R, 4, 4), all NaN where the row holds none."""
-    values = np.stack([_values(table, f"{prefix}{name}") for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")], 1)
+    values = np.stack([_values(table, f"{prefix}{name}") for name in _POSE_COLUMNS], 1)
     poses = se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
     poses[~np.isfinite(poses).all((1, 2))] = np.nan
     return poses

@@ -52,7 +52,7 @@ def find_candidates(
 ) -> Proposals:
     """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
     index, stops = state.index(descriptors), candidate_stops(keyframes, settings)
-    return propose(rank_places(index, descriptors, stops, settings.asked, sequence, execution.threads), settings)
+    return propose(rank_places(index, descriptors, stops, settings.ranked, sequence, execution.threads), settings)
 
 
 def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:

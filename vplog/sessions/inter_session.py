@@ -59,7 +59,7 @@ def proposed_in(
     """The candidates of the places `later` among those of one drive."""
     stops = np.full(len(later), len(earlier), np.int64)
     index = index_of_part(state, earlier)
-    ranked = rank_places(index, later, stops, pipeline.propose.asked, pipeline.sequence, threads)
+    ranked = rank_places(index, later, stops, pipeline.propose.ranked, pipeline.sequence, threads)
     return propose(ranked, pipeline.propose)
 
 

@@ -51,7 +51,7 @@ class Evaluation:
     """A run of one drive against a file of poses."""
 
     record: dict[str, Any]
-    """As `evaluate` gives it."""
+    """The record that `evaluate` returns."""
     keyframes: Keyframes
     truth: BodyTruth
     judged: closures.Judgement
@@ -84,7 +84,7 @@ def evaluate_poses(
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
-    settings = _recorded(record, folder, dict, "settings", "propose")
+    settings = run_record.recorded(record, folder / "run.json", dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
     camera = _camera(folder)
     of_body = body_truth(known, before, camera)
@@ -134,8 +134,8 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     drives: dict[str, Evaluation] = {}
     uncovered: dict[str, str] = {}
     maps = []
-    for found in _recorded(record, folder, list, "maps"):
-        names = _recorded(found, folder, list, "drives")
+    for found in run_record.recorded(record, folder / "run.json", list, "maps"):
+        names = run_record.recorded(found, folder / "run.json", list, "drives")
         if not all(map(is_below, names)):
             raise ResultError(f"{folder}/run.json names drives outside its folder. Run `vplog run` again.")
         for name in names:
@@ -172,15 +172,6 @@ def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCri
             counts = closures.count_closures(ledger, judged, place)
             found.append({"query_drive": later, "match_drive": earlier, **counts})
     return found
-
-
-def _recorded(record: Any, folder: Path, kind: type, *names: str) -> Any:
-    """What run.json holds under these names. Raises ResultError where that is not of the kind, or not there."""
-    for name in names:
-        record = record.get(name) if isinstance(record, dict) else None
-    if not isinstance(record, kind):
-        raise ResultError(f"{folder}/run.json lacks {'.'.join(names)}. Compute it again with `vplog run`.")
-    return record
 
 
 def _against_gps(

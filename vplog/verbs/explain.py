@@ -44,7 +44,7 @@ def explain(
     record = run_record.read_single_run(folder)
     if picture is not None and picture.suffix not in (".png", ".svg"):
         raise ResultError(f"{picture} is neither a .png nor a .svg. Name one with -o.")
-    _part(record, folder, "settings")
+    run_record.recorded(record, folder / "run.json", dict, "settings")
     pipeline = recorded_pipeline(folder, record)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     path = folder / "closures.parquet"
@@ -52,7 +52,7 @@ def explain(
     number = choose(closures, keyframes)
     row = tables.read_closure(path, number)
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
-    reason = str(_part(record, folder, "solution").get("reason", ""))
+    reason = str(run_record.recorded(record, folder / "run.json", dict, "solution").get("reason", ""))
     words = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
     shown = None
     if not words_only:
@@ -93,12 +93,6 @@ def worst(closures: Closures, _keyframes: Keyframes) -> int:
     if not np.isfinite(closures.residual_after).any():
         raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
     return int(np.nanargmax(closures.residual_after))
-
-
-def _part(record: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
-    if not isinstance(record.get(name), dict):
-        raise ResultError(f"{folder}/run.json lacks {name}. Run `vplog run` again.")
-    return record[name]
 
 
 def _show(

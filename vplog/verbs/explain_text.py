@@ -12,8 +12,6 @@ from vplog.data import Verdict
 from vplog.geometry import se3 as geometry
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vplog.data import Floats, Keyframes
     from vplog.pipeline import Pipeline
 
@@ -56,7 +54,7 @@ def describe(
         _proposed(row, keyframes, siblings),
         _geometry(row),
         _solver(row, keyframes, world_from_body, reason),
-        _CHANGES[verdict](row, pipeline),
+        _change(row, pipeline),
     )
 
 
@@ -143,119 +141,55 @@ def _count(number: int, name: str, plural: str = "s") -> str:
     return f"{number or 'no'} {name}{plural if number != 1 else ''}"
 
 
-def _accepted(row: Row, pipeline: Pipeline) -> str:
-    metric = pipeline.verify.metric
-    needed = _needed(row, pipeline)
-    return (
-        f"It would be rejected with fewer than {needed} inliers, if they covered less than "
-        f"{100 * metric.min_spread:.0f} % of the image, or if the robust solve found it at odds with the rest."
+def _change(row: Row, pipeline: Pipeline) -> str:
+    """What would change the verdict."""
+    verdict, verify = Verdict(row["verdict"]), pipeline.verify
+    metric = bool(row["landmarks"])
+    needed = verify.epipolar.min_inliers
+    if metric:
+        needed = max(verify.metric.min_inliers, int(np.ceil(verify.metric.min_share * row["landmarks"])))
+    name = verdict.value
+    if verdict is Verdict.TOO_FEW_INLIERS and row["inliers"] >= needed:
+        name = "by_chance"
+    return _CHANGES[name].format(
+        **row,
+        verify=verify,
+        kind="metric" if metric else "epipolar",
+        compared=row["landmarks"] or row["matches"],
+        needed=needed,
+        share=", min_share" if metric else "",
+        spread_percent=100 * (verify.metric if metric else verify.epipolar).min_spread,
+        metric_percent=100 * verify.metric.min_spread,
     )
 
 
-def _too_few_matches(row: Row, pipeline: Pipeline) -> str:
-    needed, ratio = pipeline.verify.min_matches, pipeline.verify.matching.ratio
-    return (
-        f"{needed} matches are needed (verify.min_matches), or their part among the strongest "
-        f"{pipeline.verify.matching.first_look} features. --set verify.min_matches={row['matches']}, or a "
-        f"verify.matching.ratio above {ratio:g}, would verify it, and many false candidates with it."
-    )
-
-
-def _too_few_landmarks(row: Row, pipeline: Pipeline) -> str:
-    return (
-        f"{pipeline.verify.metric.min_inliers} matches with a position are needed (verify.metric.min_inliers). Depth "
-        f"images, or more sideways motion around keyframe {row['match']}, would give more of them one."
-    )
-
-
-def _too_few_inliers(row: Row, pipeline: Pipeline) -> str:
-    needed = _needed(row, pipeline)
-    settings = "verify.metric" if row["landmarks"] else "verify.epipolar"
-    if row["inliers"] >= needed:
-        return (
-            f"Enough agree, {needed} being needed, but so many of {row['landmarks'] or row['matches']} may do so by "
-            f"chance ({settings}.log10_false_alarms)."
-        )
-    share = ", min_share" if row["landmarks"] else ""
-    return f"{needed} inliers are needed ({settings}.min_inliers{share}), and {row['inliers']} were found."
-
-
-def _needed(row: Row, pipeline: Pipeline) -> int:
-    """Inliers that a pose, or without calibration an epipolar geometry, has to have."""
-    if not row["landmarks"]:
-        return pipeline.verify.epipolar.min_inliers
-    metric = pipeline.verify.metric
-    return max(metric.min_inliers, int(np.ceil(metric.min_share * row["landmarks"])))
-
-
-def _poor_spread(row: Row, pipeline: Pipeline) -> str:
-    name = "metric" if row["landmarks"] else "epipolar"
-    needed = getattr(pipeline.verify, name).min_spread
-    return (
-        f"{100 * needed:.0f} % of the image must be covered (verify.{name}.min_spread): less is one object, such as a "
-        "sign or a parked car, that may stand anywhere."
-    )
-
-
-def _degenerate(row: Row, _: Pipeline) -> str:
-    return (
-        f"Depth images, or frames around keyframe {row['match']} that move sideways, would give its features positions."
-    )
-
-
-def _no_calibration(_: Row, pipeline: Pipeline) -> str:
-    return (
-        f"Record the camera's camera_info, or name it with --camera-info-topic: then a pose with "
-        f"{pipeline.verify.metric.min_inliers} inliers would make it a closure."
-    )
-
-
-def _implausible(_: Row, pipeline: Pipeline) -> str:
-    return (
-        f"The distance may be {pipeline.verify.metric.max_depths:g} of the inliers' median depth "
-        "(verify.metric.max_depths); beyond it two views hardly share what they see."
-    )
-
-
-def _too_far(_: Row, pipeline: Pipeline) -> str:
-    return (
-        f"Up to {pipeline.verify.metric.max_distance_m:g} m are taken (verify.metric.max_distance_m). Nearer "
-        "keyframes of the same pass have a smaller error; see the other candidates of this keyframe."
-    )
-
-
-def _inconsistent(row: Row, _: Pipeline) -> str:
-    return (
-        "Both ways must give one pose. Where they do not, the scene repeats itself, or too little of it is seen "
-        f"from both; see the other candidates of keyframe {row['query']}. --set verify.both_ways=false checks one "
-        "way."
-    )
-
-
-def _by_solver(row: Row, _: Pipeline) -> str:
-    return (
-        "It would be kept if the odometry or other closures agreed with it. Where it is right, the odometry's "
-        "noise is set too small or the neighbouring closures are false: look at the candidates around keyframe "
-        f"{row['query']} with a weight of 1, and at the noise settings (`noise`)."
-    )
-
-
-def _direction_only(row: Row, _: Pipeline) -> str:
-    return "Metres would need landmarks: keyframes around the match that moved further, a depth image or a stereo pair."
-
-
-_CHANGES: dict[Verdict, Callable[[Row, Pipeline], str]] = {
-    Verdict.ACCEPTED: _accepted,
-    Verdict.TOO_FEW_MATCHES: _too_few_matches,
-    Verdict.TOO_FEW_LANDMARKS: _too_few_landmarks,
-    Verdict.TOO_FEW_INLIERS: _too_few_inliers,
-    Verdict.POOR_SPREAD: _poor_spread,
-    Verdict.DEGENERATE_MOTION: _degenerate,
-    Verdict.NO_CALIBRATION: _no_calibration,
-    Verdict.IMPLAUSIBLE_POSE: _implausible,
-    Verdict.TOO_FAR: _too_far,
-    Verdict.INCONSISTENT: _inconsistent,
-    Verdict.DIRECTION_ONLY: _direction_only,
-    Verdict.REJECTED_BY_SOLVER: _by_solver,
+_CHANGES = {
+    "accepted": "It would be rejected with fewer than {needed} inliers, if they covered less than "
+    "{metric_percent:.0f} % of the image, or if the robust solve found it at odds with the rest.",
+    "too_few_matches": "{verify.min_matches} matches are needed (verify.min_matches), or their part among the "
+    "strongest {verify.matching.first_look} features. --set verify.min_matches={matches}, or a "
+    "verify.matching.ratio above {verify.matching.ratio:g}, would verify it, and many false candidates with it.",
+    "too_few_landmarks": "{verify.metric.min_inliers} matches with a position are needed (verify.metric.min_inliers). "
+    "Depth images, or more sideways motion around keyframe {match}, would give more of them one.",
+    "too_few_inliers": "{needed} inliers are needed (verify.{kind}.min_inliers{share}), and {inliers} were found.",
+    "by_chance": "Enough agree, {needed} being needed, but so many of {compared} may do so by chance "
+    "(verify.{kind}.log10_false_alarms).",
+    "poor_spread": "{spread_percent:.0f} % of the image must be covered (verify.{kind}.min_spread): less is one "
+    "object, such as a sign or a parked car, that may stand anywhere.",
+    "degenerate_motion": "Depth images, or frames around keyframe {match} that move sideways, would give its features "
+    "positions.",
+    "no_calibration": "Record the camera's camera_info, or name it with --camera-info-topic: then a pose with "
+    "{verify.metric.min_inliers} inliers would make it a closure.",
+    "implausible_pose": "The distance may be {verify.metric.max_depths:g} of the inliers' median depth "
+    "(verify.metric.max_depths); beyond it two views hardly share what they see.",
+    "too_far": "Up to {verify.metric.max_distance_m:g} m are taken (verify.metric.max_distance_m). Nearer keyframes of "
+    "the same pass have a smaller error; see the other candidates of this keyframe.",
+    "inconsistent": "Both ways must give one pose. Where they do not, the scene repeats itself, or too little of it is "
+    "seen from both; see the other candidates of keyframe {query}. --set verify.both_ways=false checks one way.",
+    "rejected_by_solver": "It would be kept if the odometry or other closures agreed with it. Where it is right, the "
+    "odometry's noise is set too small or the neighbouring closures are false: look at the candidates around keyframe "
+    "{query} with a weight of 1, and at the noise settings (`noise`).",
+    "direction_only": "Metres would need landmarks: keyframes around the match that moved further, a depth image or a "
+    "stereo pair.",
 }
-"""What would change each verdict."""
+"""What would change each verdict; `by_chance` where enough inliers for a pose may agree by chance."""

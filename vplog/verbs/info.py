@@ -100,8 +100,8 @@ def _look(path: Path, topics: TopicChoice) -> Preflight:
     keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
-    for topic, told in zip(found.topics, named["topics"], strict=True):
-        told["why"] = _why(topic, found, topics)
+    for topic, entry in zip(found.topics, named["topics"], strict=True):
+        entry["why"] = _why(topic, found, topics)
     record = {
         **named,
         "camera": None if camera is None else _about_camera(camera),
@@ -189,8 +189,8 @@ def _keyframes(
 def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
     """Why a topic is used or not, in a sentence."""
     if topic.used:
-        asked = {str(value) for name, value in topics if value and not name.endswith("_file")}
-        return f"used as {_PART_WORDS[topic.part]}" + (", as asked for" if topic.name in asked else "")
+        chosen = {str(value) for name, value in topics if value and not name.endswith("_file")}
+        return f"used as {_PART_WORDS[topic.part]}" + (", as asked for" if topic.name in chosen else "")
     if not topic.count:
         return "no messages"
     if not topic.role:
@@ -226,16 +226,9 @@ def _timing(stamp_ns: Ints) -> dict[str, Any]:
 
 
 def _about_camera(camera: Camera) -> dict[str, Any]:
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "matrix": None if camera.matrix is None else camera.matrix.tolist(),
-        "distortion_model": camera.distortion_model,
-        "distortion": camera.distortion.tolist(),
-        "body_from_camera": camera.body_from_camera.tolist(),
-        "baseline_m": camera.baseline_m,
-    }
+    names = ["name", "width", "height", "matrix", "distortion_model", "distortion", "body_from_camera", "baseline_m"]
+    values = {name: getattr(camera, name) for name in names}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
 def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoice) -> dict[str, Any] | None:

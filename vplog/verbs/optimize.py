@@ -60,13 +60,13 @@ def _about_parts(part: Ints, ids: Ints) -> list[str]:
     size = np.bincount(part)
     first = [str(ids[np.argmax(part == number)]) for number in np.flatnonzero(size > 1)[:5].tolist()]
     alone = int((size == 1).sum())
-    said = [f"{alone} poses have no edge and stay where they are."] if alone else []
+    warnings = [f"{alone} poses have no edge and stay where they are."] if alone else []
     if (size > 1).sum() > 1:
-        said.append(
+        warnings.append(
             f"The graph has {int((size > 1).sum())} unconnected parts (from {', '.join(first)} "
             f"on{', ..' if (size > 1).sum() > 5 else ''}); each is solved by itself with its first pose fixed."
         )
-    return said
+    return warnings
 
 
 def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints) -> tuple[Solution, list[str]]:

@@ -1,4 +1,4 @@
-"""Going on with a run that was killed: what was asked for and what was done are in its cache."""
+"""The request of an unfinished run, read from its cache, for `vplog run --resume`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vplog.cache.stage_cache import inputs_of, key_of
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.pipeline import Pipeline
 from vplog.results import run_record
-from vplog.results.run_record import CACHE, REQUEST
+from vplog.results.run_record import CACHE, REQUEST, recorded
 from vplog.results.staging import recover
 from vplog.run.provenance import OWN_LIBRARY, stat_of, stored_log
 from vplog.storage.folders import check_regular
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a run was asked for."""
+class ResumeRequest:
+    """The logs and options of a run."""
 
     logs: list[Path]
     """The parts of one recording, or the drives of one map."""
@@ -35,8 +35,8 @@ class Asked:
     topics: logs.TopicChoice
 
 
-def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
-    """What the unfinished run in `out` was asked for; logs `given` must be its logs.
+def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
+    """The request of the unfinished run in `out`; logs `given` must be its logs.
 
     Raises ResultError where there is nothing to go on with, SettingsError where the logs are others.
     """
@@ -54,7 +54,7 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
             f"{out}/run.json lacks options of its run. Give the full command without --resume: finished stages are "
             "reused."
         )
-    known = [str(located(text).resolve()) for text in _texts(account, out)]
+    known = [str(located(text).resolve()) for text in _texts(account, file)]
     paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
     if not given:
         again = f"Give it again: vplog run --resume LOG -o {out}"
@@ -65,16 +65,14 @@ def asked_for(out: Path, given: Sequence[Path] = ()) -> Asked:
         )
     _check_unchanged(paths, account, out)
     where = str(file)
-    pipeline = Pipeline.read(_tree(account, "settings", out), where)
-    library = _tree(account, "library", out).get("from")
-    if not isinstance(library, str):
-        raise _lacking(out, "library.from")
-    return Asked(
+    pipeline = Pipeline.read(recorded(account, file, dict, "settings"), where)
+    library = recorded(account, file, str, "library", "from")
+    return ResumeRequest(
         paths,
         "logs" in account,
         pipeline,
         None if library == OWN_LIBRARY else located(library),
-        logs.TopicChoice.read(_tree(account, "topics", out), where),
+        logs.TopicChoice.read(account["topics"], where),
     )
 
 
@@ -90,25 +88,12 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
 
 
 def _place(known: list[str], path: Path) -> int:
-    """Of a log among those of the run; behind all where it is none of them."""
+    """Row of a log among those of the run; behind all where it is none of them."""
     text = str(path.resolve())
     return known.index(text) if text in known else len(known)
 
 
-def _texts(account: dict[str, Any], out: Path) -> list[str]:
-    named = account.get("logs") or account.get("parts") or [account.get("log")]
-    paths = [path for path in named if isinstance(path, str)] if isinstance(named, list) else []
-    if not paths or len(paths) < len(named):
-        raise _lacking(out, "log")
-    return paths
-
-
-def _tree(account: dict[str, Any], name: str, out: Path) -> dict[str, Any]:
-    tree = account.get(name)
-    if not isinstance(tree, dict):
-        raise _lacking(out, name)
-    return tree
-
-
-def _lacking(out: Path, name: str) -> ResultError:
-    return ResultError(f"{out}/run.json lacks {name}. Run again without --resume.")
+def _texts(account: dict[str, Any], file: Path) -> list[str]:
+    name = next((name for name in ("logs", "parts") if account.get(name)), "log")
+    named = recorded(account, file, str if name == "log" else list, name)
+    return [recorded({name: path}, file, str, name) for path in ([named] if name == "log" else named)]

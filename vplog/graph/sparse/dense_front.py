@@ -30,7 +30,7 @@ _BY_THREAD = 4
 
 
 def eliminate_together(front: Floats, eliminated: int, workers: Workers) -> bool:
-    """As eliminate_front(), by several threads where the front is large."""
+    """`eliminate_front` by several threads where the front is large."""
     length = len(front)
     if length < SHARED or workers.count == 1:
         return eliminate_front(front, eliminated)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints
 
     Listed = tuple[Ints, Ints, Ints]
-    """As of by_supernode()."""
+    """What `by_supernode` returns."""
 
 
 class Blocks(NamedTuple):

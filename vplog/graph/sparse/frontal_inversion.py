@@ -27,7 +27,7 @@ _LEAST_SHARE = 64
 
 
 def invert_together(front: Floats, root: Floats, workers: Workers) -> None:
-    """As invert_front(), by several threads where the front is large."""
+    """`invert_front` by several threads where the front is large."""
     wide, length = root.shape
     if length < SHARED or workers.count == 1:
         invert_front(front, root)
@@ -92,7 +92,7 @@ def _within(front: Floats, root: Floats, begun: int, end: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _gained(root: Floats, begun: int, end: int, gain: Floats) -> None:
-    """Rows begun:end of R by its block there, from column `end` on: what these are told by all after them."""
+    """Rows begun:end of R by its block there, from column `end` on: their gain on all after them."""
     length = root.shape[1]
     for k in range(end - 1, begun - 1, -1):
         line = gain[k - begun]

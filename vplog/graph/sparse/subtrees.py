@@ -23,13 +23,13 @@ class Subtrees:
     runs: list[tuple[int, int]]
     """First supernode and the one after the last, the run of most work first."""
     roots: list[Ints]
-    """Of each run, those of its subtrees."""
+    """Roots of the subtrees of each run."""
     after: list[Ints]
-    """Rows after each run that it has a say in."""
+    """Rows after each run that it contributes to."""
     top: list[int]
     """Supernodes above all runs, in order of elimination."""
     children: list[list[int]]
-    """Of each of the top."""
+    """Children of each supernode of the top."""
 
     @classmethod
     def of(cls, shape: Form) -> Subtrees:

@@ -44,7 +44,7 @@ class Elimination:
 
     @classmethod
     def of(cls, n: int, a: Int32s | Ints, b: Int32s | Ints) -> Elimination:
-        """Of the graph of n nodes and edges a, b (E,), by nested dissection (METIS): the same graph, the same order."""
+        """The elimination of a graph of n nodes and edges a, b (E,), by nested dissection (METIS); deterministic."""
         low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
         pairs = np.unique(low * n + high)
         low, high = pairs // n, pairs % n
@@ -65,7 +65,7 @@ class Elimination:
 
     @property
     def form(self) -> Form:
-        """The same for compiled loops."""
+        """The elimination for compiled loops."""
         return Form(self.first, self.start, self.rows, self.place, self.parent)
 
     @cached_property

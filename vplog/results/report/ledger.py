@@ -61,8 +61,7 @@ def _chosen(content: Content) -> list[int]:
     closures = content.closures
     if len(closures) <= _MOST_ROWS:
         return list(range(len(closures)))
-    taken = np.array([verdict in TAKEN for verdict in closures.verdict], bool)
-    order = np.lexsort((-closures.score.astype(np.float64), ~taken))
+    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*TAKEN)))
     return sorted(order[:_MOST_ROWS].tolist())
 
 

@@ -12,7 +12,6 @@ from vplog.results.report import TAKEN, charts
 from vplog.results.report.ledger import ledger
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Floats
     from vplog.results.report.content import Content, Judged
 
 _MOST_LOSSES = 100
@@ -87,19 +86,15 @@ def _loss(loss: dict[str, Any], content: Content) -> list[str]:
 
 def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
     """The legend and the map of the trajectory."""
-    verdicts, judged = content.closures.verdict, content.judged
-    accepted, rejected, without_metres = (
-        np.array([one == verdict for one in verdicts], bool)
-        for verdict in (Verdict.ACCEPTED, Verdict.REJECTED_BY_SOLVER, Verdict.DIRECTION_ONLY)
-    )
-    false = np.zeros(len(verdicts), bool)
+    closures, judged, position = content.closures, content.judged, content.world_from_body[:, :3, 3]
+    accepted, false = closures.of(Verdict.ACCEPTED), np.zeros(len(closures), bool)
     if judged is not None and judged.true is not None and judged.known is not None:
         false = accepted & judged.known & ~judged.true
     segments = [
-        ("yes", "accepted closures", _ends(content, accepted & ~false)),
-        ("other", "closures taken without metres", _ends(content, without_metres)),
-        ("no", "closures the solver rejected", _ends(content, rejected)),
-        ("false", "accepted closures that are false", _ends(content, false)),
+        ("yes", "accepted closures", closures.lines(position, accepted & ~false)),
+        ("other", "closures taken without metres", closures.lines(position, closures.of(Verdict.DIRECTION_ONLY))),
+        ("no", "closures the solver rejected", closures.lines(position, closures.of(Verdict.REJECTED_BY_SOLVER))),
+        ("false", "accepted closures that are false", closures.lines(position, false)),
     ]
     paths = [
         ("before", "odometry", content.before.world_from_body[:, :3, 3]),
@@ -111,12 +106,6 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
     legend = [(kind, name) for kind, name, points in (*dots, *paths, *segments) if len(points)]
     drawn = ([(kind, points) for kind, _, points in group] for group in (paths, dots, segments))
     return legend, charts.trajectory_map(*drawn)
-
-
-def _ends(content: Content, chosen: Bools) -> Floats:
-    """(S, 2, 3) positions of the match and the query of these closures (C,)."""
-    position, closures = content.world_from_body[:, :3, 3], content.closures
-    return np.stack([position[closures.match[chosen]], position[closures.query[chosen]]], axis=1)
 
 
 def _truth(judged: Judged) -> list[list[str]]:
@@ -154,7 +143,7 @@ def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     """What accepted and rejected candidates differ in, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
-    taken = np.array([verdict in TAKEN for verdict in closures.verdict], bool)
+    taken = closures.of(*TAKEN)
     shown = []
     for label, values, name, least in (
         ("score", closures.score, "", None),
