@@ -18,7 +18,6 @@ from vplog.logs.messages.records import (
     FixMessage,
     ImageMessage,
     PoseMessage,
-    TransformMessage,
 )
 from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import NONE, Stamps
@@ -140,7 +139,7 @@ class Gathered:
     poses: dict[Channel, PoseTrack]
     """Of every topic that may be the odometry."""
     fixes: FixTrack | None
-    transforms: list[TransformMessage] = field(default_factory=list)
+    transforms: list[PoseMessage] = field(default_factory=list)
     lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
     """By reason and topic."""
     waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = field(default_factory=dict)

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import GAP_NS, GAP_PERIODS, LATE_NS, LEAST_JUMP_NS, Clock, on_one_clock
+from vplog.logs.clocks import (
+    GAP_NS,
+    GAP_PERIODS,
+    LATE_NS,
+    LEAST_JUMP_NS,
+    LEAST_STEP_NS,
+    STEP_PERIODS,
+    Clock,
+    on_one_clock,
+)
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.formats.loss_account import runs_of
 
@@ -235,8 +244,12 @@ def _note_gaps(topic: str, stamp_ns: Ints, notes: Notes) -> None:
 
 def increasing(stamp_ns: Ints, what: str, notes: Notes) -> tuple[Ints, Ints]:
     """The stamps sorted, the first of equal ones kept, and the row each came from; sorting is noted."""
-    if late := int((np.diff(stamp_ns) < 0).sum()):
-        notes.add(f"{what}: {plural(late, 'stamp')} out of order; sorted.")
+    step = np.diff(stamp_ns)
+    if late := int((step < 0).sum()):
+        back_ns = -int(step.min())
+        far = back_ns > max(LEAST_STEP_NS, STEP_PERIODS * float(np.median(np.abs(step))))
+        how = f"by up to {back_ns / 1e9:.3f} s (late, or was a clock changed?); sorted." if far else "; sorted."
+        notes.add(f"{what}: {plural(late, 'stamp')} out of order{' ' * far}{how}")
     order = np.argsort(stamp_ns, kind="stable")
     ordered = stamp_ns[order]
     first = np.ones(len(ordered), bool)
