@@ -85,7 +85,7 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         read.take_block(block)
     read.finish_poses()
     read.mend_steps_back(notes)
-    share_clock(read.stamps())
+    share_clock(stamps for _, stamps in read.stamps())
     found = read_sources(read, chosen)
     sources = weigh_sources(found, read.images.finish(Notes())[0])
     rates_hz = read.rates_hz()
