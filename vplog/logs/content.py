@@ -1,4 +1,4 @@
-"""The one pass over the chosen topics: motion, fixes and calibration are kept, images only by stamp and place."""
+"""The one pass over the chosen topics: motion, fixes and calibration as arrays, images by stamp and place."""
 
 from __future__ import annotations
 

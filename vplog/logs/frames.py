@@ -85,7 +85,7 @@ class RecordedFrame:
     right: Encoded | None
     pair: Pair | None
     notes: Notes
-    """Of the log: what does not decode is counted there."""
+    """Notes of the log, where what does not decode is counted."""
     calibration: CalibrationMessage | None = None
     """That of the image, where it came later and is another than the camera's."""
 

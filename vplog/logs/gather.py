@@ -48,7 +48,7 @@ class Images:
     stamps: Stamps = field(default_factory=Stamps)
     places: list[Place] = field(default_factory=list)
     stream: list[Place] = field(default_factory=list)
-    """Of all messages, the empty and damaged ones too."""
+    """Places of all messages, the empty and damaged ones too."""
     rows: list[int] = field(default_factory=list)
     """Which of `stream` the places are."""
 
@@ -117,11 +117,11 @@ class Gathered:
     calibrations: Calibrations
     right_calibrations: Calibrations
     poses: dict[Channel, PoseTrack]
-    """Of every topic that may be the odometry."""
+    """Tracks of the topics that may be the odometry."""
     fixes: FixTrack | None
     transforms: list[PoseMessage] = field(default_factory=list)
     lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
-    """By reason and topic."""
+    """Lost messages by reason and topic."""
     waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = field(default_factory=dict)
     """Messages of odometry that are still to be added, their log times and their positions."""
     messages: int = 0
@@ -149,11 +149,11 @@ class Gathered:
             if channel in self.by_channel:
                 single += mine
             elif channel in self.poses:
-                waiting = self.waiting.setdefault(channel, ([], [], []))
-                data = [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
-                for column, values in zip(waiting, (data, log_ns, positions), strict=True):
-                    column.extend(values)
-                if len(waiting[0]) >= _TOGETHER:
+                data, waiting_ns, waiting_positions = self.waiting.setdefault(channel, ([], [], []))
+                data += [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
+                waiting_ns += log_ns
+                waiting_positions += positions
+                if len(data) >= _TOGETHER:
                     self._add_poses(channel)
             else:
                 self.others.setdefault(channel, Stamps()).extend([0] * len(mine), log_ns, positions)

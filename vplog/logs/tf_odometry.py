@@ -82,7 +82,7 @@ class MovingFrames:
         return [link.first for _, link in sorted(self._links.items()) if not link.moves]
 
     def stamps(self) -> list[Stamps]:
-        """Of every link that is followed over time."""
+        """Stamps of every link that is followed over time."""
         return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
 
     def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:

@@ -86,7 +86,7 @@ class FixMessage:
     covariance: Floats
     """(3, 3) m^2 east-north-up; NaN where its type says unknown."""
     frame: str
-    """Of the antenna."""
+    """Frame of the antenna."""
 
 
 Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[PoseMessage]
