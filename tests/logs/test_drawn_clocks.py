@@ -95,3 +95,15 @@ def test_nothing_is_interleaved(still: bool) -> None:
             assert len(rows) >= 0.97 * len(true_ns), (seed, name, notes.lines)
             if "log" not in " ".join(notes.lines) and "clock" not in " ".join(notes.lines):
                 np.testing.assert_array_equal(topics[name].header_ns, true_ns)
+
+
+@pytest.mark.parametrize("back_s", [0.75, 1.05, 1.55, 2.55])
+def test_an_image_at_a_step_inside_a_gap_is_not_sorted_silently(back_s: float) -> None:
+    """The one image in a gap is on a clock that was set back; by what surrounds it, it may also be late."""
+    true_ns = START_NS + np.r_[0:100, 102, 130:230] * (SECOND // 10)
+    header_ns = true_ns - (np.arange(len(true_ns)) == 100) * int(back_s * SECOND)
+    stamps = Stamps()
+    stamps.extend(header_ns.tolist(), true_ns.tolist())
+    stamp_ns, _ = stamps.order("/camera", notes := Notes())
+    said = " ".join(notes.lines)
+    assert np.isin(stamp_ns, true_ns).all() or "clock" in said, said

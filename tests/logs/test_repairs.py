@@ -16,7 +16,7 @@ from tests.logs.drives import LATENCY_NS, Drive, foxglove_messages, ros_messages
 from vplog import logs
 from vplog.logs.cameras import body_from_camera, camera_of
 from vplog.logs.formats.container import Notes
-from vplog.logs.messages.records import CalibrationMessage, PoseMessage, TransformMessage
+from vplog.logs.messages.records import CalibrationMessage, PoseMessage
 from vplog.logs.stamps import Stamps, increasing, nearest
 from vplog.logs.static_transforms import FrameTree
 from vplog.logs.tracks import PoseTrack
@@ -127,8 +127,8 @@ def test_covariance_that_no_noise_has_is_unknown(bad: np.ndarray) -> None:
 def test_frames_chain_through_any_depth_and_both_directions() -> None:
     rng = np.random.default_rng(2)
     edges = [("base", "mast"), ("mast", "head"), ("mount", "head"), ("mount", "camera"), ("mast", "other")]
-    given_ = {e: (rng.normal(size=3), rng.normal(size=4)) for e in edges}
-    tree = FrameTree([TransformMessage(a, f"/{b}", *given_[a, b]) for a, b in edges])
+    given_ = {e: (rng.normal(size=3).tolist(), rng.normal(size=4).tolist()) for e in edges}
+    tree = FrameTree([PoseMessage(0, a, f"/{b}", *given_[a, b], None) for a, b in edges])
 
     def chain(*frames: str) -> np.ndarray:
         steps = [tree.between(a, b) for a, b in pairwise(frames)]
@@ -139,11 +139,11 @@ def test_frames_chain_through_any_depth_and_both_directions() -> None:
     np.testing.assert_allclose(chain("base", "camera"), steps, atol=1e-12)
     np.testing.assert_allclose(chain("camera", "base", "camera"), np.eye(4), atol=1e-12)
     assert tree.between("base", "nowhere") is None
-    assert FrameTree([TransformMessage("a", "b", np.zeros(3), np.zeros(4))]).dropped == 1
+    assert FrameTree([PoseMessage(0, "a", "b", np.zeros(3).tolist(), np.zeros(4).tolist(), None)]).dropped == 1
 
 
 def test_missing_chain_is_a_warning_unless_the_log_names_no_frames() -> None:
-    tree = FrameTree([TransformMessage("base_link", "lidar", np.ones(3), QUARTER)])
+    tree = FrameTree([PoseMessage(0, "base_link", "lidar", (1.0, 1.0, 1.0), QUARTER.tolist(), None)])
     for body, frame, transforms, warned in (
         ("base_link", "camera", tree, True),
         ("base_link", "camera", FrameTree([]), True),

@@ -16,9 +16,9 @@ __all__ = ["TopicChoice", "check", "open", "open_drive"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
-    """The drive at `path`, its kind told by content, its topics chosen by the rules of `select.py` or by name.
+    """The drive at `path`, its kind found by content, its topics chosen as by `topic_selection.py` or by name.
 
-    Raises LogError where there is no log, or where a topic asked for is not in it.
+    Raises LogError where there is no log, or where a topic of `topics` is not in it.
     """
     from vplog.logs.detect import open_log  # OpenCV, rosbags and mcap load here, not with the package
 

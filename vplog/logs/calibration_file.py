@@ -37,7 +37,7 @@ class CalibratedCamera:
 
     name: str
     topic: str
-    """Of its images, empty where the file does not say."""
+    """Image topic, empty where the file does not say."""
     calibration: CalibrationMessage
     from_first: Floats | None = None
     """(4, 4) this camera from the first one of the chain; None where the file has no chain."""

@@ -60,8 +60,8 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
             f"which is none of {', '.join(_COUNTS)}, so the camera is uncalibrated. Give one with --calibration."
         )
         return unknown
-    camera = replace(unknown, matrix=matrix, distortion_model=known[0], distortion=known[1])
-    return _fit(camera, calibration, notes)
+    camera = replace(unknown, distortion_model=known[0], distortion=known[1])
+    return _fit(camera, matrix, calibration, notes)
 
 
 def camera_from_image(
@@ -79,11 +79,16 @@ def camera_from_image(
         x, y = camera.width / size[0], camera.height / size[1]
         if abs(x - y) > _SAME_SHAPE * max(x, y):
             return None, False
-        found = np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2]])
+        found = resized(x, y)[:2]
     corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], np.float64)
     moved = np.abs(corners @ found.T - corners[:, :2]).max()
     same = size == (camera.width, camera.height) and moved < _SAME_PX
     return (None, True) if same else (found, False)
+
+
+def resized(x: float, y: float) -> Floats:
+    """(3, 3) from px of an image to those of it scaled by x and y: about its corner, which lies at -0.5."""
+    return np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def is_rectified(topic: str) -> bool:
@@ -105,21 +110,19 @@ def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:
     return model, coefficients
 
 
-def _fit(camera: Camera, calibration: CalibrationMessage, notes: Notes) -> Camera:
+def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes: Notes) -> Camera:
     """The camera for the size its images really have."""
     width, height = calibration.width, calibration.height
     if not (width and height) or (camera.width, camera.height) in ((width, height), (0, 0)):
         size = (camera.width or width, camera.height or height)
-        return replace(camera, width=size[0], height=size[1])
+        return replace(camera, matrix=matrix, width=size[0], height=size[1])
     x, y = camera.width / width, camera.height / height
-    seen = f"{camera.width} x {camera.height} px, its calibration {width} x {height}"
+    sizes = f"{camera.width} x {camera.height} px, its calibration {width} x {height}"
     if abs(x - y) > _SAME_SHAPE * max(x, y):
-        notes.add(f"{camera.name} is uncalibrated: its images have {seen}. Give another with --calibration.")
-        return replace(camera, matrix=None, distortion_model="none", distortion=np.zeros(0))
-    notes.add(f"The images of {camera.name} have {seen}; the matrix is scaled to the images.")
-    # Pixel centres are whole numbers, so the image starts at -0.5: scaling is about that corner.
-    scale = np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2], [0.0, 0.0, 1.0]])
-    return replace(camera, matrix=scale @ (camera.matrix if camera.matrix is not None else np.eye(3)))
+        notes.add(f"{camera.name} is uncalibrated: its images have {sizes}. Give another with --calibration.")
+        return replace(camera, distortion_model="none", distortion=np.zeros(0))
+    notes.add(f"The images of {camera.name} have {sizes}; the matrix is scaled to the images.")
+    return replace(camera, matrix=resized(x, y) @ matrix)
 
 
 def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes) -> Floats:

@@ -57,10 +57,10 @@ class Repaired:
 
     stamp_ns: Ints
     """(M,) in file order."""
-    kept: np.ndarray
+    valid: np.ndarray
     """(M,) bool, false where a stamp is far from those beside it, so that its time is not known."""
     skew_ns: int
-    """Of the clock that all are on."""
+    """Skew of the clock that all are on."""
     jumps_ns: list[int]
     """By how much the header's clock was set each time; the stamps behind are shifted back by as much."""
     log_jumps: int
@@ -107,34 +107,40 @@ def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None)
     if reference_ns is not None and len(counts) > 1:
         near = min(counts, key=lambda skew: (abs(skew - reference_ns), skew))
         chosen = near if abs(near - reference_ns) <= limit else reference_ns
-    stamp_ns, kept = header_ns.copy(), np.zeros(len(header_ns), bool)
+    stamp_ns, valid = header_ns.copy(), np.zeros(len(header_ns), bool)
     for number, run in enumerate(runs):
         skew = _skew_of(int(np.median(log_ns[run] - header_ns[run])), clocks, number, limit)
         if skew is not None:
             shifted = [int(extreme) + skew - chosen for extreme in (header_ns[run].min(), header_ns[run].max())]
-            kept[run] = min(shifted) >= 0 and max(shifted) < 2**63
-            stamp_ns[run] += skew - chosen if kept[run.start] else 0
+            valid[run] = min(shifted) >= 0 and max(shifted) < 2**63
+            stamp_ns[run] += skew - chosen if valid[run.start] else 0
     order = [clock for clock in clocks if clock is not None]
     jumps = [before - behind for before, behind in pairwise(order) if before != behind]
     log_jumps = _log_jumps(header_ns, log_ns, jump_ns)
-    return Repaired(stamp_ns, kept, chosen, jumps, log_jumps, found.unclear, counts)
+    return Repaired(stamp_ns, valid, chosen, jumps, log_jumps, found.unclear, counts)
+
+
+def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], set[int]]:
+    """Messages between steps of the headers by `least_ns` or more that the log times do not take, and steps back; and
+    the first message of each run that follows a gap."""
+    step, log_step = np.diff(header_ns), np.diff(log_ns)
+    size = np.abs(step - log_step)
+    usual, log_usual = (float(np.median(one[one > 0])) if (one > 0).any() else 0.0 for one in (step, log_step))
+    rows = np.flatnonzero((size > least_ns) & ((step < 0) | (2 * np.abs(step - usual) >= size))) + 1
+    gaps = rows[(step[rows - 1] >= 0) & (2 * np.abs(log_step - log_usual) > size)[rows - 1]]
+    return [slice(a, b) for a, b in pairwise([0, *rows.tolist(), len(header_ns)])], set(gaps.tolist())
 
 
 def _levels(header_ns: Ints, log_ns: Ints, least_ns: float) -> _Levels | None:
     """The runs and clocks with steps of `least_ns` or more; None where these leave the skew at no level.
 
-    A run ends where the headers step otherwise than the log times do, or go back. Its clock is another than that of
-    the run before where the skew stays at another level, by more than it varies: late messages and bursts come back.
+    The clock of a run is another than that of the run before where the skew stays at another level, by more than it
+    varies: late messages and bursts come back.
     """
-    step, log_step, skew = np.diff(header_ns), np.diff(log_ns), log_ns - header_ns
-    size = np.abs(step - log_step)
-    usual, log_usual = (float(np.median(one[one > 0])) if (one > 0).any() else 0.0 for one in (step, log_step))
-    rows = np.flatnonzero((size > least_ns) & ((step < 0) | (2 * np.abs(step - usual) >= size))) + 1
-    gaps = set(rows[(step[rows - 1] >= 0) & (2 * np.abs(log_step - log_usual) > size)[rows - 1]].tolist())
-    runs = [slice(a, b) for a, b in pairwise([0, *rows.tolist(), len(header_ns)])]
-    least = min(_LEAST_RUN, max(run.stop - run.start for run in runs))
-    short = sum(run.stop - run.start for run in runs if run.stop - run.start < least)
-    if least_ns < LEAST_JUMP_NS and short * _SHORT > len(skew):
+    runs, gaps = _runs(header_ns, log_ns, least_ns)
+    skew, lengths = log_ns - header_ns, [run.stop - run.start for run in runs]
+    least = min(_LEAST_RUN, max(lengths))
+    if least_ns < LEAST_JUMP_NS and sum(length for length in lengths if length < least) * _SHORT > len(skew):
         return None
     levels: list[list[Ints]] = []
     sizes, unclear = [2 * max(LEAST_JUMP_NS, least_ns)], []
@@ -155,12 +161,12 @@ def _levels(header_ns: Ints, log_ns: Ints, least_ns: float) -> _Levels | None:
             return None
         levels[-1].append(own)
         place.append(len(levels) - 1)
-        if len(levels) > _MOST_CLOCKS:
-            return None
+    if len(levels) > _MOST_CLOCKS:
+        return None
     clocks: list[int] = []
     for level in levels:
-        of_level = int(np.median(np.concatenate(level)))
-        clocks.append(next((known for known in clocks if abs(known - of_level) <= least_ns), of_level))
+        median = int(np.median(np.concatenate(level)))
+        clocks.append(next((known for known in clocks if abs(known - median) <= least_ns), median))
     return _Levels(runs, [None if one is None else clocks[one] for one in place], min(sizes) / 2, unclear)
 
 

@@ -1,4 +1,4 @@
-"""The one pass over the chosen topics: motion, fixes and calibration are kept, images only by stamp and place."""
+"""The one pass over the chosen topics: motion, fixes and calibration as arrays, images by stamp and place."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         read.take_block(block)
     read.finish_poses()
     read.mend_steps_back(notes)
-    share_clock(read.stamps())
+    share_clock(stamps for _, stamps in read.stamps())
     found = read_sources(read, chosen)
     sources = weigh_sources(found, read.images.finish(Notes())[0])
     rates_hz = read.rates_hz()

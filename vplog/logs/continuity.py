@@ -59,7 +59,7 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
 
 
 def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
-    """The odometry with its motion continued over each jump as it was before; stray poses are left out. Both is said.
+    """The odometry with its motion continued over each jump as it was before; stray poses are left out. Both is noted.
 
     What follows a jump is moved as one piece, so every other step stays as logged. The covariance of the pose behind a
     jump becomes unknown.
@@ -98,7 +98,7 @@ def _departure(steps: Floats, seconds: Floats) -> Floats:
 
 
 def _usual(values: Floats) -> float:
-    """What nine tenths of the values stay below, zeros left out: a robot that stands has no say."""
+    """What nine tenths of the values stay below, zeros left out: a robot that stands does not count."""
     moving = values[values > 0]
     return float(np.quantile(moving, 0.9)) if len(moving) else 0.0
 
@@ -108,11 +108,11 @@ def _stray(stamp_ns: Ints, poses: Floats, rows: Ints) -> np.ndarray:
     stray = np.zeros(len(stamp_ns), bool)
     for a, b in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
         if b - a < _BESIDE and not stray[a]:
-            kept = np.ones(len(stamp_ns), bool)
-            kept[a + 1 : b + 1] = False
+            rest = np.ones(len(stamp_ns), bool)
+            rest[a + 1 : b + 1] = False
             near = slice(max(a - _LEAST, 0), b + _LEAST)
-            kept_near = kept[near]
-            jumps = find_jumps(stamp_ns[near][kept_near], poses[near][kept_near])
+            rest_near = rest[near]
+            jumps = find_jumps(stamp_ns[near][rest_near], poses[near][rest_near])
             stray[a + 1 : b + 1] = a - near.start not in jumps
     return stray
 

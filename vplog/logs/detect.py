@@ -1,4 +1,4 @@
-"""The kind of a log, told by magic bytes and by what is in a folder; names only order the files of one bag."""
+"""The kind of a log, by magic bytes and by what is in a folder; names only order the files of one bag."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def open_log(path: Path, choice: TopicChoice) -> Log:
 
 
 def check_log(path: Path) -> None:
-    """Raises LogError where there is nothing that could be a log, told by the first bytes of files."""
+    """Raises LogError where there is nothing that could be a log, by the first bytes of files."""
     path = located(path)
     try:
         _check_there(path)
@@ -89,15 +89,15 @@ def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
 
 def _recorded(path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice) -> RecordedLog:
     log = RecordedLog(path, name, kind, container, notes, choice)
-    if (said := notes.account.sentences) and not container.contents().messages:
-        raise LogError(f"{path}: nothing in it can be read. {said[0]}")
+    if (losses := notes.account.sentences) and not container.contents().messages:
+        raise LogError(f"{path}: nothing in it can be read. {losses[0]}")
     return log
 
 
 def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container, str]:
     """The messages of one file, unpacked first where it is compressed as a whole, and its kind. Raises LogError.
 
-    `name` is what the file is called where something is said of it, its own name where empty.
+    `name` is what the file is called in notes, its own name where empty.
     """
     kind, inside = _magic(path), path
     with ExitStack() as copies:

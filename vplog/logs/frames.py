@@ -13,7 +13,6 @@ from vplog.data import Frame
 from vplog.errors import LogError
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.image_views import read_image
 from vplog.logs.messages.pixels import depth_m, grey
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 
@@ -28,11 +27,8 @@ if TYPE_CHECKING:
 
 
 def image_in(channel: Channel, data: Octets) -> ImageMessage:
-    """The image of a message, its pixels or file a view of it. Raises BadMessageError.
-
-    What this takes, other threads wait for: the interpreter is one.
-    """
-    message = read_image(channel, data, copy=False) or decode(channel, data)
+    """The image of a message. Raises BadMessageError."""
+    message = decode(channel, data)
     if not isinstance(message, ImageMessage):
         raise BadMessageError("it is not an image message")
     return message
@@ -89,7 +85,7 @@ class RecordedFrame:
     right: Encoded | None
     pair: Pair | None
     notes: Notes
-    """Of the log: what does not decode is counted there."""
+    """Notes of the log, where what does not decode is counted."""
     calibration: CalibrationMessage | None = None
     """That of the image, where it came later and is another than the camera's."""
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.formats.container import Message, plural
+from vplog.logs.formats.container import Block, plural
 from vplog.logs.formats.loss_account import Runs
 from vplog.logs.messages.decode import decode, stamp_of
 from vplog.logs.messages.odometry import read_poses
@@ -18,7 +18,6 @@ from vplog.logs.messages.records import (
     FixMessage,
     ImageMessage,
     PoseMessage,
-    TransformMessage,
 )
 from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import NONE, Stamps
@@ -26,7 +25,7 @@ from vplog.logs.tf_odometry import MovingFrames
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.formats.container import Block, Channel, Notes, Octets, Place
+    from vplog.logs.formats.container import Channel, Message, Notes, Octets, Place
     from vplog.logs.tracks import FixTrack, PoseTrack
 
 _SMALL = 512
@@ -41,12 +40,6 @@ class _EmptyImageError(BadMessageError):
     """An image message without an image: cameras that lose a frame may log one."""
 
 
-def _is_empty(message: Message) -> bool:
-    """Raises BadMessageError."""
-    record = decode(message.channel, message.data) if message.data else None
-    return record is None or (isinstance(record, ImageMessage) and not record.data)
-
-
 @dataclass
 class Images:
     """Stamps and places of one image topic."""
@@ -55,36 +48,22 @@ class Images:
     stamps: Stamps = field(default_factory=Stamps)
     places: list[Place] = field(default_factory=list)
     stream: list[Place] = field(default_factory=list)
-    """Of all messages, the empty and damaged ones too."""
+    """Places of all messages, the empty and damaged ones too."""
     rows: list[int] = field(default_factory=list)
     """Which of `stream` the places are."""
 
-    def add(self, message: Message, position: int) -> None:
-        """Raises BadMessageError."""
-        self.stream.append(message.place)
-        if len(message.data) < _SMALL and _is_empty(message):
-            raise _EmptyImageError
-        self.stamps.add(stamp_of(message.channel, message.data), message.log_ns, position)
-        self.places.append(message.place)
+    def add(self, block: Block, row: int, position: int) -> None:
+        """Add a message of a block. Raises BadMessageError."""
+        start, stop = block.starts[row], block.stops[row]
+        self.stream.append(block.places[row])
+        if stop - start < _SMALL:
+            record = decode(block.channels[row], block.data[start:stop]) if stop > start else None
+            if record is None or (isinstance(record, ImageMessage) and not record.data):
+                raise _EmptyImageError
+        stamp_ns = stamp_of(block.channels[row], memoryview(block.data)[start:stop])
+        self.stamps.add(stamp_ns, block.log_ns[row], position)
+        self.places.append(block.places[row])
         self.rows.append(len(self.stream) - 1)
-
-    def add_block(self, block: Block, rows: list[int], position: int) -> bool:
-        """Add these messages of a block, where each is one with an image and a stamp; else none."""
-        view, stamps = memoryview(block.data), []
-        try:
-            for row in rows:
-                start, stop = block.starts[row], block.stops[row]
-                if stop - start < _SMALL:
-                    return False
-                stamps.append(stamp_of(block.channels[row], view[start:stop]))
-        except BadMessageError:
-            return False
-        self.stamps.extend(stamps, [block.log_ns[row] for row in rows], [position + row for row in rows])
-        places = [block.places[row] for row in rows]
-        self.rows.extend(range(len(self.stream), len(self.stream) + len(rows)))
-        self.places.extend(places)
-        self.stream.extend(places)
-        return True
 
     def finish(self, notes: Notes) -> tuple[Ints, list[Place], Ints]:
         """Stamps and places of the images in order of time, and which of `stream` they are."""
@@ -138,11 +117,11 @@ class Gathered:
     calibrations: Calibrations
     right_calibrations: Calibrations
     poses: dict[Channel, PoseTrack]
-    """Of every topic that may be the odometry."""
+    """Tracks of the topics that may be the odometry."""
     fixes: FixTrack | None
-    transforms: list[TransformMessage] = field(default_factory=list)
+    transforms: list[PoseMessage] = field(default_factory=list)
     lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
-    """By reason and topic."""
+    """Lost messages by reason and topic."""
     waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = field(default_factory=dict)
     """Messages of odometry that are still to be added, their log times and their positions."""
     messages: int = 0
@@ -164,27 +143,26 @@ class Gathered:
         self.messages += len(block.channels)
         for row, channel in enumerate(block.channels):
             rows.setdefault(channel, []).append(row)
-        others: list[int] = []
+        single: list[int] = []
         for channel, mine in rows.items():
-            if (images := self.by_channel.get(channel)) and images.add_block(block, mine, first):
-                self._sound(channel.topic)
+            log_ns, positions = [block.log_ns[row] for row in mine], [first + row for row in mine]
+            if channel in self.by_channel:
+                single += mine
             elif channel in self.poses:
-                data, log_ns, positions = self.waiting.setdefault(channel, ([], [], []))
-                data += [bytes(block.data[block.starts[row] : block.stops[row]]) for row in mine]
-                log_ns += [block.log_ns[row] for row in mine]
-                positions += [first + row for row in mine]
+                data, waiting_ns, waiting_positions = self.waiting.setdefault(channel, ([], [], []))
+                data += [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
+                waiting_ns += log_ns
+                waiting_positions += positions
                 if len(data) >= _TOGETHER:
                     self._add_poses(channel)
             else:
-                self.others.setdefault(channel, Stamps()).extend(
-                    [0] * len(mine), [block.log_ns[row] for row in mine], [first + row for row in mine]
-                )
+                self.others.setdefault(channel, Stamps()).extend([0] * len(mine), log_ns, positions)
                 known = self.calibrations_of(channel)
-                others += [
+                single += [
                     row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
                 ]
-        for row in sorted(others):
-            self.take(block.message(row), first + row)
+        for row in sorted(single):
+            self._take(block, row, first + row)
 
     def finish_poses(self) -> None:
         """Add the messages of odometry that wait."""
@@ -200,18 +178,21 @@ class Gathered:
             self._sound(channel.topic)
         else:
             for one, time_ns, position in zip(data, log_ns, positions, strict=True):
-                self.take(Message(channel, time_ns, one, ()), position)
+                self._take(Block(one, [channel], [time_ns], [0], [len(one)], [()]), 0, position)
 
-    def take(self, message: Message, position: int) -> None:
+    def _take(self, block: Block, row: int, position: int) -> None:
         """Add a message, or count it among the lost ones."""
-        topic = message.channel.topic
+        channel = block.channels[row]
         try:
-            self.add(message, position)
+            if images := self.by_channel.get(channel):
+                images.add(block, row, position)
+            else:
+                self._add(block.message(row), position)
         except BadMessageError as error:
             reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
-            self.lost.setdefault((reason, topic), Runs()).lost(message.log_ns)
-            return
-        self._sound(topic)
+            self.lost.setdefault((reason, channel.topic), Runs()).lost(block.log_ns[row])
+        else:
+            self._sound(channel.topic)
 
     def _sound(self, topic: str) -> None:
         for reason in ("empty_image", "undecodable") if self.lost else ():
@@ -222,34 +203,29 @@ class Gathered:
         """The calibrations that a channel holds, if it is one of them."""
         return next((one for one in (self.right_calibrations, self.calibrations) if one.channel == channel), None)
 
-    def stamps(self) -> list[Stamps]:
-        """Of every topic that is followed over time."""
-        images = [one.stamps for one in (self.images, self.depths, self.rights) if one.channel]
-        return images + [one.stamps for one in (*self.poses.values(), self.fixes) if one]
+    def stamps(self) -> list[tuple[str, Stamps]]:
+        """Every topic that is followed over time, with its stamps."""
+        images = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
+        return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one]
 
     def mend_steps_back(self, notes: Notes) -> None:
         """Undo steps back of the recorder's clock, which all topics share."""
         for track in self.poses.values():
             track.give_places()
-        mend_steps_back([*self.stamps(), *self.others.values(), *self.moving.stamps()], notes)
+        mend_steps_back([*(stamps for _, stamps in self.stamps()), *self.others.values(), *self.moving.stamps()], notes)
 
     def skew_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
-        timed = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
-        timed += [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one]
-        return {topic: skew / 1e6 for topic, stamps in timed if (skew := stamps.skew_ns()) is not None}
+        return {topic: skew / 1e6 for topic, stamps in self.stamps() if (skew := stamps.skew_ns()) is not None}
 
     def rates_hz(self) -> dict[Channel, float | None]:
         """Messages a second of each topic that was read, by its own times."""
         found = {channel: one.stamps for channel, one in (*self.by_channel.items(), *self.poses.items())}
         return {channel: stamps.rate_hz() for channel, stamps in (*found.items(), *self.others.items())}
 
-    def add(self, message: Message, position: int) -> None:
+    def _add(self, message: Message, position: int) -> None:
         """Raises BadMessageError."""
         channel = message.channel
-        if images := self.by_channel.get(channel):
-            images.add(message, position)
-            return
         match decode(channel, message.data):
             case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
                 known.add(replace(calibration, stamp_ns=calibration.stamp_ns or message.log_ns), message.data)

@@ -18,7 +18,7 @@ from vplog.logs.frames import affine_to_camera, warped
 from vplog.logs.image_groups import of_one_camera
 from vplog.logs.messages.pixels import drive_levels, grey, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
-from vplog.logs.sidecar_files import Beside
+from vplog.logs.sidecar_files import SidecarFiles
 from vplog.logs.stamps import increasing, rate_hz, rows_of
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class FileFrame:
     camera: Camera
     path: Path
     notes: Notes
-    """Of the folder: what does not decode is counted there."""
+    """Notes of the folder, where what does not decode is counted."""
     levels: Levels | None = None
     """Black and white of the folder, where its images have 16 bits."""
 
@@ -119,12 +119,12 @@ class ImageFolder:
         lost = [(time_ns, time_ns) for file, time_ns in zip(files, times, strict=True) if file in damaged]
         if lost:
             notes.account.add("empty_image", {path.name: len(lost)}, (path.name, 0), lost)
-        kept = [(file, time_ns) for file, time_ns in zip(files, times, strict=True) if file not in damaged]
-        files = [file for file, _ in kept]
-        stamp_ns, rows = increasing(np.array([time_ns for _, time_ns in kept], np.int64), path.name, notes)
+        sound = [(file, time_ns) for file, time_ns in zip(files, times, strict=True) if file not in damaged]
+        files = [file for file, _ in sound]
+        stamp_ns, rows = increasing(np.array([time_ns for _, time_ns in sound], np.int64), path.name, notes)
         if len(rows) < len(files):
             notes.account.add("repeated_stamp", {path.name: len(files) - len(rows)}, (path.name, 0), [])
-        self._path, self._notes, self._beside = path, notes, Beside(choice, notes)
+        self._path, self._notes, self._sidecar = path, notes, SidecarFiles(choice, notes)
         self._stamp_ns, self._files = stamp_ns, [files[row] for row in rows.tolist()]
 
     @property
@@ -137,7 +137,7 @@ class ImageFolder:
 
     @property
     def account(self) -> Account:
-        """Of what could not be used so far."""
+        """Account of what could not be used so far."""
         return self._notes.account
 
     @property
@@ -162,7 +162,7 @@ class ImageFolder:
             yield FileFrame(int(self._stamp_ns[row]), self._camera, self._files[row], self._notes, self._levels)
 
     def odometry(self) -> Odometry | None:
-        return self._beside.odometry
+        return self._sidecar.odometry
 
     def gps(self) -> Gps | None:
         return None
@@ -174,7 +174,7 @@ class ImageFolder:
     @cached_property
     def _camera(self) -> Camera:
         height, width = self._first_image().shape
-        known = self._beside.camera(self.name)
+        known = self._sidecar.camera(self.name)
         camera = camera_of(self.name, known.calibration if known else None, (width, height), self._notes)
         if known is None or known.body_from_camera is None:
             return camera

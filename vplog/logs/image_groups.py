@@ -1,4 +1,4 @@
-"""The cameras of a folder of images: told by names that differ in more than numbers, by bits, and by size."""
+"""The cameras of a folder of images: by names that differ in more than numbers, by bits, and by size."""
 
 from __future__ import annotations
 

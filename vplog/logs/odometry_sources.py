@@ -41,7 +41,7 @@ _COMMAND = re.compile(
     "(?<![a-z])(goal|set_?point|target|desired|reference|command|cmd|ref|plan|way_?point|initial_?pose|clicked)s?(?![a-z])",
     re.IGNORECASE,
 )
-"""Words for where a robot is to be, or is told to be."""
+"""Words for where a robot is to be, or is commanded to be."""
 _COMMANDED, _MAYBE_COMMANDED = "is a command by its name", "may be a command by its name"
 COVERED = 0.9
 """Share of the camera's time that odometry covers in a usual log: recorders start and stop within seconds."""
@@ -118,9 +118,9 @@ def weigh_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list
 
 
 def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selection, notes: Notes) -> Channel | None:
-    """The source to use: the one asked for, else the best. What is lost with it is said."""
-    asked = chosen.odometry
-    commands = [one for one, _ in sources if not asked and _COMMANDED in one.evidence]
+    """The source to use: the requested one, else the best. What is lost with it is noted."""
+    requested = chosen.odometry
+    commands = [one for one, _ in sources if not requested and _COMMANDED in one.evidence]
     fit = [one for one in sources if one[0] not in commands]
     if commands and (not fit or commands[0].score > fit[0][0].score):
         names = ", ".join(source.topic for source in commands)
@@ -129,16 +129,16 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
             f"{commands[0].topic} takes it."
         )
     if not fit:
-        return None if sources else asked or next(iter(chosen.sources), None)
+        return None if sources else requested or next(iter(chosen.sources), None)
     best, source = fit[0]
-    _note_doubts(best, asked is not None, chosen.image is not None, notes)
+    _note_doubts(best, requested is not None, chosen.image is not None, notes)
     return source
 
 
-def _note_doubts(source: OdometrySource, asked: bool, pictured: bool, notes: Notes) -> None:
+def _note_doubts(source: OdometrySource, requested: bool, pictured: bool, notes: Notes) -> None:
     """Say what is lost with a source that is taken all the same."""
     if source.coverage < COVERED and pictured:
-        better = "" if asked else " No other source is better; --odometry-file takes one from a file."
+        better = "" if requested else " No other source is better; --odometry-file takes one from a file."
         notes.add(
             f"{source.topic} covers {source.coverage:.0%} of the camera's time; the frames outside have no odometry "
             f"and are left out.{better}"
@@ -148,15 +148,15 @@ def _note_doubts(source: OdometrySource, asked: bool, pictured: bool, notes: Not
             f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is "
             "interpolated."
         )
-    if not asked and _MAYBE_COMMANDED in source.evidence:
+    if not requested and _MAYBE_COMMANDED in source.evidence:
         notes.add(
             f"{source.topic} is a command by its name (where the robot should be), but moves {source.frames[-1]}, "
             "and no other source is better; --odometry-file takes one from a file."
         )
     if any(map(_TRUTH.search, (source.topic, *source.frames))):
         notes.add(
-            f"{source.topic} is ground truth by its name{'' if asked else ', and the best that the log has'}; measured "
-            "against it, the trajectory says nothing about real odometry."
+            f"{source.topic} is ground truth by its name{'' if requested else ', and the best that the log has'}; "
+            "measured against it, the trajectory says nothing about real odometry."
         )
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from vplog.errors import LogError
 from vplog.logs.formats.container import plural
 from vplog.logs.frames import Decoded, Encoded, image_in
-from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import drive_levels, grey, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
@@ -22,17 +21,11 @@ if TYPE_CHECKING:
 
     from vplog.data import Float32s
     from vplog.logs.content import Content
-    from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
+    from vplog.logs.formats.container import Channel, Container, Notes, Place
     from vplog.logs.messages.pixels import Levels
 
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
-
-
-def _frame_and_size(channel: Channel, data: Octets) -> tuple[str, tuple[int, int]]:
-    message = image_in(channel, data)
-    height, width = grey(message).shape
-    return message.frame, (width, height)
 
 
 class Pictures:
@@ -79,12 +72,9 @@ class Pictures:
         video, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:
-                if video is None:
-                    return _frame_and_size(channel, self._container.read(place))
-                message = decode(channel, self._container.read(place))
-                if isinstance(message, ImageMessage):
-                    height, width = video.frame(int(self.content.stream_rows[i])).shape
-                    return message.frame, (width, height)
+                message = image_in(channel, self._container.read(place))
+                pixels = grey(message) if video is None else video.frame(int(self.content.stream_rows[i]))
+                return message.frame, (pixels.shape[1], pixels.shape[0])
             except BadMessageError as error:
                 reason = str(error)
         raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another --image-topic.")
@@ -92,11 +82,11 @@ class Pictures:
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
         failure = None
-        rows = [row for row, place in enumerate(self.content.depth_places) if place is not None]
-        for row in rows[:_TRIED]:
-            found = self.beside(channel, self.content.depth_places, row)
+        found = [(row, place) for row, place in enumerate(self.content.depth_places) if place is not None]
+        for row, place in found[:_TRIED]:
             try:
-                return None if found is None else found.depth_m(int(self.content.stamp_ns[row]))
+                depth = Encoded(channel, self._container.read(place))
+                return depth.depth_m(int(self.content.stamp_ns[row]))
             except LogError as error:
                 failure = failure or error
         if failure is not None:
@@ -105,26 +95,24 @@ class Pictures:
 
     def _stream(self, image: Channel, codec: str, places: list[Place]) -> VideoStream:
         def payload(row: int) -> bytes:
-            try:
-                message = decode(image, self._container.read(places[row]))
-            except BadMessageError:
-                return b""
-            return bytes(message.data) if isinstance(message, ImageMessage) else b""
+            with suppress(BadMessageError):
+                return bytes(image_in(image, self._container.read(places[row])).data)
+            return b""
 
         return VideoStream(codec, image.topic, payload, len(places))
 
     def _from_first_key(self, video: VideoStream, content: Content, notes: Notes) -> Content:
         first = video.first_key()
-        kept = content.stream_rows >= (len(content.stream) if first is None else first)
-        if self._image is not None and (lost := int((~kept).sum())):
+        decodable = content.stream_rows >= (len(content.stream) if first is None else first)
+        if self._image is not None and (lost := int((~decodable).sum())):
             why = "without a key frame before them" if first is None else "before the first key frame"
             notes.add(f"{self._image.topic}: {plural(lost, 'image')} {why} cannot be decoded; left out.")
-        rows = np.flatnonzero(kept).tolist()
+        rows = np.flatnonzero(decodable).tolist()
         return replace(
             content,
-            stamp_ns=content.stamp_ns[kept],
+            stamp_ns=content.stamp_ns[decodable],
             places=[content.places[row] for row in rows],
-            stream_rows=content.stream_rows[kept],
+            stream_rows=content.stream_rows[decodable],
             depth_places=[content.depth_places[row] for row in rows],
             right_places=[content.right_places[row] for row in rows],
         )

@@ -1,4 +1,4 @@
-"""A Log over any container: topics are chosen when it is opened, everything else is read when it is first asked for."""
+"""A Log over any container: topics are chosen when it is opened, everything else is read when it is first used."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import RecordedFrame, size_of
 from vplog.logs.pictures import Pictures
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
-from vplog.logs.sidecar_files import Beside
+from vplog.logs.sidecar_files import SidecarFiles
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
 from vplog.logs.topic_selection import TopicChoice, select
@@ -47,7 +47,7 @@ class RecordedLog:
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
         self._selection = select(self._candidates, choice, path.name)
-        self._beside_log = Beside(choice, notes)
+        self._sidecar = SidecarFiles(choice, notes)
 
     @property
     def name(self) -> str:
@@ -59,7 +59,7 @@ class RecordedLog:
 
     @property
     def account(self) -> Account:
-        """Of what could not be used so far."""
+        """Account of what could not be used so far."""
         return self._notes.account
 
     @property
@@ -110,7 +110,7 @@ class RecordedLog:
             yield self._frame(row, camera)
 
     def odometry(self) -> Odometry | None:
-        return self._beside_log.odometry or self._content.odometry
+        return self._sidecar.odometry or self._content.odometry
 
     def gps(self) -> Gps | None:
         return self._content.gps
@@ -152,7 +152,7 @@ class RecordedLog:
     @cached_property
     def _later_calibrations(self) -> list[CalibrationMessage]:
         """Those that change the camera's, by stamp: a lens in focus has one for every image."""
-        if self._beside_log.camera(self._image_channel().topic) is not None:
+        if self._sidecar.camera(self._image_channel().topic) is not None:
             return []
         return sorted(self._content.calibrations[1:], key=lambda calibration: calibration.stamp_ns)
 
@@ -199,7 +199,7 @@ class RecordedLog:
         image = self._image_channel()
         content, notes = self._content, self._notes
         frame, size = self._pictures.first(image, [*content.places], self._path.name)
-        known = self._beside_log.camera(image.topic)
+        known = self._sidecar.camera(image.topic)
         calibration = known.calibration if known else next(iter(content.calibrations), None)
         camera = camera_of(image.topic, calibration, size, notes)
         named = content.body and frame and content.tree.between(content.body, frame) is not None
@@ -222,7 +222,7 @@ class RecordedLog:
         try:
             if self._codec(right):
                 raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
-            known = [self._beside_log.camera(channel.topic) for channel in (image, right)]
+            known = [self._sidecar.camera(channel.topic) for channel in (image, right)]
             calibrations = [camera.calibration if camera else None for camera in known]
             if known[0] is None:
                 calibrations = [next(iter(content.calibrations), None), content.right_calibration]
@@ -233,7 +233,7 @@ class RecordedLog:
             left_side = Side(left, calibrations[0], is_rectified(image.topic))
             right_side = Side(camera, calibrations[1], is_rectified(right.topic))
             apart = content.tree.between(other, frame) if other and frame else None
-            apart = self._beside_log.right_from_left(image.topic, right.topic) if known[0] else apart
+            apart = self._sidecar.right_from_left(image.topic, right.topic) if known[0] else apart
             pair = pair_of(left_side, right_side, apart)
             error_px = row_error_px(self._rectified(pair, right))
             if error_px is not None and error_px > MOST_ROWS_PX:

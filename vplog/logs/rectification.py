@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from vplog.geometry import se3
+from vplog.logs.cameras import resized
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -153,8 +154,7 @@ def _projection(side: Side) -> Floats:
     if not known or not (calibration.width and calibration.height):
         return calibration.projection if known else np.zeros((3, 4))
     x, y = camera.width / calibration.width, camera.height / calibration.height
-    scale = np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2], [0.0, 0.0, 1.0]])  # as in cameras.py
-    return scale @ calibration.projection
+    return resized(x, y) @ calibration.projection
 
 
 def _rotation(calibration: CalibrationMessage) -> Floats:

@@ -1,4 +1,4 @@
-"""What files beside a log say in its place: odometry and calibration."""
+"""Odometry and calibration from files beside a log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vplog.logs.topic_selection import TopicChoice
 
 
-class Beside:
+class SidecarFiles:
     """The files of a TopicChoice, read at once: what is wrong with them shows before any work on the log."""
 
     def __init__(self, choice: TopicChoice, notes: Notes) -> None:

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.clocks import GAP_NS, GAP_PERIODS, LATE_NS, LEAST_JUMP_NS, Clock, on_one_clock
+from vplog.logs.clocks import (
+    GAP_NS,
+    GAP_PERIODS,
+    LATE_NS,
+    LEAST_JUMP_NS,
+    LEAST_STEP_NS,
+    STEP_PERIODS,
+    Clock,
+    on_one_clock,
+)
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.formats.loss_account import runs_of
 
@@ -66,7 +75,7 @@ class Stamps:
     def skew_ns(self) -> int | None:
         """Log time less header stamp, the median; None where the header stamps follow no clock."""
         found = self._on_one_clock()
-        return found.skew_ns if found is not None and found.kept.any() else None
+        return found.skew_ns if found is not None and found.valid.any() else None
 
     def rate_hz(self) -> float | None:
         """Messages a second between the first and the last; None where there is no such time."""
@@ -128,13 +137,13 @@ class Stamps:
                 f"{topic}: behind a gap the log times are {change / 1e9:+.3f} s further from the header stamps. Was a "
                 "clock set, or does it take longer since? The stamps are left as they are."
             )
-        _lose("stray_stamp", topic, ~found.kept, log_ns[rows], notes)
-        rows, stamp_ns = rows[found.kept], found.stamp_ns[found.kept]
+        _lose("stray_stamp", topic, ~found.valid, log_ns[rows], notes)
+        rows, stamp_ns = rows[found.valid], found.stamp_ns[found.valid]
         stamp_ns = _on_common(stamp_ns, found.skew_ns, self.common, topic, notes)
         return _in_order(topic, notes, stamp_ns, rows, log_ns)
 
     def _by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
-        """The same by the log times alone, whatever the header stamps are."""
+        """The log times in place of the header stamps."""
         log_ns = np.array(self.log_ns, np.int64)
         notes.add(f"{topic} {why}; its log times are used instead.")
         return _in_order(topic, notes, log_ns, np.arange(len(log_ns)), log_ns)
@@ -162,7 +171,7 @@ def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
 
 
 def share_clock(topics: Iterable[Stamps]) -> None:
-    """Tell all topics of a log the clock that most of their messages are on, by how far log times are from stamps."""
+    """Set the common clock of all topics of a log: that of most messages, by log time less stamp."""
     topics = [one for one in topics if len(one.header_ns)]
     pooled: dict[int, int] = {}
     steady = [one for one in topics if len(one.clocks()) == 1]
@@ -173,8 +182,6 @@ def share_clock(topics: Iterable[Stamps]) -> None:
     if not pooled:
         return
     skew_ns = max(pooled, key=lambda skew: (pooled[skew], -skew))
-    for one in topics:
-        one.common = Clock(skew_ns, 0, 0)
     covered = [one for one in topics if any(abs(skew - skew_ns) <= LEAST_JUMP_NS for skew in one.clocks())]
     log_ns = [int(ns) - skew_ns for one in covered for ns in (min(one.log_ns), max(one.log_ns))]
     for one in topics:
@@ -234,9 +241,13 @@ def _note_gaps(topic: str, stamp_ns: Ints, notes: Notes) -> None:
 
 
 def increasing(stamp_ns: Ints, what: str, notes: Notes) -> tuple[Ints, Ints]:
-    """The stamps sorted, the first of equal ones kept, and the row each came from; sorting is noted."""
-    if late := int((np.diff(stamp_ns) < 0).sum()):
-        notes.add(f"{what}: {plural(late, 'stamp')} out of order; sorted.")
+    """The stamps sorted, the first of equal ones, and the row each came from; sorting is noted."""
+    step = np.diff(stamp_ns)
+    if late := int((step < 0).sum()):
+        back_ns = -int(step.min())
+        far = back_ns > max(LEAST_STEP_NS, STEP_PERIODS * float(np.median(np.abs(step))))
+        how = f"by up to {back_ns / 1e9:.3f} s (late, or was a clock changed?); sorted." if far else "; sorted."
+        notes.add(f"{what}: {plural(late, 'stamp')} out of order{' ' * far}{how}")
     order = np.argsort(stamp_ns, kind="stable")
     ordered = stamp_ns[order]
     first = np.ones(len(ordered), bool)
@@ -245,7 +256,7 @@ def increasing(stamp_ns: Ints, what: str, notes: Notes) -> tuple[Ints, Ints]:
 
 
 def rows_of(known_ns: Ints, wanted_ns: Ints, log: str) -> list[int]:
-    """Rows of the stamps asked for, in order of time, each once. Raises LogError where one is not known."""
+    """Rows of the wanted stamps, in order of time, each once. Raises LogError where one is not known."""
     wanted = np.unique(np.asarray(wanted_ns, np.int64))
     rows = np.searchsorted(known_ns, wanted)
     found = rows < len(known_ns)

@@ -10,10 +10,10 @@ import numpy as np
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from vplog.data import Floats
-    from vplog.logs.messages.records import TransformMessage
+    from vplog.logs.messages.records import PoseMessage
 
 FARTHEST_M = 1e9
 """m; positions in map coordinates reach 1e7, so a coordinate beyond this is damage."""
@@ -24,14 +24,14 @@ SMALLEST = 1e-6
 class FrameTree:
     """Static transforms between named frames; a later transform of the same pair replaces an earlier one."""
 
-    def __init__(self, transforms: Iterable[TransformMessage]) -> None:
+    def __init__(self, transforms: Iterable[PoseMessage]) -> None:
         self._from: dict[str, dict[str, Floats]] = {}
         self.edges: list[tuple[str, str]] = []
         """Parent and child of each transform."""
         self.dropped = 0
         """Transforms that were NaN, infinite or without rotation."""
         for transform in transforms:
-            parent, child = clean(transform.parent), clean(transform.child)
+            parent, child = clean(transform.frame), clean(transform.child)
             parent_from_child = usable_pose(transform.position, transform.quaternion)
             if parent_from_child is None or parent == child:
                 self.dropped += 1
@@ -65,11 +65,10 @@ def clean(frame: str) -> str:
     return frame.lstrip("/")
 
 
-def usable_pose(position: Floats, quaternion: Floats) -> Floats | None:
+def usable_pose(position: Sequence[float], quaternion: Sequence[float]) -> Floats | None:
     """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond FARTHEST_M) or no rotation is set."""
-    if not are_usable(np.append(position, quaternion)[None]).all():
-        return None
-    return se3.pose(se3.rotation(quaternion), position)
+    pose = np.array([*position, *quaternion], np.float64)
+    return se3.pose(se3.rotation(pose[3:]), pose[:3]) if are_usable(pose[None]).all() else None
 
 
 def are_usable(poses: Floats) -> np.ndarray:

@@ -19,7 +19,7 @@ from vplog.logs.static_transforms import are_usable, clean
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
     from vplog.logs.formats.container import Notes
-    from vplog.logs.messages.records import TransformMessage
+    from vplog.logs.messages.records import PoseMessage
     from vplog.logs.static_transforms import FrameTree
 
 _BODIES = ("base_link", "base_footprint")
@@ -34,7 +34,7 @@ Edge = tuple[str, str]
 class _Link:
     """One edge of the frame tree over time."""
 
-    first: TransformMessage
+    first: PoseMessage
     times_ns: list[tuple[int, int, int]] = field(default_factory=list)
     """Stamp, log time and position in the file of the first and the last sample before it moved."""
     moves: bool = False
@@ -44,7 +44,7 @@ class _Link:
     values: array[float] = field(default_factory=lambda: array("d"))
     """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
 
-    def keep(self, transform: TransformMessage, time_ns: tuple[int, int, int]) -> None:
+    def keep(self, transform: PoseMessage, time_ns: tuple[int, int, int]) -> None:
         if not self.moves:
             self.times_ns[1:] = [time_ns]  # the first stays
             return
@@ -53,7 +53,7 @@ class _Link:
         self.times_ns.clear()
         self._append(transform, time_ns)
 
-    def _append(self, transform: TransformMessage, time_ns: tuple[int, int, int]) -> None:
+    def _append(self, transform: PoseMessage, time_ns: tuple[int, int, int]) -> None:
         self.stamps.add(*time_ns)
         self.values.extend((*transform.position, *transform.quaternion))
 
@@ -66,23 +66,23 @@ class MovingFrames:
         """Keep every sample, for odometry; else only what tells whether a frame moves."""
         self._links: dict[Edge, _Link] = {}
 
-    def add(self, transforms: list[TransformMessage], log_ns: int, position: int) -> None:
+    def add(self, transforms: list[PoseMessage], log_ns: int, position: int) -> None:
         for transform in transforms:
-            edge = clean(transform.parent), clean(transform.child)
+            edge = clean(transform.frame), clean(transform.child)
             link = self._links.get(edge)
             if link is None:
                 link = self._links[edge] = _Link(transform)
-            link.travels = link.travels or not np.array_equal(link.first.position, transform.position)
-            link.moves = link.travels or link.moves or not np.array_equal(link.first.quaternion, transform.quaternion)
+            link.travels = link.travels or link.first.position != transform.position
+            link.moves = link.travels or link.moves or link.first.quaternion != transform.quaternion
             if self._keep:
                 link.keep(transform, (transform.stamp_ns, log_ns, position))
 
-    def still(self) -> list[TransformMessage]:
+    def still(self) -> list[PoseMessage]:
         """Transforms that were the same whenever they were sent."""
         return [link.first for _, link in sorted(self._links.items()) if not link.moves]
 
     def stamps(self) -> list[Stamps]:
-        """Of every link that is followed over time."""
+        """Stamps of every link that is followed over time."""
         return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
 
     def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:

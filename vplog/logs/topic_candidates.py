@@ -25,10 +25,10 @@ _THERMAL = re.compile(r"therm|infra|lwir|flir|boson|lepton|(?<![a-z])ir(?![a-z])
 def read_candidates(container: Container, contents: Contents) -> list[Candidate]:
     """Every topic that could play a part; the first message of each tells depth from grey, its frame and its codec."""
     kinds = {channel: kind_of(channel) for channel in contents.counts}
-    asked = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
+    wanted = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
     firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
-    left = set(asked)
-    for message in container.messages(asked) if asked else ():
+    left = set(wanted)
+    for message in container.messages(wanted) if wanted else ():
         if message.channel not in left:
             continue
         try:

@@ -69,7 +69,7 @@ class Candidate:
     encoding: str = ""
     """Pixel layout of the images, or their format where compressed, as the first message names it."""
     size: tuple[int, int] = (0, 0)
-    """Width and height in px of the first image, 0 where it is not told without decoding it."""
+    """Width and height in px of the first image, 0 where only decoding tells it."""
     supported: bool = True
     """Whether images of its encoding can be decoded to grey."""
 
@@ -82,7 +82,7 @@ class Selection:
     depth: Channel | None = None
     camera_info: Channel | None = None
     odometry: Channel | None = None
-    """As asked for, or as chosen among `sources` once these are read."""
+    """As requested, or as chosen among `sources` once these are read."""
     sources: tuple[Channel, ...] = ()
     """Topics that may be the odometry; the transforms over time are one source, named by the largest topic."""
     gps: Channel | None = None
@@ -179,15 +179,15 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         if choice.odometry:
             raise LogError(_two("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
         choice = choice.model_copy(update={"odometry": ""})
-    asked = pick("odometry", by_size, "tf") if choice.odometry is not None else None
+    requested = pick("odometry", by_size, "tf") if choice.odometry is not None else None
     moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=by_size)
-    sources = [asked] if asked else []
+    sources = [requested] if requested else []
     if choice.odometry is None:
         sources = [*sorted((c for c in candidates if c.role == "odometry" and c.count), key=by_size), *moving[:1]]
     gps = pick("gps", by_size)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     parts = {
-        "image": image, "depth": depth, "camera_info": calibration, "odometry": asked, "gps": gps,
+        "image": image, "depth": depth, "camera_info": calibration, "odometry": requested, "gps": gps,
         "right": right, "right_info": right_info,
     }  # fmt: skip
     found = {name: part.channel for name, part in parts.items() if part is not None}

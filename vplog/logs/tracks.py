@@ -145,7 +145,7 @@ class FixTrack:
         self.stamps = Stamps()
         self._fixes: list[FixMessage] = []
         self.frame = ""
-        """Of the antenna, by the first fix."""
+        """Frame of the antenna, by the first fix."""
         self._dropped: Counter[str] = Counter()
         """Messages by why they are no fix."""
 

@@ -105,7 +105,8 @@ def test_every_type_agrees_with_protobuf() -> None:
             pairs = [(by_flat, by_proto)]
         for a, b in pairs:
             for key, value in (b._asdict() if isinstance(b, tuple) else vars(b)).items():
-                np.testing.assert_array_equal(getattr(a, key), value, err_msg=f"{name}.{key}")
+                expected = bytes(value) if isinstance(value, memoryview) else value
+                np.testing.assert_array_equal(getattr(a, key), expected, err_msg=f"{name}.{key}")
 
 
 @given(st.binary(max_size=120), st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=4))

@@ -20,7 +20,6 @@ from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.message import DecodeError
 
 from vplog.logs.messages.flatbuffers import fill_flat
 from vplog.logs.messages.records import (
@@ -29,7 +28,6 @@ from vplog.logs.messages.records import (
     FixMessage,
     ImageMessage,
     PoseMessage,
-    TransformMessage,
     nanoseconds,
 )
 
@@ -48,44 +46,42 @@ _FIXED = {1: 8, 5: 4}
 """Bytes of the wire types that have always as many."""
 
 
-def decode_foxglove(kind: str, encoding: str, data: bytes) -> Record:
-    """A record of type `foxglove.RawImage` and so on. Raises BadMessageError or what the parsers raise."""
+def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
+    """A record of type `foxglove.RawImage` and so on; in protobuf, the bytes of images are a view of `data`.
+
+    Raises BadMessageError or what the parsers raise.
+    """
     make, read = _READERS[kind]
-    message = make()
+    message: Any = make()
     if encoding == "json":
-        _fill(message, json.loads(data))
+        _fill(message, json.loads(bytes(data)))
     elif encoding == "flatbuffer":
-        fill_flat(message, data)
+        fill_flat(message, bytes(data))
+    elif read in (_raw, _compressed) and (
+        found := _find_data(message, data)
+    ):  # all but a few bytes are pixels, which the parser would copy twice
+        at, start, stop = found
+        message.ParseFromString(bytes(data[:at]) + bytes(data[stop:]))
+        if not message.data:
+            image: Any = read(message)
+            return image._replace(data=memoryview(data)[start:stop])
+        message.ParseFromString(bytes(data))  # of a field that comes twice, the last one counts
     else:
-        message.ParseFromString(data)
+        message.ParseFromString(bytes(data))
     return read(message)
 
 
-def head_reader(kind: str) -> Callable[[Octets], tuple[Any, int, int] | None]:
-    """What reads a protobuf image without its pixels: the message, its `data` empty, and where those start and stop.
-
-    It gives None for bytes that are no such message, or hold `data` more than once.
-    """
-    make, _ = _READERS[kind]
-    tag_of_data = make.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH
-
-    def read(data: Octets) -> tuple[Any, int, int] | None:
-        at, stop = 0, len(data)
-        while at < len(data) and (tag := data[at]) != tag_of_data:
-            at = _skipped(data, at + 1, tag)
-        start, head = at, bytes(data[:at])
-        if at < len(data):
-            length, start = _varint(data, at + 1)
-            stop = start + length
-            head += bytes(data[stop:])
-        message: Any = make()
-        try:
-            message.ParseFromString(head)
-        except DecodeError:
-            return None
-        return None if start > stop or stop > len(data) or message.data else (message, start, stop)
-
-    return read
+def _find_data(message: Proto, data: Octets) -> tuple[int, int, int] | None:
+    """Where the field `data` of an image lies in protobuf: its tag, its first byte and its end. None where it is left
+    out, or bytes before it are odd."""
+    tag, at = message.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH, 0
+    try:
+        while data[at] != tag:
+            at = _skipped(data, at + 1, data[at])
+        size, start = _varint(data, at + 1)
+    except LookupError:
+        return None
+    return (at, start, start + size) if start + size <= len(data) else None
 
 
 def _skipped(data: Octets, at: int, tag: int) -> int:
@@ -159,36 +155,33 @@ def _compressed(m: Any) -> Record:
 
 
 def _calibration(m: Any) -> Record:
-    matrix, projection = _matrix(m.K, (3, 3)), _matrix(m.P, (3, 4))
-    distortion = np.array(m.D, np.float64)
     return CalibrationMessage(
-        _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, distortion, matrix, projection,
-        _matrix(m.R, (3, 3)),
+        _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, np.array(m.D, np.float64),
+        _matrix(m.K, (3, 3)), _matrix(m.P, (3, 4)), _matrix(m.R, (3, 3)),
     )  # fmt: skip
 
 
 def _pose(m: Any) -> Record:
-    pose = m.pose
-    p, q = pose.position, pose.orientation
-    return PoseMessage(_stamp(m), m.frame_id, "", (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), None)
+    return _placed(m, m.frame_id, "", m.pose.position, m.pose.orientation)
 
 
 def _odometry(m: Any) -> Record:
     covariance = _matrix(m.pose_covariance, (6, 6)).ravel().tolist()
-    p, q = m.pose.position, m.pose.orientation
-    position, quaternion = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
-    return PoseMessage(_stamp(m), m.frame_id, m.body_frame_id, position, quaternion, covariance)
+    return _placed(m, m.frame_id, m.body_frame_id, m.pose.position, m.pose.orientation, covariance)
+
+
+def _transform(m: Any) -> PoseMessage:
+    return _placed(m, m.parent_frame_id, m.child_frame_id, m.translation, m.rotation)
+
+
+def _placed(m: Any, frame: str, child: str, p: Any, q: Any, covariance: list[float] | None = None) -> PoseMessage:
+    return PoseMessage(_stamp(m), frame, child, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), covariance)
 
 
 def _fix(m: Any) -> Record:
     known = m.position_covariance_type != LocationFix.PositionCovarianceType.UNKNOWN
     covariance = _matrix(m.position_covariance, (3, 3)) if known else np.full((3, 3), np.nan)
     return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance, m.frame_id)
-
-
-def _transform(m: Any) -> TransformMessage:
-    position, quaternion = _xyz(m.translation), _xyzw(m.rotation)
-    return TransformMessage(m.parent_frame_id, m.child_frame_id, position, quaternion, _stamp(m))
 
 
 def _one_transform(m: Any) -> Record:
@@ -202,14 +195,6 @@ def _transforms(m: Any) -> Record:
 def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
     """Zeros where the field was left out."""
     return np.array(values, np.float64).reshape(shape) if len(values) else np.zeros(shape)
-
-
-def _xyz(v: Any) -> Floats:
-    return np.array([v.x, v.y, v.z])
-
-
-def _xyzw(q: Any) -> Floats:
-    return np.array([q.x, q.y, q.z, q.w])
 
 
 _READERS: dict[str, tuple[type[Proto], Callable[[Any], Record]]] = {

@@ -23,7 +23,7 @@ class FrameNumbers:
 
     def __init__(self) -> None:
         self._bits = 0
-        """Of frame_num; 0 where numbers tell nothing: no parameter set was read, or it allows gaps."""
+        """Bits of frame_num; 0 where numbers tell nothing: no parameter set was read, or it allows gaps."""
         self._separate = False
         """Slices name their colour plane."""
         self._last = -1

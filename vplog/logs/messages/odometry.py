@@ -1,30 +1,27 @@
-"""Odometry, the messages that drives have most of, many at once; nav_msgs/Odometry where its numbers lie.
-
-A general decoder builds twenty objects for each; this takes a hundredth of its time. Whatever is not laid out just as
-expected is left to that decoder, which says what is wrong.
-"""
+"""Poses, the messages that drives have most of, many at once: those of ROS in a hundredth of the time of one by one."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vplog.logs.messages.decode import decode_generally
-from vplog.logs.messages.records import BadMessageError, PoseMessage, nanoseconds, short_type
+from vplog.logs.messages.decode import decode
+from vplog.logs.messages.records import BadMessageError, PoseMessage, short_type
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
     from vplog.logs.formats.container import Channel
 
-_POSE = 7 + 36
-"""Numbers of a pose with covariance: position, quaternion, 6 x 6; the twist behind it has one fewer, 6 + 36."""
-_TWIST = 6 + 36
-_MOST_NAMED = 4096
-"""Bytes that the names of both frames may take here."""
+_NUMBERS = {
+    "nav_msgs/Odometry": (7 + 36, 6 + 36),
+    "geometry_msgs/PoseWithCovarianceStamped": (7 + 36, 0),
+    "geometry_msgs/PoseStamped": (7, 0),
+    "geometry_msgs/TransformStamped": (7, 0),
+}
+"""float64 at the end of a message: x y z, x y z w and a (6, 6) covariance; and those of a twist behind them."""
 _HEAD = 12
-"""Bytes before the names: CDR's encapsulation of 4 bytes or ROS 1's sequence number, then the stamp."""
+"""Bytes before the names of frames: CDR's encapsulation of 4 bytes or ROS 1's sequence number, then the stamp."""
 
 
 class Poses(NamedTuple):
@@ -44,13 +41,13 @@ class Poses(NamedTuple):
 def read_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
     """The poses of messages of any type; None where they cannot be taken together: one is damaged or is no pose, or
     they name different frames."""
-    found = read_odometry(channel, messages) or _read_poses_in_frame(channel, messages)
-    if found is not None:
-        return found
     try:
-        records = [decode_generally(channel, message) for message in messages]
+        found = read_ros_poses(channel, messages)
+        records = [] if found else [decode(channel, message) for message in messages]
     except BadMessageError:
         return None
+    if found is not None:
+        return found
     poses = [record for record in records if isinstance(record, PoseMessage)]
     if len(poses) < len(messages):
         return None
@@ -62,71 +59,27 @@ def read_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
     return Poses(np.array(stamps, np.int64), frames[0], children[0], numbers, known)
 
 
-def read_odometry(channel: Channel, messages: list[bytes]) -> Poses | None:
-    """The poses of messages of nav_msgs/Odometry in little-endian CDR or as ROS 1 has it.
+def read_ros_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
+    """The poses of messages in little-endian CDR or as ROS 1 packs them, equal but for stamps and numbers.
 
-    None for anything else, where the messages name different frames, and where a stamp is out of range.
+    None for anything else, and where a stamp is out of range. Raises BadMessageError where the first is damaged.
     """
-    size = len(messages[0])
-    numbers_at = size - 8 * (_POSE + _TWIST)
-    if not _is_odometry(channel) or not _HEAD < numbers_at < _MOST_NAMED or {*map(len, messages)} != {size}:
+    count, behind = _NUMBERS.get(short_type(channel.type), (0, 0))
+    cdr, size = channel.encoding == "cdr", len(messages[0])
+    at = size - 8 * (count + behind)
+    if not count or not (cdr or channel.encoding == "ros1") or {*map(len, messages)} != {size}:
         return None
+    first = decode(channel, messages[0])
     rows = np.frombuffer(b"".join(messages), np.uint8).reshape(-1, size)
-    cdr = channel.encoding == "cdr"
-    if cdr and (rows[:, :4] != (0, 1, 0, 0)).any():  # encapsulation: plain CDR, little endian, no options
+    if not isinstance(first, PoseMessage) or (rows[:, _HEAD:at] != rows[0, _HEAD:at]).any():
         return None
-    names = _names(messages[0][_HEAD:numbers_at], cdr)
-    if names is None or (rows[:, _HEAD:numbers_at] != rows[0, _HEAD:numbers_at]).any():
+    if cdr and (rows[:, :4] != (0, 1, 0, 0)).any():  # encapsulation: plain CDR, little endian, no options
         return None
     stamps = np.ascontiguousarray(rows[:, 4:_HEAD]).view("<u4").astype(np.int64)
     if cdr and (stamps[:, 0] >= 2**31).any():  # negative
         return None
-    numbers = np.ascontiguousarray(rows[:, numbers_at : numbers_at + 8 * _POSE]).view("<f8")
-    return Poses(stamps[:, 0] * 10**9 + stamps[:, 1], *names, numbers[:, :7], numbers[:, 7:])
-
-
-def _read_poses_in_frame(channel: Channel, messages: list[bytes]) -> Poses | None:
-    """The poses of messages of foxglove.PoseInFrame in protobuf; None as above, and for damaged ones."""
-    if channel.encoding != "protobuf" or channel.type != "foxglove.PoseInFrame":
+    numbers = np.ascontiguousarray(rows[:, at : at + 8 * count]).view("<f8")
+    if tuple(numbers[0, :3].tolist()) != first.position:  # padding at the end
         return None
-    from vplog.logs.messages.foxglove import DecodeError, PoseInFrame
-
-    stamps, numbers = [], []
-    one: Any = PoseInFrame()
-    try:
-        frame = one.FromString(messages[0]).frame_id
-        for data in messages:
-            one.ParseFromString(data)
-            if one.frame_id != frame:
-                return None
-            stamps.append(nanoseconds(one.timestamp.seconds, one.timestamp.nanos))
-            p, q = one.pose.position, one.pose.orientation
-            numbers.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-    except (DecodeError, BadMessageError):
-        return None
-    return Poses(np.array(stamps, np.int64), frame, "", np.array(numbers, np.float64), None)
-
-
-@lru_cache(maxsize=16)
-def _is_odometry(channel: Channel) -> bool:
-    return short_type(channel.type) == "nav_msgs/Odometry" and channel.encoding in ("cdr", "ros1")
-
-
-@lru_cache(maxsize=16)
-def _names(data: bytes, cdr: bool) -> tuple[str, str] | None:
-    """Frame and child frame, the same in every message of a topic; None where the bytes are not two strings alone."""
-    position, names = 0, []
-    for _ in range(2):
-        length = int.from_bytes(data[position : position + 4], "little")
-        stop = position + 4 + length
-        if stop > len(data) or (cdr and (not length or data[stop - 1])):
-            return None
-        names.append(data[position + 4 : stop - cdr])  # strings end with a zero in CDR only
-        # CDR aligns numbers to their size, counted from behind its 4 bytes of encapsulation and 8 of stamp.
-        position = stop + (-stop % 4 if cdr else 0)
-    if position + (-(position + 8) % 8 if cdr else 0) != len(data):
-        return None
-    try:
-        return names[0].decode("utf-8"), names[1].decode("utf-8")
-    except UnicodeDecodeError:
-        return None
+    covariances = None if first.covariance is None else numbers[:, 7:]
+    return Poses(stamps[:, 0] * 10**9 + stamps[:, 1], first.frame, first.child, numbers[:, :7], covariances)

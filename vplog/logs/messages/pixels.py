@@ -118,7 +118,7 @@ def _grey_table(levels: Levels) -> Bytes:
 
 
 def sixteen_bits(message: ImageMessage) -> bool:
-    """Whether its pixels have 16 bits, told without decoding them."""
+    """Whether its pixels have 16 bits, without decoding them."""
     if not message.compressed:
         return message.encoding in _LAYOUTS and _LAYOUTS[message.encoding][0] == "u2"
     return message.data[:8] == PNG and bytes(message.data[24:25]) == b"\x10"

@@ -1,4 +1,4 @@
-"""The five records that messages of known types become, whatever their encoding."""
+"""The records that messages of known types become, whatever their encoding."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class BadMessageError(Exception):
 
 
 class ImageMessage(NamedTuple):
-    """A tuple, which is made in no time: one is for every image."""
+    """One image."""
 
     stamp_ns: int
     frame: str
     encoding: str
     """ROS name of the pixel layout (`mono8`, `16UC1`, ...); the format string where compressed."""
     data: Octets
-    """A view only where it was asked for."""
+    """A view of the message, where its encoding has the bytes as they are."""
     compressed: bool
     width: int = 0
     height: int = 0
@@ -62,7 +62,7 @@ class CalibrationMessage:
 
 
 class PoseMessage(NamedTuple):
-    """A tuple of plain numbers: drives have more of these than of anything else."""
+    """A pose or a transform, of plain numbers: drives have more of these than of anything else."""
 
     stamp_ns: int
     frame: str
@@ -86,21 +86,10 @@ class FixMessage:
     covariance: Floats
     """(3, 3) m^2 east-north-up; NaN where its type says unknown."""
     frame: str
-    """Of the antenna."""
+    """Frame of the antenna."""
 
 
-@dataclass(frozen=True, eq=False)
-class TransformMessage:
-    """One edge of the frame tree."""
-
-    parent: str
-    child: str
-    position: Floats
-    quaternion: Floats
-    stamp_ns: int = 0
-
-
-Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[TransformMessage]
+Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[PoseMessage]
 
 _KINDS = {
     "sensor_msgs/Image": "image",

@@ -1,180 +1,201 @@
-"""ROS messages, CDR (ROS 2) and ROS 1, through rosbags' decoders of the standard types."""
+"""ROS messages, CDR (ROS 2) and as ROS 1 packs them, their fields read where they lie.
+
+By hand: rosbags' decoders take 20 us for three transforms where this takes 11, and 22 us for an image of 0.3 MB, which
+they copy, where this takes 5.
+"""
 
 from __future__ import annotations
 
+import struct
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from vplog.logs.messages.records import (
+    BadMessageError,
     CalibrationMessage,
     FixMessage,
     ImageMessage,
     PoseMessage,
-    TransformMessage,
     nanoseconds,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rosbags.typesys.store import Typestore
-
     from vplog.data import Floats
+    from vplog.logs.formats.container import Octets
     from vplog.logs.messages.records import Record
 
 _UNKNOWN_COVARIANCE = 0
 """NavSatFix.COVARIANCE_TYPE_UNKNOWN."""
+_ENCAPSULATION = 4
+"""Bytes before a message in CDR: plain, big (0) or little (1) endian. Numbers are aligned to their size behind them."""
 
-_VIDEO = {
-    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
-        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
-        "bool is_bigendian\nuint8[] data"
-    ),
-    "foxglove_msgs/msg/CompressedVideo": (
-        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
-    ),
-}
-"""Types of video that ROS does not come with: github.com/ros-misc-utilities/ffmpeg_image_transport_msgs, and
-docs.foxglove.dev/docs/sdk/schemas."""
+
+def decode_ros(kind: str, encoding: str, data: Octets) -> Record:
+    """A record of type `sensor_msgs/Image` and so on; the bytes of images are a view of `data`.
+
+    Raises BadMessageError, struct.error, ValueError (UnicodeDecodeError) or LookupError on damaged bytes.
+    """
+    fields = _Fields(data, encoding == "cdr")
+    record = _READERS[kind](fields)
+    fields.check_end()
+    return record
+
+
+class _Fields:
+    """Reads the fields of a message in their order."""
+
+    __slots__ = ("_at", "_cdr", "_data", "_order")
+
+    def __init__(self, data: Octets, cdr: bool) -> None:
+        if cdr and bytes(data[:2]) not in (b"\0\0", b"\0\1"):
+            raise BadMessageError("its CDR encapsulation is not supported")
+        self._data, self._cdr, self._at = data, cdr, _ENCAPSULATION if cdr else 0
+        self._order = "<" if not cdr or data[1] else ">"
+
+    def numbers(self, layout: str) -> tuple:
+        """Numbers by a format of `struct`, in which none needs more alignment than the first."""
+        fixed, size = _layout(self._order + layout)
+        self._align(size)
+        values = fixed.unpack_from(self._data, self._at)
+        self._at += fixed.size
+        return values
+
+    def _align(self, size: int) -> None:
+        if self._cdr:
+            self._at += (_ENCAPSULATION - self._at) % size
+
+    def octets(self) -> memoryview:
+        """uint8[]."""
+        (size,) = self.numbers("I")
+        start, self._at = self._at, self._at + size
+        if self._at > len(self._data):
+            raise BadMessageError(f"its {len(self._data)} bytes are too few")
+        return memoryview(self._data)[start : self._at]
+
+    def text(self) -> str:
+        """A string; those of CDR end with a zero."""
+        raw = self.octets()
+        return str(raw[:-1] if self._cdr else raw, "utf-8")
+
+    def doubles(self) -> Floats:
+        """float64[]."""
+        (count,) = self.numbers("I")
+        if count:
+            self._align(8)
+        values = np.frombuffer(self._data, f"{self._order}f8", count, self._at).astype(np.float64)
+        self._at += 8 * count
+        return values
+
+    def stamp_ns(self) -> int:
+        return nanoseconds(*self.numbers("iI" if self._cdr else "II"))
+
+    def header(self) -> tuple[int, str]:
+        """Stamp in ns and frame."""
+        if not self._cdr:
+            self._at += 4  # the sequence number
+        return self.stamp_ns(), self.text()
+
+    def check_end(self) -> None:
+        """Raises BadMessageError where more follows than the padding of CDR."""
+        if len(self._data) - self._at > (3 if self._cdr else 0):
+            raise BadMessageError(f"its {len(self._data)} bytes are too many")
 
 
 @cache
-def _store(encoding: str) -> Typestore:
-    if encoding == "cdr":
-        store = get_typestore(Stores.ROS2_HUMBLE)  # these types have one layout in every ROS 2 release
-        for name, fields in _VIDEO.items():
-            store.register(get_types_from_msg(fields, name))
-        return store
-    store = get_typestore(Stores.ROS1_NOETIC)
-    transforms = "geometry_msgs/TransformStamped[] transforms"
-    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
-        if name not in store.fielddefs:
-            store.register(get_types_from_msg(transforms, name))
-    return store
+def _layout(layout: str) -> tuple[struct.Struct, int]:
+    """The compiled format, and the size of its first number."""
+    return struct.Struct(layout), struct.calcsize("=" + layout.lstrip("<>0123456789")[0])
 
 
-def decode_ros(kind: str, encoding: str, data: bytes) -> Record:
-    """A record of type `sensor_msgs/Image` and so on. Raises whatever the decoder does on damaged bytes."""
-    store = _store(encoding)
-    name = kind.replace("/", "/msg/")
-    message: Any = store.deserialize_cdr(data, name) if encoding == "cdr" else store.deserialize_ros1(data, name)
-    return _READERS[kind](message)
+def _image(fields: _Fields) -> Record:
+    stamp_ns, frame = fields.header()
+    (height, width), encoding = fields.numbers("2I"), fields.text()
+    (big_endian,), (step,) = fields.numbers("B"), fields.numbers("I")
+    return ImageMessage(stamp_ns, frame, encoding, fields.octets(), False, width, height, step, bool(big_endian))
 
 
-def _stamp(message: Any) -> int:
-    return nanoseconds(message.header.stamp.sec, message.header.stamp.nanosec)
+def _compressed(fields: _Fields) -> Record:
+    return ImageMessage(*fields.header(), fields.text(), fields.octets(), True)
 
 
-def _image(message: Any) -> Record:
-    return ImageMessage(
-        _stamp(message), message.header.frame_id, message.encoding, message.data.tobytes(), False,
-        message.width, message.height, message.step, bool(message.is_bigendian),
-    )  # fmt: skip
+def _packet(fields: _Fields) -> Record:
+    """github.com/ros-misc-utilities/ffmpeg_image_transport_msgs."""
+    stamp_ns, frame = fields.header()
+    fields.numbers("2i")  # width, height
+    encoding = fields.text()
+    fields.numbers("Q")  # pts
+    fields.numbers("2B")  # flags, is_bigendian
+    return ImageMessage(stamp_ns, frame, encoding, fields.octets(), True)
 
 
-def _compressed(message: Any) -> Record:
-    return ImageMessage(_stamp(message), message.header.frame_id, message.format, message.data.tobytes(), True)
+def _video(fields: _Fields) -> Record:
+    """docs.foxglove.dev/docs/sdk/schemas."""
+    stamp_ns, frame, data = fields.stamp_ns(), fields.text(), fields.octets()
+    return ImageMessage(stamp_ns, frame, fields.text(), data, True)
 
 
-def _packet(message: Any) -> Record:
-    return ImageMessage(_stamp(message), message.header.frame_id, message.encoding, message.data.tobytes(), True)
-
-
-def _video(message: Any) -> Record:
-    stamp_ns = nanoseconds(message.timestamp.sec, message.timestamp.nanosec)
-    return ImageMessage(stamp_ns, message.frame_id, message.format, message.data.tobytes(), True)
-
-
-def _calibration(message: Any) -> Record:
-    # ROS 2 made the fields of ROS 1 lower case.
-    d, k, p, r = (np.array(getattr(message, n if hasattr(message, n) else n.upper()), np.float64) for n in "dkpr")
-    window, width, height = _window(message)
-    k = window @ k.reshape(3, 3) if k.any() else k.reshape(3, 3)
-    p = window @ p.reshape(3, 4) if p.any() else p.reshape(3, 4)
-    return CalibrationMessage(
-        _stamp(message), message.header.frame_id, width, height, message.distortion_model, d, k, p, r.reshape(3, 3)
-    )
-
-
-def _window(message: Any) -> tuple[Floats, int, int]:
-    """(3, 3) from px of the full image to px of the images as they come, and the width and height of those.
-
-    K and P are of the full image; roi says which part of it is sent, and binning how many px become one.
-    """
-    roi, x, y = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
+def _calibration(fields: _Fields) -> Record:
+    """K and P are of the full image; roi says which part of it is sent, and binning how many px become one."""
+    stamp_ns, frame = fields.header()
+    (height, width), model, distortion = fields.numbers("2I"), fields.text(), fields.doubles()
+    numbers = np.array(fields.numbers("30d"))
+    k, r, p = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(3, 4)
+    binning_x, binning_y, left, top, roi_height, roi_width, _ = fields.numbers("6IB")
+    x, y = max(binning_x, 1), max(binning_y, 1)
     # Pixel centres are whole numbers, so a pixel of n begins half a pixel before the first of them.
-    window = np.array([
-        [1 / x, 0.0, (0.5 - roi.x_offset) / x - 0.5],
-        [0.0, 1 / y, (0.5 - roi.y_offset) / y - 0.5],
-        [0.0, 0.0, 1.0],
-    ])  # fmt: skip
-    return window, (roi.width or message.width) // x, (roi.height or message.height) // y
+    window = np.array([[1 / x, 0.0, (0.5 - left) / x - 0.5], [0.0, 1 / y, (0.5 - top) / y - 0.5], [0.0, 0.0, 1.0]])
+    k, p = (window @ matrix if matrix.any() else matrix for matrix in (k, p))
+    size = (roi_width or width) // x, (roi_height or height) // y
+    return CalibrationMessage(stamp_ns, frame, *size, model, distortion, k, p, r)
 
 
-def _odometry(message: Any) -> Record:
-    return _pose(message, message.pose.pose, message.child_frame_id, message.pose.covariance)
+def _odometry(fields: _Fields) -> Record:
+    (stamp_ns, frame), child = fields.header(), fields.text()
+    numbers = fields.numbers("85d")  # pose and its covariance, twist and its own
+    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:7], numbers[7:43])
 
 
-def _pose_stamped(message: Any) -> Record:
-    return _pose(message, message.pose, "", None)
+def _pose(fields: _Fields) -> Record:
+    (stamp_ns, frame), numbers = fields.header(), fields.numbers("7d")
+    return PoseMessage(stamp_ns, frame, "", numbers[:3], numbers[3:], None)
 
 
-def _pose_with_covariance(message: Any) -> Record:
-    return _pose(message, message.pose.pose, "", message.pose.covariance)
+def _pose_with_covariance(fields: _Fields) -> Record:
+    (stamp_ns, frame), numbers = fields.header(), fields.numbers("43d")
+    return PoseMessage(stamp_ns, frame, "", numbers[:3], numbers[3:7], numbers[7:])
 
 
-def _pose(message: Any, pose: Any, child: str, covariance: Any) -> PoseMessage:
-    sigma = None if covariance is None else np.reshape(covariance, 36).astype(np.float64).tolist()
-    p, q = pose.position, pose.orientation
-    return PoseMessage(_stamp(message), message.header.frame_id, child, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), sigma)
+def _transform(fields: _Fields) -> PoseMessage:
+    (stamp_ns, frame), child, numbers = fields.header(), fields.text(), fields.numbers("7d")
+    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:], None)
 
 
-def _fix(message: Any) -> Record:
-    covariance = np.reshape(message.position_covariance, (3, 3)).astype(np.float64)
-    if message.position_covariance_type == _UNKNOWN_COVARIANCE:
-        covariance = np.full((3, 3), np.nan)
-    return FixMessage(
-        _stamp(message), message.status.status >= 0, message.latitude, message.longitude, message.altitude, covariance,
-        message.header.frame_id,
-    )  # fmt: skip
+def _transforms(fields: _Fields) -> Record:
+    return [_transform(fields) for _ in range(fields.numbers("I")[0])]
 
 
-def _transforms(message: Any) -> Record:
-    return [
-        TransformMessage(
-            t.header.frame_id, t.child_frame_id, _xyz(t.transform.translation), _xyzw(t.transform.rotation), _stamp(t)
-        )
-        for t in message.transforms
-    ]
+def _fix(fields: _Fields) -> Record:
+    (stamp_ns, frame), (status,) = fields.header(), fields.numbers("b")
+    fields.numbers("H")  # service
+    latitude, longitude, altitude, *covariance, kind = fields.numbers("12dB")
+    known = np.full((3, 3), np.nan) if kind == _UNKNOWN_COVARIANCE else np.array(covariance).reshape(3, 3)
+    return FixMessage(stamp_ns, status >= 0, latitude, longitude, altitude, known, frame)
 
 
-def _one_transform(message: Any) -> Record:
-    p, q = message.transform.translation, message.transform.rotation
-    position, quaternion = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
-    return PoseMessage(_stamp(message), message.header.frame_id, message.child_frame_id, position, quaternion, None)
-
-
-def _xyz(v: Any) -> Floats:
-    return np.array([v.x, v.y, v.z])
-
-
-def _xyzw(q: Any) -> Floats:
-    return np.array([q.x, q.y, q.z, q.w])
-
-
-_READERS: dict[str, Callable[[Any], Record]] = {
+_READERS: dict[str, Callable[[_Fields], Record]] = {
     "sensor_msgs/Image": _image,
     "sensor_msgs/CompressedImage": _compressed,
     "ffmpeg_image_transport_msgs/FFMPEGPacket": _packet,
     "foxglove_msgs/CompressedVideo": _video,
     "sensor_msgs/CameraInfo": _calibration,
     "nav_msgs/Odometry": _odometry,
-    "geometry_msgs/PoseStamped": _pose_stamped,
+    "geometry_msgs/PoseStamped": _pose,
     "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
-    "geometry_msgs/TransformStamped": _one_transform,
+    "geometry_msgs/TransformStamped": _transform,
     "sensor_msgs/NavSatFix": _fix,
     "tf2_msgs/TFMessage": _transforms,
     "tf/tfMessage": _transforms,

@@ -1,7 +1,7 @@
 """Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
 
 foxglove.CompressedVideo, ffmpeg_image_transport's packets, and sensor_msgs/CompressedImage with such a format. Decoding
-runs forward only: asked for frames in order of time, every packet between two key frames is decoded at most once, and
+runs forward only: for frames in order of time, every packet between two key frames is decoded at most once, and
 stretches between key frames without a frame of interest not at all. Behind a damaged or missing packet nothing is
 decoded up to the next key frame, since the pictures would be wrong; VP9 and AV1 do not tell a missing one.
 """
@@ -40,8 +40,8 @@ _DELAY = 64
 """Packets behind a frame that are given to the decoder before the frame counts as lost: H.264 and H.265 reorder 16."""
 _BROKEN = "a video packet between its key frame and it is damaged or missing"
 _START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
-_UNSEEN, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
-"""What a packet is: not looked at; needs those before it; parameter sets alone; a key frame without, or with them."""
+_UNREAD, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
+"""What a packet is: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
 
 
 def codec_of(encoding: str) -> str:
@@ -60,8 +60,8 @@ class VideoStream:
         self._av: Any = None
         self._decoder: Any = None
         self._numbers: FrameNumbers | None = None
-        self._asked = 0
-        """The last row asked for: frames behind it that came out since are ready."""
+        self._last = 0
+        """The last row given out: frames behind it that came out since are ready."""
         self._next = 0
         """The first row that the decoder has not been given."""
         self._damaged = -1
@@ -73,13 +73,13 @@ class VideoStream:
         return next((row for row in range(self._count) if self._kind(row) >= _KEY), None)
 
     def frame(self, row: int) -> Bytes:
-        """(H, W) uint8 grey; rows are best asked for in increasing order.
+        """(H, W) uint8 grey; rows are best read in increasing order.
 
         Raises BadMessageError where it cannot be decoded, and LogError where PyAV is not installed.
         """
         if row not in self._ready:
             self._advance(row)
-        self._asked = row
+        self._last = row
         found = self._ready.get(row)
         self._ready = {later: image for later, image in self._ready.items() if later >= row}
         if found is None:
@@ -88,7 +88,7 @@ class VideoStream:
 
     def _advance(self, row: int) -> None:
         """Give the decoder packets until the frame of this row comes out."""
-        running = self._decoder is not None and self._asked <= row
+        running = self._decoder is not None and self._last <= row
         key = self._key_before(row, self._next + 1 if running else 0)  # at a key frame that is next, it runs on
         if key is None and not running:
             raise BadMessageError("no key frame comes before it")
@@ -170,7 +170,7 @@ class VideoStream:
         return next((r for r in range(row, first - 1, -1) if self._kind(r) >= _KEY), None)
 
     def _kind(self, row: int) -> int:
-        if self._kinds[row] == _UNSEEN:
+        if self._kinds[row] == _UNREAD:
             self._kinds[row] = packet_kind(self._codec, self._packet(row))
         return self._kinds[row]
 
