@@ -92,7 +92,7 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
         fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
         return {"drives": fate, "joined": None, "join_error": ""}
 
-    monkeypatch.setattr("vplog.batch.redescribe.run_batch", run_batch)
+    monkeypatch.setattr(redescribe, "run_batch", run_batch)
     other = tmp_path / "library"
     shutil.copytree(finished / "library", other)
     record = json.loads((other / "library.json").read_text())
