@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.batch.test_batch import OPTIONS, QUICK, TINY, tables
+from vplog.batch import ray_cluster, ray_engine
 from vplog.batch.batch import run_batch
 from vplog.batch.ray_cluster import Head
 from vplog.batch.ray_engine import translated
@@ -95,9 +96,7 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     nodes: tuple[Any, list[Path]], logs: list[Path], alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Then a drive that is longer is added, its frames split over both nodes."""
-    monkeypatch.setattr(
-        "vplog.batch.ray_engine.RayEngine.look_for", lambda *_: None
-    )  # nobody sees the map but the batch
+    monkeypatch.setattr(ray_engine.RayEngine, "look_for", lambda *_: None)  # nobody sees the map but the batch
     monkeypatch.setattr(ray_cluster, "_ANSWER_S", 600.0)
     (cluster, places), pipeline, root = nodes, load_pipeline("default", SETTINGS), tmp_path / "map"
     [library], (first_log, bad_log, second_log, long_log) = (alone / "libraries").iterdir(), logs

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tests.maps.bucket import serving
+from vplog.batch import redescribe
 from vplog.batch.redescribe import redescribe_map
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
