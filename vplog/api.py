@@ -224,9 +224,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """ATE, RPE and drift of a run before and after, and which of its closures are right.
 
-    truth: a TUM file of poses, or `gps`, the log's own fixes. distance_m, heading_deg: bounds of one place (6 m, 45
-    degrees unless given). align: `se3`, `sim3` or `origin`, the alignment of the ATE. truth_offset_s: added to the
-    truth's stamps. Raises TruthError, ResultError.
+    truth: a TUM file of poses, or `gps`, the log's own fixes.
+    distance_m, heading_deg: bounds of one place; 6 m and 45 degrees unless given.
+    align: alignment of the ATE, `se3`, `sim3` or `origin`.
+    truth_offset_s: added to the truth's stamps.
     """
     from vplog.storage.remote_path import local_copy, located
     from vplog.verbs.evaluate_run import TruthOptions
@@ -261,10 +262,15 @@ def compare(
 ) -> Comparison:
     """Compare recognisers on the frames of one drive looked for in another, or in its own past with `min_gap` frames.
 
-    methods: `["bobb", "bovf:vocabulary=200"]`, or that text with commas. truth: FILE.csv of pairs, `index` (within
-    `tolerance` frames), FILE.tum, `poses` or `gps` (within `distance_m` and `heading_deg`). library: a log or a library
-    of reference images, None for `library_size` of the map's. sequence: also match windows of so many frames. out: a
-    local folder for compare.json, scores and curves. `record` of the result holds all figures.
+    `record` of the result holds the figures, `ranks` what they are of.
+
+    map: None to search the query's own frames, those `min_gap` frames older.
+    methods: recognisers or pipelines, `["bobb", "gist"]` or `"bobb,gist"`, each with `:setting=value` as needed.
+    truth: FILE.csv of pairs, `index` (within `tolerance` frames), FILE.tum, `poses` or `gps` (within `distance_m` and
+    `heading_deg`).
+    library: a log or a library of reference images, None for `library_size` images of the map drive.
+    sequence: also match windows of so many frames.
+    out: a local folder for compare.json, scores and curves.
     """
     from vplog.benchmark.compare import compare as compare_methods
     from vplog.benchmark.recogniser_specs import split_methods
@@ -311,10 +317,16 @@ def batch(
 ) -> dict[str, Any]:
     """Compute many drives into one growing map, each log in a process of its own, here or on a Ray cluster.
 
-    What the map has from the same log, settings and library stays. A drive that fails stops no other: `failed` of the
-    result counts them, `drives` has the state and the error of each, and `join_error` says why drives that are in the
-    map could not be joined. pipeline: None for the settings of the map. jobs: drives at once, each with so many
-    `threads`. tell: called with each drive as it ends.
+    What the map has from the same log, settings and library stays. A drive that fails stops no other and raises
+    nothing: `failed` of the result counts them, `drives` has the state and the error of each, and `join_error` says why
+    drives that are in the map could not be joined.
+
+    pipeline: None for the settings of the map, or the default for a new one.
+    jobs: drives at once, each with so many `threads`.
+    engine, address: `local` processes, or `ray` with the HOST:PORT of a cluster.
+    retries: more attempts at a drive whose process was killed.
+    join: whether closures between drives are looked for at the end.
+    tell: called with each drive as it ends.
     """
     from vplog.storage.remote_path import local_copy, located
 
@@ -392,8 +404,10 @@ class Map:
     ) -> Answers:
         """The `top` places of the map most like each view of a log.
 
-        sequence: views in a window, odd; 1 ranks each by itself, None as the map's settings say. out: a Parquet file
-        for the answers. engine, address: as in `batch`. cache, cache_gb: folder and size of the cache of a map by URL.
+        sequence: views in a window, odd; 1 ranks each by itself, None as the map's settings say.
+        out: a Parquet file for the answers.
+        engine, address: who searches, as in `batch`.
+        cache, cache_gb: folder and size of the cache of a map by URL.
         """
         from vplog.batch.engine import opened
         from vplog.maps.search.query import query_map
