@@ -89,9 +89,8 @@ def python_page() -> str:
                 lines += ["", f"### {name}.{member}{signature}", "", *_documented(one)]
     errors = [name for name in names if name.endswith("Error")]
     lines += ["", "## Errors", "", "All are a `VplogError`.", "", "| error | |", "|---|---|"]
-    return (
-        "\n".join([*lines, *(f"| `{name}` | {_cell(inspect.getdoc(names[name]) or '')} |" for name in errors)]) + "\n"
-    )
+    lines += [f"| `{name}` | {_cell(inspect.getdoc(names[name]) or '')} |" for name in errors]
+    return "\n".join(lines) + "\n"
 
 
 def _signature(function: Any) -> str:
@@ -103,8 +102,13 @@ def _signature(function: Any) -> str:
 
 
 def _documented(one: Any) -> list[str]:
-    """A docstring, its arguments as a list."""
-    return re.sub(r"(?m)^(\w+(?:, \w+)*): (?=\S)", r"- `\1`: ", inspect.getdoc(one) or "").splitlines()
+    """A docstring, its parameters as a list."""
+    parameters = inspect.signature(one).parameters if inspect.isfunction(one) else {}
+
+    def item(found: re.Match[str]) -> str:
+        return f"- `{found[1]}`: " if set(found[1].split(", ")) <= set(parameters) else found[0]
+
+    return re.sub(r"(?m)^(\w+(?:, \w+)*): (?=\S)", item, inspect.getdoc(one) or "").splitlines()
 
 
 def _help(*verb: str) -> str:

@@ -78,7 +78,7 @@ def test_every_public_name_is_there_and_documented() -> None:
 
 
 def test_help_reads_as_documentation() -> None:
-    text = pydoc.render_doc(vplog, renderer=pydoc.plaintext)
+    text = pydoc.plain(pydoc.render_doc(vplog))
     for name in ("run", "open_log", "open_run", "evaluate", "compare", "batch", "open_map"):
         assert f"\n    {name}(" in text, name
     assert "Unpack" not in text

@@ -6,17 +6,22 @@
     run.closures.to_pandas()                      # tables are Arrow tables
     vplog.evaluate(run, "truth.tum")["ate_after"]
 
-Files and folders are a str, a Path or a URL: s3://, gs://, and http(s):// to read. Keyword arguments have the names of
-the options of the command line. What cannot be done raises a VplogError, whose message says what, where and what next.
-No call needs an `if __name__ == "__main__"` guard.
+Files and folders are a str, a Path or a URL: s3://, gs://, and http(s):// to read. What cannot be done raises a
+VplogError, whose message says what, where and what next. Where it names an option of the command line, as --min-gap,
+the keyword argument is min_gap; `settings` is --set, and `topics` has what --image-topic and its like choose. No call
+needs an `if __name__ == "__main__"` guard.
 """
+
+from __future__ import annotations
 
 import sys
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # for type checkers it is true, and typing takes most of the time of this import
 if TYPE_CHECKING:
+    from typing import Any
+
     from vplog.api import Answers, Map, RunFolder, batch, compare, evaluate, open_log, open_map, open_run, run
     from vplog.errors import (
         GraphError,

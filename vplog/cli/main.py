@@ -42,7 +42,6 @@ from vplog.cli.printing import (
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, was_interrupted
 from vplog.execution.cores import available, limited
-from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -278,10 +277,7 @@ def _folder(path: Path) -> None:
 def demo(arguments: argparse.Namespace) -> None:
     """Render a small drive, run on it and evaluate the result."""
     from vplog.demo import DemoSettings, make_drive
-    from vplog.pipeline import CacheOptions
-    from vplog.pipeline import run as run_pipeline
     from vplog.run.report import outcome_of
-    from vplog.verbs.evaluate_run import evaluate as evaluate_run
     from vplog.verbs.report import report as write_report
 
     pipeline = pipeline_of(arguments)
@@ -290,16 +286,13 @@ def demo(arguments: argparse.Namespace) -> None:
         progress("render", 0, 1)
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
         progress("render", 1, 1)
-        done = run_pipeline(
-            drive.log, arguments.output / "run", pipeline, execution=Execution(arguments.threads, progress),
-            cache=CacheOptions(force=arguments.force),
-        )  # fmt: skip
-    found = evaluate_run(arguments.output / "run", str(drive.truth))
-    write_report(arguments.output / "run", truth=str(drive.truth))
+        out = arguments.output / "run"
+        done = api.run(drive.log, out, pipeline, force=arguments.force, threads=arguments.threads, progress=progress)
+    found = api.evaluate(done, drive.truth)
+    write_report(out, truth=str(drive.truth))
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    out = arguments.output / "run"
     print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
     print_evaluation(found)
 
