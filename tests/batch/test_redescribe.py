@@ -88,7 +88,7 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
         paths: list[Path], root: Path, pipeline: Any, library: Path, topics: Any, *_: Any, join: bool, **workers: Any
     ) -> dict[str, Any]:
         assert join == bool(asked), "once, when all are there"
-        assert workers == {"engine": "local", "address": None, "retries": 2}
+        assert workers == {"engine": "local", "address": None, "retries": 2, "processes": None}
         asked.append(([path.parent.name for path in paths], topics.image, pipeline.places.kind))
         fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
         return {"drives": fate, "joined": None, "join_error": ""}
