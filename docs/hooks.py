@@ -1,7 +1,8 @@
-"""Reference pages that are made from the code itself: settings, files, verbs."""
+"""Reference pages that are made from the code itself: settings, files, verbs, the Python API."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import subprocess
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mkdocs.structure.files import File
+
+import vplog
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -20,7 +23,7 @@ SCHEMAS = Path(__file__).parents[1] / "schemas"
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages; mkdocs calls this before it renders."""
-    pages = {"settings": settings_page(), "files": files_page(), "verbs": verbs_page()}
+    pages = {"settings": settings_page(), "files": files_page(), "verbs": verbs_page(), "python": python_page()}
     for name, text in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=text))
     return files
@@ -67,6 +70,45 @@ def verbs_page() -> str:
     for verb in re.findall(r"^ {4}(\w+)\b", overview, re.MULTILINE):
         lines += ["", f"## vplog {verb}", "", "```text", _help(verb), "```"]
     return "\n".join(lines) + "\n"
+
+
+def python_page() -> str:
+    """Functions, classes and errors of `import vplog`, from their docstrings."""
+    names = {name: getattr(vplog, name) for name in vplog.__all__}
+    functions = [name for name, one in names.items() if inspect.isfunction(one)]
+    classes = [name for name in names if inspect.isclass(names[name]) and not name.endswith("Error")]
+    lines = ["# Python", "", *_documented(vplog)]
+    for name in ("run", *(name for name in functions if name != "run")):
+        lines += ["", f"## vplog.{name}", "", "```python", f"vplog.{name}{_signature(names[name])}", "```"]
+        lines += ["", *_documented(names[name])]
+    for name in classes:
+        lines += ["", f"## {name}", "", *_documented(names[name])]
+        for member, one in vars(names[name]).items():
+            if not member.startswith("_") and inspect.getdoc(one) and not isinstance(one, str):
+                signature = _signature(one) if inspect.isfunction(one) else ""
+                lines += ["", f"### {name}.{member}{signature}", "", *_documented(one)]
+    errors = [name for name in names if name.endswith("Error")]
+    lines += ["", "## Errors", "", "All are a `VplogError`.", "", "| error | |", "|---|---|"]
+    lines += [f"| `{name}` | {_cell(inspect.getdoc(names[name]) or '')} |" for name in errors]
+    return "\n".join(lines) + "\n"
+
+
+def _signature(function: Any) -> str:
+    """Names and defaults, without types."""
+    signature, empty = inspect.signature(function), inspect.Parameter.empty
+    known = [one.replace(annotation=empty) for one in signature.parameters.values() if one.name != "self"]
+    text = str(signature.replace(parameters=known, return_annotation=empty))
+    return re.sub(r"<function (\S+) at \w+>", lambda found: "None" if "lambda" in found[1] else found[1], text)
+
+
+def _documented(one: Any) -> list[str]:
+    """A docstring, its parameters as a list."""
+    parameters = inspect.signature(one).parameters if inspect.isfunction(one) else {}
+
+    def item(found: re.Match[str]) -> str:
+        return f"- `{found[1]}`: " if set(found[1].split(", ")) <= set(parameters) else found[0]
+
+    return re.sub(r"(?m)^(\w+(?:, \w+)*): (?=\S)", item, inspect.getdoc(one) or "").splitlines()
 
 
 def _help(*verb: str) -> str:

@@ -101,7 +101,7 @@ def test_a_map_grows_by_its_new_drives_alone(
     whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With two jobs, the library given, one drive after the other and a bad one between: the bytes of one batch."""
-    monkeypatch.setattr("vplog.batch.batch._FREE_BYTES", 0)  # however full the disk is
+    monkeypatch.setattr(batch, "_FREE_BYTES", 0)  # however full the disk is
     [library] = (whole / "libraries").iterdir()
     root, bad = tmp_path / "map", tmp_path / "bad.mcap"
     bad.write_bytes(b"no log at all")

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.batch.test_batch import OPTIONS, QUICK, TINY, tables
+from vplog.batch import ray_cluster, ray_engine
 from vplog.batch.batch import run_batch
 from vplog.batch.ray_cluster import Head
 from vplog.batch.ray_engine import translated
@@ -95,10 +96,8 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     nodes: tuple[Any, list[Path]], logs: list[Path], alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Then a drive that is longer is added, its frames split over both nodes."""
-    monkeypatch.setattr(
-        "vplog.batch.ray_engine.RayEngine.look_for", lambda *_: None
-    )  # nobody sees the map but the batch
-    monkeypatch.setattr("vplog.batch.ray_cluster._ANSWER_S", 600.0)
+    monkeypatch.setattr(ray_engine.RayEngine, "look_for", lambda *_: None)  # nobody sees the map but the batch
+    monkeypatch.setattr(ray_cluster, "_ANSWER_S", 600.0)
     (cluster, places), pipeline, root = nodes, load_pipeline("default", SETTINGS), tmp_path / "map"
     [library], (first_log, bad_log, second_log, long_log) = (alone / "libraries").iterdir(), logs
     killed: list[int] = []
@@ -124,8 +123,8 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     assert not [path for place in places for path in place.glob("vplog-*/run-*")]
     assert not list(root.glob(".cache"))
 
-    monkeypatch.setattr("vplog.batch.ray_engine._PROBE_S", 600.0)  # a machine that is slow to tell is not refused here
-    monkeypatch.setattr("vplog.batch.ray_engine.made_by", lambda: {"code": "other", "versions": {}})
+    monkeypatch.setattr(ray_engine, "_PROBE_S", 600.0)  # a machine that is slow to tell is not refused here
+    monkeypatch.setattr(ray_engine, "made_by", lambda: {"code": "other", "versions": {}})
     with pytest.raises(SettingsError, match="has vplog's code"):
         run_batch(logs, root, pipeline, engine="ray", address=cluster.address)
 
@@ -133,7 +132,7 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
 def test_a_cluster_that_wants_a_token_or_has_no_cpus_is_said(
     nodes: tuple[Any, list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vplog.batch.ray_cluster._ANSWER_S", 600.0)
+    monkeypatch.setattr(ray_cluster, "_ANSWER_S", 600.0)
     pipeline, address = load_pipeline("default", SETTINGS), nodes[0].address
     with monkeypatch.context() as environment:
         environment.delenv("RAY_AUTH_MODE")
@@ -156,7 +155,7 @@ def test_errors_of_ray_say_what_to_do(kind: str, told: str) -> None:
 
 def test_a_lost_head_fails_what_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before Ray ends the process of the batch."""
-    monkeypatch.setattr("vplog.batch.ray_cluster._LOST_S", 0.3)
+    monkeypatch.setattr(ray_cluster, "_LOST_S", 0.3)
     ended = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as server:
         head = Head(f"127.0.0.1:{server.getsockname()[1]}")
@@ -214,7 +213,7 @@ def workers_of(place: str) -> list[str]:
 
 
 def test_an_address_without_a_cluster_is_said_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vplog.batch.ray_cluster._ANSWER_S", 3.0)
+    monkeypatch.setattr(ray_cluster, "_ANSWER_S", 3.0)
     pipeline = load_pipeline("default", SETTINGS)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]

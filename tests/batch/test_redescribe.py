@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tests.maps.bucket import serving
+from vplog.batch import redescribe
 from vplog.batch.redescribe import redescribe_map
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
@@ -92,7 +93,7 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
         fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
         return {"drives": fate, "joined": None, "join_error": ""}
 
-    monkeypatch.setattr("vplog.batch.redescribe.run_batch", run_batch)
+    monkeypatch.setattr(redescribe, "run_batch", run_batch)
     other = tmp_path / "library"
     shutil.copytree(finished / "library", other)
     record = json.loads((other / "library.json").read_text())

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 
+import vplog
 from tests.joined import QUICK, cut
 from vplog.data import Trajectory
 from vplog.evaluate.truth import read_truth
@@ -99,6 +101,16 @@ def test_the_ledger_names_both_drives(joint: Path) -> None:
     kept = [row for row in table if row["weight"] == 1]
     assert len(kept) >= 3
     assert all(row["verdict"] == "accepted" and row["shared_references"] for row in kept)
+
+
+def test_from_python_a_joint_run_has_a_run_for_each_drive(joint: Path) -> None:
+    found = vplog.open_run(joint)
+    assert list(found.drives) == [one["name"] for one in found.record["drives"]]
+    drive = found.drives["before"]
+    assert drive.table("joint_trajectory").schema.names == drive.trajectory.schema.names
+    assert {"query_drive", "match_drive"} <= set(found.table("joins").column_names)
+    with pytest.raises(vplog.ResultError, match="Give one of them"):
+        _ = found.trajectory
 
 
 def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Callable[..., Said]) -> None:

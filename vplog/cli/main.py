@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import shlex
 import signal
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import vplog
+from vplog import api
 from vplog.cli.benchmark import add_studies
 from vplog.cli.maps import add_maps
 from vplog.cli.options import (
@@ -42,7 +42,6 @@ from vplog.cli.printing import (
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, was_interrupted
 from vplog.execution.cores import available, limited
-from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -68,7 +67,6 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
     arguments = _parser().parse_args(sys.argv[1:] if argv is None else argv)
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
-    logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are printed with the result
     try:
         with _ended_by(signal.SIGTERM), _at_hand(arguments), limited(getattr(arguments, "threads", None)):
             arguments.verb(arguments)
@@ -204,29 +202,14 @@ def library(arguments: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
     from vplog.run.report import outcome_of
-    from vplog.storage.remote_path import local_copy
 
     paths, pipeline, library, topics = _asked(arguments)
-    # a cache that is sent over the net costs more than it saves
-    use_cache = arguments.cache and "://" not in str(arguments.shown)
-    with ExitStack() as stack, Progress(arguments) as progress:
-        if library is not None:  # by URL, as an unfinished run may name it
-            library = stack.enter_context(local_copy(library))
-        if len(paths) > 1 and not arguments.one_drive:
-            from vplog.sessions.joint_run import run_joint
-
-            found = run_joint(
-                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress), use_cache,
-                arguments.force,
-            )  # fmt: skip
-        else:
-            from vplog.pipeline import CacheOptions
-            from vplog.pipeline import run as run_pipeline
-
-            found = run_pipeline(
-                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress),
-                CacheOptions(use=use_cache, force=arguments.force),
-            ).record  # fmt: skip
+    remote = "://" in str(arguments.shown)  # and `output` what is sent there
+    with Progress(arguments) as progress:
+        found = api.run(
+            paths, arguments.output, pipeline, topics=topics, library=library, one_drive=arguments.one_drive,
+            cache=arguments.cache and not remote, force=arguments.force, threads=arguments.threads, progress=progress,
+        ).record  # fmt: skip
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
     elif "maps" in found:
@@ -294,10 +277,7 @@ def _folder(path: Path) -> None:
 def demo(arguments: argparse.Namespace) -> None:
     """Render a small drive, run on it and evaluate the result."""
     from vplog.demo import DemoSettings, make_drive
-    from vplog.pipeline import CacheOptions
-    from vplog.pipeline import run as run_pipeline
     from vplog.run.report import outcome_of
-    from vplog.verbs.evaluate_run import evaluate as evaluate_run
     from vplog.verbs.report import report as write_report
 
     pipeline = pipeline_of(arguments)
@@ -306,22 +286,19 @@ def demo(arguments: argparse.Namespace) -> None:
         progress("render", 0, 1)
         drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
         progress("render", 1, 1)
-        done = run_pipeline(
-            drive.log, arguments.output / "run", pipeline, execution=Execution(arguments.threads, progress),
-            cache=CacheOptions(force=arguments.force),
-        )  # fmt: skip
-    found = evaluate_run(arguments.output / "run", str(drive.truth))
-    write_report(arguments.output / "run", truth=str(drive.truth))
+        out = arguments.output / "run"
+        done = api.run(drive.log, out, pipeline, force=arguments.force, threads=arguments.threads, progress=progress)
+    found = api.evaluate(done, drive.truth)
+    write_report(out, truth=str(drive.truth))
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    out = arguments.output / "run"
     print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
     print_evaluation(found)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="vplog", description=vplog.__doc__)
+    parser = Parser(prog="vplog", description=(vplog.__doc__ or "").splitlines()[0])
     parser.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print one JSON object")

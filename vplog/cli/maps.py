@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vplog import api
 from vplog.cli.options import (
     at_least,
     at_least_one,
@@ -34,11 +34,8 @@ from vplog.cli.printing import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from typing import Any
-
-    from vplog.execution.process_pool import OwnProcesses
-    from vplog.maps.storage.download_cache import Cache
 
 
 def export_map(arguments: argparse.Namespace) -> None:
@@ -86,7 +83,7 @@ def remove_drives(arguments: argparse.Namespace) -> None:
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """Copy a map to another, its drives described with another library; their logs are read again."""
-    with _processes(arguments) as processes, Progress(arguments) as progress:
+    with api.drive_processes(arguments.engine, arguments.jobs) as processes, Progress(arguments) as progress:
         from vplog.batch.redescribe import redescribe_map as redescribe
 
         found = redescribe(
@@ -97,38 +94,14 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
     _end(arguments, found, print_redescribed, wrong)
 
 
-@contextmanager
-def _processes(arguments: argparse.Namespace, drives: int | None = None) -> Iterator[OwnProcesses | None]:
-    """The processes of drives, which load while this one does; of so many drives where that is known."""
-    if arguments.engine != "local":
-        yield None
-        return
-    from vplog.execution.process_pool import OwnProcesses
-
-    count = (arguments.jobs or 1) + 1
-    with OwnProcesses(count if drives is None else min(count, drives)) as processes:
-        processes.begin()
-        yield processes
-
-
 def batch(arguments: argparse.Namespace) -> None:
     """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
-    from vplog.errors import SettingsError
-
-    if arguments.odometry_file is not None and len(arguments.logs) > 1:
-        raise SettingsError(
-            f"--odometry-file {arguments.odometry_file} is of one drive, and {len(arguments.logs)} logs are given. "
-            "Give each log by itself with its own file; each command adds a drive to the map."
-        )
-    with _processes(arguments, len(arguments.logs)) as processes, Progress(arguments) as progress:
-        from vplog.batch.batch import run_batch, settings_for
-
-        pipeline = settings_for(arguments.map, arguments.pipeline, arguments.set)
-        found = run_batch(
-            arguments.logs, arguments.map, pipeline, arguments.library, topics_of(arguments), arguments.jobs,
-            arguments.threads, progress, engine=arguments.engine, address=arguments.address,
-            retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache, tell=progress.tell_drive,
-            processes=processes,
+    with Progress(arguments) as progress:
+        found = api.batch(
+            arguments.logs, arguments.map, arguments.pipeline, settings=arguments.set, topics=topics_of(arguments),
+            library=arguments.library, jobs=arguments.jobs, threads=arguments.threads, engine=arguments.engine,
+            address=arguments.address, retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
+            progress=progress, tell=progress.tell_drive,
         )  # fmt: skip
     wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
     _end(arguments, found, print_batch, wrong)
@@ -165,26 +138,21 @@ def info_map(arguments: argparse.Namespace) -> None:
 
 def query_map(arguments: argparse.Namespace) -> None:
     """Find the places of a map most like each view of a log, here or on the workers of a Ray cluster."""
-    from vplog.batch.engine import opened
-    from vplog.maps.search.query import query_map as find_places
-
-    cache = _cache(arguments)
-    with (
-        opened(arguments.engine, arguments.address, 1, arguments.threads) as engine,
-        Progress(arguments) as progress,
-    ):
-        found = find_places(
-            arguments.map, arguments.log, topics_of(arguments), arguments.top, arguments.sequence,
-            arguments.output, arguments.threads, progress, engine.executor, cache,
+    with Progress(arguments) as progress:
+        found = api.Map(arguments.map).query(
+            arguments.log, arguments.top, topics=topics_of(arguments), sequence=arguments.sequence,
+            out=arguments.output, engine=arguments.engine, address=arguments.address, cache=arguments.cache,
+            cache_gb=arguments.cache_gb, threads=arguments.threads, progress=progress,
         )  # fmt: skip
-    print_result(arguments, found, print_answers)
+    print_result(arguments, found.record, print_answers)
 
 
 def index_map(arguments: argparse.Namespace) -> None:
     """Bring the index that queries search up to date with the drives of a map, as the next query would."""
     from vplog.maps.search.query import index_map as update
+    from vplog.maps.storage.download_cache import cache_in
 
-    cache = _cache(arguments)
+    cache = None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)
     with Progress(arguments) as progress:
         found = update(arguments.map, arguments.threads, progress, cache)
     if arguments.json:
@@ -195,13 +163,6 @@ def index_map(arguments: argparse.Namespace) -> None:
             f"files, {found['bytes'] / 1e6:.1f} MB"
         )
         warn(found["warnings"])
-
-
-def _cache(arguments: argparse.Namespace) -> Cache | None:
-    """Of what is read of a map by URL; a map in a folder needs none."""
-    from vplog.maps.storage.download_cache import cache_in
-
-    return None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)
 
 
 def add_maps(

@@ -2,6 +2,10 @@
 
 pebble's pool starts a new process for each task, kills them all on Ctrl-C and reports which task's process died. With
 one more process than jobs, one always has its modules loaded, which takes two seconds, when a drive ends.
+
+multiprocessing has a spawned process import the main module of its parent, since what it is to call may be there: a
+script without `if __name__ == "__main__"` would run again in each. Tasks are functions of this package alone, so these
+processes are started without.
 """
 
 from __future__ import annotations
@@ -10,11 +14,16 @@ import importlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from multiprocessing import resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from pebble import ProcessExpired, ProcessPool
+
+from vplog.errors import SettingsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +37,24 @@ _WORK = "vplog.batch.worker"
 """What every process loads first."""
 
 
+class _Process(SpawnProcess):
+    _starting = threading.Lock()
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:  # noqa: N802 (multiprocessing's name)
+        with _Process._starting:
+            main = sys.modules["__main__"]
+            sys.modules["__main__"] = ModuleType("__main__")  # of no file, so that there is none to import
+            try:
+                return SpawnProcess._Popen(process_obj)
+            finally:
+                sys.modules["__main__"] = main
+
+
+class _Spawn(SpawnContext):
+    Process = _Process
+
+
 class OwnProcesses:
     """So many processes, each for one task; those without a task end with the block, as do all where it fails."""
 
@@ -39,14 +66,18 @@ class OwnProcesses:
         """Start the processes where they are not running: they load meanwhile."""
         if self._pool is not None and self._pool.active:
             return self._pool
+        if multiprocessing.current_process().daemon:
+            raise SettingsError(
+                "Drives are computed in processes of their own, which a daemonic process, as those of "
+                "multiprocessing.Pool, cannot start. Call this from one of concurrent.futures.ProcessPoolExecutor."
+            )
         self._end()  # pebble gives up a pool where a process is killed that has no task
         # Ctrl-C reaches every process of a terminal; these inherit the mask and are ended by their parent instead.
         # The tracker that Python starts with the first process would take the mask off again.
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            spawn = multiprocessing.get_context("spawn")
-            self._pool = ProcessPool(self._count, 1, _load, context=spawn)
+            self._pool = ProcessPool(self._count, 1, _load, context=_Spawn())
             self._pool.active  # noqa: B018 (starts it)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)  # where a Ctrl-C that waited is raised

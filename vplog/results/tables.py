@@ -17,7 +17,7 @@ import pyarrow as pa
 
 import vplog
 from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
-from vplog.errors import ResultError
+from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
 from vplog.results.run_record import canonical_json
 from vplog.storage.parquet_limits import (
@@ -143,6 +143,9 @@ TRAJECTORY = pa.schema(
         *_pose_columns("odom_", "odom_from_body, as logged"),
     ]
 )
+
+
+_SCHEMAS = {"keyframes": KEYFRAMES, "closures": CLOSURES, "joins": JOINS, "edges": EDGES, "trajectory": TRAJECTORY}
 
 
 def descriptors_schema(descriptor: pa.DataType) -> pa.Schema:
@@ -417,6 +420,17 @@ def read_descriptors(path: Path) -> tuple[pa.Array, str]:
         _check_name(path, "descriptors", file.schema_arrow)
         table = read_table(path, file, ["descriptor"])
         return table["descriptor"].combine_chunks(), (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
+
+
+def read_arrow(path: Path) -> pa.Table:
+    """A table of a run as Arrow, by the name of its file, its columns checked. Raises ResultError."""
+    name = path.stem.removeprefix("joint_")
+    if name != "descriptors" and name not in _SCHEMAS:
+        raise ResultError(
+            f"No table {path.stem!r}.{nearest(name, _SCHEMAS)} Tables: {', '.join(_SCHEMAS)}, descriptors."
+        )
+    schema = descriptors_schema(descriptors_type(path)) if name == "descriptors" else _SCHEMAS[name]
+    return _read(path, name, schema)
 
 
 def read_stamps(path: Path) -> Ints:

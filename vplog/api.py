@@ -1,0 +1,482 @@
+"""What `import vplog` offers: the program as functions of Python, over which the verbs of the command line are thin."""
+
+from __future__ import annotations
+
+import logging
+import os
+import weakref
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from vplog.errors import ResultError, SettingsError
+from vplog.execution.cores import available, limited
+from vplog.execution.execution import Execution, silent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    import numpy as np
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from vplog.batch.batch import Drive
+    from vplog.benchmark.compare import Comparison
+    from vplog.execution.execution import Progress
+    from vplog.execution.process_pool import OwnProcesses
+    from vplog.logs import TopicChoice
+    from vplog.pipeline import Pipeline
+    from vplog.stages import Log
+
+    Place = str | Path
+    """A path, or a URL as text."""
+    Topics = TopicChoice | Mapping[str, Any]
+    """Topics and files to use instead of those that the rules choose, by part: `{"image": "/left"}`."""
+    Settings = dict[str, Any] | Sequence[str]
+    """Single settings by dotted name, `{"library.size": 50}`, or as --set has them, `["library.size=50"]`."""
+
+logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are in the records
+
+
+def run(
+    log: Place | Sequence[Place],
+    out: Place,
+    pipeline: str | Path | Pipeline = "default",
+    *,
+    settings: Settings | None = None,
+    topics: Topics | None = None,
+    library: Place | None = None,
+    one_drive: bool = False,
+    cache: bool = True,
+    force: bool = False,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> RunFolder:
+    """Turn a recorded drive into an optimised trajectory, in the run folder `out`.
+
+    Several logs are drives of one graph where closures join them; with `one_drive`, the parts of one recording.
+
+    pipeline: a shipped name (`default`, `paper`, ...), a YAML file or a Pipeline.
+    settings: single settings by dotted name, `{"features.max_features": 600}`.
+    topics: by part, `{"image": "/left", "odometry": "/odom"}`; the parts are the fields of vplog.logs.TopicChoice.
+    library: reference images as `vplog library` writes them, None to choose them in the drive.
+    cache: whether results of stages stay in `out` for later runs.
+    force: whether the run of another log in `out` is replaced.
+    threads: None for one a core; results do not depend on it.
+    progress: called with a stage, items done and items in all, from any thread.
+    """
+    from vplog.pipeline import CacheOptions
+    from vplog.pipeline import run as run_drive
+    from vplog.sessions.joint_run import run_joint
+    from vplog.storage.remote_path import RemotePath, local_copy, local_output, located
+
+    place, execution = located(out), Execution(threads or available(), progress)
+    paths, chosen, parts = _paths(log), _pipeline(pipeline, settings), _topics(topics)
+    remote = isinstance(place, RemotePath)
+    with ExitStack() as stack:
+        stack.enter_context(limited(execution.threads))
+        folder = stack.enter_context(local_output(place))
+        references = None if library is None else stack.enter_context(local_copy(located(library)))
+        kept = cache and not remote  # a cache that is sent over the net costs more than it saves
+        if len(paths) > 1 and not one_drive:
+            record = run_joint(paths, folder, chosen, references, parts, execution, kept, force)
+        else:
+            options = CacheOptions(use=kept, force=force)
+            record = run_drive(paths, folder, chosen, references, parts, execution, options).record
+    return open_run(out) if remote else RunFolder(place, record)
+
+
+def open_log(log: Place | Sequence[Place], topics: Topics | None = None) -> Log:
+    """A drive as vplog reads it, its kind found by content; several files are the parts of one recording.
+
+    `stamps()` (F,) i64 in ns, `frames(stamps)` to decode one by one, `camera()`, `odometry()`, `gps()`, `info()` and
+    `warnings`, as vplog.stages.Log says.
+    """
+    from vplog import logs
+
+    return logs.open_drive(_paths(log), _topics(topics))
+
+
+def open_run(folder: Place) -> RunFolder:
+    """A finished run, or a drive of a map (MAP/runs/drive=ID). One by URL is copied for as long as the result lives."""
+    from vplog.results.run_record import read_finished_run
+    from vplog.storage.remote_path import local_copy, located
+
+    with ExitStack() as stack:
+        here = stack.enter_context(local_copy(located(folder)))
+        found = RunFolder(here, read_finished_run(here))
+        weakref.finalize(found, stack.pop_all().close)
+    return found
+
+
+class RunFolder:
+    """A finished run: its record, its tables as Arrow, and the images of its keyframes.
+
+    Every table is a pyarrow.Table, whose `to_pandas()` gives a data frame where pandas is installed. Poses are columns
+    `tx ty tz` (m) and `qx qy qz qw`; the page *Files and columns* of the documentation explains each column.
+    """
+
+    def __init__(self, folder: Path, record: dict[str, Any]) -> None:
+        self.folder = folder
+        """On this machine."""
+        self.record = record
+        """What run.json holds: settings, counts, timings, warnings, what was lost."""
+
+    def __repr__(self) -> str:
+        return f"RunFolder({str(self.folder)!r})"
+
+    @property
+    def trajectory(self) -> pa.Table:
+        """A row for each odometry sample: `stamp_ns`, world_from_body as optimised, and `odom_` as logged."""
+        return self.table("trajectory")
+
+    @property
+    def keyframes(self) -> pa.Table:
+        """A row for each keyframe: `stamp_ns`, `odom_` and `world_` poses."""
+        return self.table("keyframes")
+
+    @property
+    def closures(self) -> pa.Table:
+        """A row for each candidate closure, rejected ones too: `query`, `match`, `verdict`, `inliers`, `weight`, ..."""
+        return self.table("closures")
+
+    @property
+    def drives(self) -> dict[str, RunFolder]:
+        """The runs of a joint run by name of the drive, whose poses in the common frame are tables `joint_...`."""
+        from vplog.storage.folders import is_below
+
+        folders = {one["name"]: one["folder"] for one in self.record.get("drives", ())}
+        if not all(map(is_below, folders.values())):
+            raise ResultError(f"{self.folder}/run.json names drives outside its folder. Run `vplog run` again.")
+        return {name: open_run(self.folder / folder) for name, folder in folders.items()}
+
+    def table(self, name: str) -> pa.Table:
+        """A table by the name of its file: `edges`, `descriptors`, `joins` of a joint run, ... Raises ResultError."""
+        from vplog.results import tables
+        from vplog.results.run_record import read_single_run
+
+        if not (self.folder / f"{name}.parquet").is_file():
+            read_single_run(self.folder)  # names the drives where there are several
+        return tables.read_arrow(self.folder / f"{name}.parquet")
+
+    def images(
+        self,
+        keyframes: Iterable[int] | None = None,
+        *,
+        from_log: bool = False,
+        log: Place | Sequence[Place] | None = None,
+        topics: Topics | None = None,
+    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Row and grey image (H, W) of keyframes, of all where None, in order of time, one in memory at a time.
+
+        They are those of result.mcap, reduced by the setting pictures.megapixels; with `from_log` those of the log, as
+        recorded, which run.json names unless `log` says where it is. Raises ResultError where one is missing.
+        """
+        import numpy as np
+
+        stamps = np.asarray(self.keyframes["stamp_ns"])
+        rows = np.arange(len(stamps)) if keyframes is None else np.unique(np.asarray(list(keyframes), np.int64))
+        if len(rows) and not 0 <= rows[0] <= rows[-1] < len(stamps):
+            raise ResultError(f"{self.folder} has keyframes 0..{len(stamps) - 1}, not {rows[0]}..{rows[-1]}.")
+        wanted = dict(zip(stamps[rows].tolist(), rows.tolist(), strict=True))
+        found = self._recorded(stamps[rows], log, topics) if from_log or log is not None else self._shown()
+        for stamp_ns, image in found:
+            if stamp_ns in wanted:
+                yield wanted.pop(stamp_ns), image()
+        if wanted:
+            where = "the log" if from_log or log is not None else f"{self.folder}/result.mcap"
+            other = "" if where == "the log" else " Take those of the log: images(from_log=True)."
+            raise ResultError(f"{where} has no image of keyframe {min(wanted.values())}.{other}")
+
+    def _shown(self) -> Iterator[tuple[int, Callable[[], Any]]]:
+        from vplog.results.mcap_read import read_images
+        from vplog.storage.image_file import BadImageError, decode_image
+
+        path = self.folder / "result.mcap"
+        try:
+            for one in read_images(path):
+                yield one.stamp_ns, lambda jpeg=one.image: decode_image(jpeg)
+        except BadImageError as error:
+            raise ResultError(f"An image of {path} cannot be decoded: {error}. Run `vplog run` again.") from None
+
+    def _recorded(
+        self, stamps: Any, log: Place | Sequence[Place] | None, topics: Topics | None
+    ) -> Iterator[tuple[int, Callable[[], Any]]]:
+        from vplog.run.provenance import reopened
+
+        parts = _topics(self.record.get("topics") if topics is None else topics)
+        opened = open_log(log, parts) if log is not None else reopened(self.record, None, parts, "Name it: log=LOG.")
+        for frame in opened.frames(stamps):
+            yield frame.stamp_ns, lambda frame=frame: frame.decode().image
+
+
+def evaluate(
+    run: RunFolder | Place,
+    truth: Place,
+    *,
+    distance_m: float | None = None,
+    heading_deg: float | None = None,
+    align: str | None = None,
+    truth_offset_s: float | None = None,
+    topics: Topics | None = None,
+) -> dict[str, Any]:
+    """ATE, RPE and drift of a run before and after, and which of its closures are right.
+
+    truth: a TUM file of poses, or `gps`, the log's own fixes.
+    distance_m, heading_deg: bounds of one place; 6 m and 45 degrees unless given.
+    align: alignment of the ATE, `se3`, `sim3` or `origin`.
+    truth_offset_s: added to the truth's stamps.
+    """
+    from vplog.storage.remote_path import local_copy, located
+    from vplog.verbs.evaluate_run import TruthOptions
+    from vplog.verbs.evaluate_run import evaluate as evaluate_run
+
+    given = {"distance_m": distance_m, "heading_deg": heading_deg, "align": align, "truth_offset_s": truth_offset_s}
+    options: Any = {name: value for name, value in given.items() if value is not None}
+    with local_copy(run.folder if isinstance(run, RunFolder) else located(run)) as folder:
+        return evaluate_run(folder, os.fspath(truth), _topics(topics), TruthOptions(**options))
+
+
+def compare(
+    query: Place,
+    map: Place | None = None,
+    *,
+    methods: str | Iterable[str],
+    truth: Place,
+    tolerance: int | None = None,
+    distance_m: float | None = None,
+    heading_deg: float | None = None,
+    pipeline: str | Path | Pipeline = "default",
+    settings: Settings | None = None,
+    topics: Topics | None = None,
+    library: Place | None = None,
+    library_size: int = 100,
+    library_seed: int = 0,
+    min_gap: int | None = None,
+    sequence: int | None = None,
+    out: Place | None = None,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> Comparison:
+    """Compare recognisers on the frames of one drive looked for in another, or in its own past with `min_gap` frames.
+
+    `record` of the result holds the figures, `ranks` what they are of.
+
+    map: None to search the query's own frames, those `min_gap` frames older.
+    methods: recognisers or pipelines, `["bobb", "gist"]` or `"bobb,gist"`, each with `:setting=value` as needed.
+    truth: FILE.csv of pairs, `index` (within `tolerance` frames), FILE.tum, `poses` or `gps` (within `distance_m` and
+    `heading_deg`).
+    library: a log or a library of reference images, None for `library_size` images of the map drive.
+    sequence: also match windows of so many frames.
+    out: a local folder for compare.json, scores and curves.
+    """
+    from vplog.benchmark.compare import compare as compare_methods
+    from vplog.benchmark.recogniser_specs import split_methods
+    from vplog.evaluate.place_truth import TruthChoice
+    from vplog.storage.remote_path import local_copy, located
+
+    threads = threads or available()
+    with limited(threads), ExitStack() as stack:
+        return compare_methods(
+            located(query),
+            None if map is None else located(map),
+            split_methods(methods) if isinstance(methods, str) else methods,
+            TruthChoice(os.fspath(truth), tolerance, distance_m, heading_deg),
+            _pipeline(pipeline, settings),
+            library=None if library is None else stack.enter_context(local_copy(located(library))),
+            library_size=library_size,
+            library_seed=library_seed,
+            min_gap=min_gap,
+            sequence=sequence,
+            out=None if out is None else located(out),
+            topics=_topics(topics),
+            threads=threads,
+            progress=progress,
+        )
+
+
+def batch(
+    logs: Iterable[Place],
+    map: Place,
+    pipeline: str | Path | Pipeline | None = None,
+    *,
+    settings: Settings | None = None,
+    topics: Topics | None = None,
+    library: Place | None = None,
+    jobs: int | None = None,
+    threads: int | None = None,
+    engine: str = "local",
+    address: str | None = None,
+    retries: int = 2,
+    join: bool = True,
+    keep_cache: bool = False,
+    progress: Progress = silent,
+    tell: Callable[[Drive], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Compute many drives into one growing map, each log in a process of its own, here or on a Ray cluster.
+
+    What the map has from the same log, settings and library stays. A drive that fails stops no other and raises
+    nothing: `failed` of the result counts them, `drives` has the state and the error of each, and `join_error` says why
+    drives that are in the map could not be joined.
+
+    pipeline: None for the settings of the map, or the default for a new one.
+    jobs: drives at once, each with so many `threads`.
+    engine, address: `local` processes, or `ray` with the HOST:PORT of a cluster.
+    retries: more attempts at a drive whose process was killed.
+    join: whether closures between drives are looked for at the end.
+    tell: called with each drive as it ends.
+    """
+    from vplog.storage.remote_path import local_copy, located
+
+    paths, parts, threads = _paths(list(logs)), _topics(topics), threads or available()
+    if parts is not None and parts.odometry_file is not None and len(paths) > 1:
+        raise SettingsError(
+            f"--odometry-file {parts.odometry_file} is of one drive, and {len(paths)} logs are given. "
+            "Give each log by itself with its own file; each command adds a drive to the map."
+        )
+    with limited(threads), drive_processes(engine, jobs, len(paths)) as processes, ExitStack() as stack:
+        from vplog.batch.batch import run_batch, settings_for
+
+        root = located(map)
+        if pipeline is None or isinstance(pipeline, str):
+            chosen = settings_for(root, pipeline, _assignments(settings))
+        else:
+            chosen = _pipeline(pipeline, settings)
+        references = None if library is None else stack.enter_context(local_copy(located(library)))
+        return run_batch(
+            paths, root, chosen, references, parts, jobs, threads, progress, engine=engine, address=address,
+            retries=retries, join=join, keep_cache=keep_cache, tell=tell, processes=processes,
+        )  # fmt: skip
+
+
+@contextmanager
+def drive_processes(engine: str, jobs: int | None, drives: int | None = None) -> Iterator[OwnProcesses | None]:
+    """The processes of the drives of a batch, which load while this one does; None where another engine computes."""
+    if engine != "local":
+        yield None
+        return
+    from vplog.execution.process_pool import OwnProcesses
+
+    count = (jobs or 1) + 1
+    with OwnProcesses(count if drives is None else min(count, drives)) as processes:
+        processes.begin()
+        yield processes
+
+
+def open_map(map: Place) -> Map:
+    """A map of many drives, as `batch` writes it. Raises ResultError where there is none."""
+    from vplog.maps.storage import map_store
+    from vplog.storage.remote_path import located
+
+    with map_store.reading(place := located(map)) as store:
+        store.head()
+    return Map(place)
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map of many drives: what it holds, and where in it the views of a log are."""
+
+    place: Path
+
+    def info(self, check: bool = False) -> dict[str, Any]:
+        """Drives, places, library, joins and failures; with `check` every file is held against its checksum."""
+        from vplog.maps.info import describe_map
+
+        return describe_map(self.place, check=check)
+
+    def query(
+        self,
+        log: Place,
+        top: int = 10,
+        *,
+        topics: Topics | None = None,
+        sequence: int | None = None,
+        out: Place | None = None,
+        engine: str = "local",
+        address: str | None = None,
+        cache: Path | None = None,
+        cache_gb: float | None = None,
+        threads: int | None = None,
+        progress: Progress = silent,
+    ) -> Answers:
+        """The `top` places of the map most like each view of a log.
+
+        sequence: views in a window, odd; 1 ranks each by itself, None as the map's settings say.
+        out: a Parquet file for the answers.
+        engine, address: who searches, as in `batch`.
+        cache, cache_gb: folder and size of the cache of a map by URL.
+        """
+        from vplog.batch.engine import opened
+        from vplog.maps.search.query import query_map
+        from vplog.maps.storage.download_cache import cache_in
+        from vplog.storage.remote_path import RemotePath, located
+
+        threads = threads or available()
+        downloads = cache_in(cache, cache_gb) if isinstance(self.place, RemotePath) else None
+        with limited(threads), opened(engine, address, 1, threads) as workers:
+            found = query_map(
+                self.place, located(log), _topics(topics), top, sequence, None if out is None else located(out),
+                threads, progress, workers.executor, downloads,
+            )  # fmt: skip
+        return Answers(found)
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Where in a map the views of a log are."""
+
+    record: dict[str, Any]
+    """Counts, warnings, and the answers as plain values."""
+
+    @cached_property
+    def table(self) -> pa.Table:
+        """A row for each answer: `query`, `rank`, `drive`, `keyframe`, `score`, ..., best first for each view."""
+        import pyarrow as pa
+
+        from vplog.results.placed import PLACED
+
+        return pa.Table.from_pylist(self.record["answers"], schema=PLACED)
+
+
+def _paths(log: Place | Sequence[Place]) -> list[Path]:
+    from pathlib import Path
+
+    from vplog.storage.remote_path import RemotePath, located
+
+    one: Any = log
+    paths = [located(path) for path in ([one] if isinstance(one, str | Path | RemotePath) else one)]
+    if not paths:
+        raise SettingsError("No log is given. Give a path or a URL, or several.")
+    return paths
+
+
+def _pipeline(pipeline: str | Path | Pipeline, settings: Settings | None) -> Pipeline:
+    from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
+
+    if isinstance(pipeline, Pipeline):
+        assignments = _assignments(settings)
+        return pipeline_from(pipeline.model_dump(mode="json"), "pipeline", assignments) if assignments else pipeline
+    return load_pipeline(os.fspath(pipeline), _assignments(settings))
+
+
+def _assignments(settings: Settings | None) -> list[str]:
+    """As --set has them; JSON is YAML."""
+    import json
+
+    if not isinstance(settings, dict):
+        return list(settings or ())
+    return [f"{name}={json.dumps(value, default=str)}" for name, value in settings.items()]
+
+
+def _topics(topics: Topics | None) -> TopicChoice | None:
+    """With absolute paths of files, so that run.json is understood from any folder."""
+    from vplog.logs import TopicChoice
+
+    if topics is None or isinstance(topics, TopicChoice):
+        return topics
+    choice = TopicChoice.read(dict(topics), "topics")
+    files = {name: path.resolve() for name in ("odometry_file", "calibration_file") if (path := getattr(choice, name))}
+    return choice.model_copy(update=files)
