@@ -15,7 +15,7 @@ from vplog.logs.formats.chunk_cache import Chunks
 from vplog.logs.formats.compression import BadChunkError
 from vplog.logs.formats.container import Channel, Message, Notes, in_blocks
 from vplog.logs.formats.mcap_file import McapFile
-from vplog.logs.formats.mcap_walk import Walk
+from vplog.logs.formats.mcap_walk import ChunkReader
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,13 +82,14 @@ def test_messages_are_found_in_place_as_in_the_whole(
     for brief in ((), wanted):
         defined: list[list] = [[], []]
         walks = [
-            Walk(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief) for to in defined
+            ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief)
+            for to in defined
         ]
         whole = walks[0].whole(data)
         there = walks[1].in_place(lambda start, length: data[start : start + length])
         assert defined[0] == defined[1]
         assert walks[0].__dict__.keys() == walks[1].__dict__.keys()
-        for name in ("position", "unknown", "last_ns", "seen"):
+        for name in ("position", "unknown", "last_ns", "counts"):
             assert getattr(walks[0], name) == getattr(walks[1], name)
         assert (whole.channels, whole.log_ns, whole.places) == (there.channels, there.log_ns, there.places)
         for a, b in zip(whole.messages(), there.messages(), strict=True):
