@@ -50,7 +50,7 @@ def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool, monkeypatc
 
 def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunks_module, "MOST_BYTES", 1000)
-    kept = chunks_module._Kept()
+    kept = chunks_module._RecentChunks()
     for number in range(50):
         kept.put((number % 2, number), bytes(90))
     assert kept._bytes == 90 * len(kept._chunks) <= 1000
