@@ -322,7 +322,7 @@ def test_several_damages_are_never_silent_nor_exaggerated(name: str, tmp_path: P
     path = form.write(tmp_path)
     whole = path.read_bytes()
     fields, rng, problems = list(FIELDS[path.suffix](whole)), random.Random(13), []
-    for number in range(60):
+    for number in range(25):
         path.write_bytes(damaged(whole, fields, rng))
         if found := problem(path, WRITTEN, form._replace(counted=False), content=False):
             problems.append(f"{number}: {found}")
