@@ -293,3 +293,70 @@ def test_a_bag_that_is_cut_between_two_records_is_cut(tmp_path: Path) -> None:
         container, _ = open_container(path, notes)
         container.contents()
         assert [loss.reason for loss in notes.account.losses] == ["cut"], end
+
+
+SEVERAL = ("mcap-lz4", "mcap-zstd", "mcap-no-summary", "mcap-unchunked", "bag-none", "bag-bz2", "bag-lz4", "db3-folder")
+"""Formats of all kinds; in a chunk that is neither packed nor has a checksum, several damages can pass for messages."""
+
+
+def damaged(whole: bytes, fields: list[Field], rng: random.Random) -> bytes:
+    """Two to four damages: wrong lengths, zeroed blocks, bytes by chance; and now and then a cut tail."""
+    data = whole
+    for _ in range(rng.randrange(2, 5)):
+        kind, at = rng.randrange(4), rng.randrange(len(whole))
+        if kind == 0:
+            field = rng.choice(fields)
+            data = field.set(data, rng.choice((0, field.read(whole) + 1, 2 * field.read(whole), 2**31, 2**32 - 1)))
+        else:
+            width = (1, 4, 20, 100)[rng.randrange(4)]
+            bytes_there = data[at : at + width]
+            wrong = bytes(len(bytes_there)) if kind == 1 else rng.randbytes(len(bytes_there))
+            data = data[:at] + wrong + data[at + width :]
+    return data[: rng.randrange(len(data) // 3, len(data))] if rng.random() < 0.2 else data
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_several_damages_are_never_silent_nor_exaggerated(name: str, tmp_path: Path) -> None:
+    """What is said lost is at most what is missing; where it is less, or nothing, more of unknown number is said."""
+    form = FORMATS[name]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    fields, rng, problems = list(FIELDS[path.suffix](whole)), random.Random(13), []
+    for number in range(25):
+        path.write_bytes(damaged(whole, fields, rng))
+        if found := problem(path, WRITTEN, form._replace(counted=False), content=False):
+            problems.append(f"{number}: {found}")
+    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in FORMATS if name not in ("mcap-cut-off", "bag-unindexed", "bag-none-unindexed")]
+)
+def test_what_is_behind_the_end_of_a_recording_is_said(name: str, tmp_path: Path) -> None:
+    """Two recordings in one file: the first is read whole, the second is not passed over without a word."""
+    form = FORMATS[name]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole)
+    notes = Notes()
+    container, _ = open_container(path, notes)
+    contents = container.contents()
+    assert Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in container.messages(contents.counts)) == WRITTEN
+    (loss,) = notes.account.losses
+    assert (loss.reason, loss.messages) == ("appended", None)
+    assert f"ends at byte {len(whole)} of {2 * len(whole)}" in loss.detail
+
+
+@pytest.mark.parametrize("kind", ["", "BZ2", "LZ4"])
+def test_the_index_of_a_bag_counts_what_damage_to_a_chunk_and_its_own_index_took(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "log.bag", kind)
+    whole = path.read_bytes()
+    index = [field for field in FIELDS[".bag"](whole) if field.name == "op4.header_length"]
+    for field in index[:6]:
+        chunk = max(
+            f.offset for f in FIELDS[".bag"](whole) if f.name == "op5.header_length" and f.offset < field.offset
+        )
+        data = bytearray(field.set(whole, 0))
+        data[chunk + 120 : chunk + 140] = bytes(20)
+        path.write_bytes(data)
+        assert problem(path, WRITTEN, Format(write_bag), content=False) == ""  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from vplog.logs.formats.chunk_cache import Chunks
 from vplog.logs.formats.compression import BadChunkError
 from vplog.logs.formats.container import Channel, Message, Notes, in_blocks
 from vplog.logs.formats.mcap_file import McapFile
-from vplog.logs.formats.mcap_walk import Walk
+from vplog.logs.formats.mcap_walk import ChunkReader
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +50,7 @@ def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool, monkeypatc
 
 def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunks_module, "MOST_BYTES", 1000)
-    kept = chunks_module._Kept()
+    kept = chunks_module._RecentChunks()
     for number in range(50):
         kept.put((number % 2, number), bytes(90))
     assert kept._bytes == 90 * len(kept._chunks) <= 1000
@@ -82,13 +82,14 @@ def test_messages_are_found_in_place_as_in_the_whole(
     for brief in ((), wanted):
         defined: list[list] = [[], []]
         walks = [
-            Walk(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief) for to in defined
+            ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief)
+            for to in defined
         ]
         whole = walks[0].whole(data)
         there = walks[1].in_place(lambda start, length: data[start : start + length])
         assert defined[0] == defined[1]
         assert walks[0].__dict__.keys() == walks[1].__dict__.keys()
-        for name in ("position", "unknown", "last_ns", "seen"):
+        for name in ("position", "unknown", "last_ns", "counts"):
             assert getattr(walks[0], name) == getattr(walks[1], name)
         assert (whole.channels, whole.log_ns, whole.places) == (there.channels, there.log_ns, there.places)
         for a, b in zip(whole.messages(), there.messages(), strict=True):

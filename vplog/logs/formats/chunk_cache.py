@@ -1,4 +1,4 @@
-"""The chunks of a file, unpacked: those to come by other threads, those gone by kept as long as there is room."""
+"""The chunks of a file, unpacked: those to come by other threads, the last ones stay in memory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _AHEAD_BYTES = 32 * 2**20
 """Bytes of unpacked chunks that wait to be gone through; a chunk larger than that is unpacked when its turn comes."""
 
 
-class _Kept:
+class _RecentChunks:
     """The chunks last used by any file of the process: a drive may have a hundred files, and each of them chunks."""
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class _Kept:
                 self._bytes -= len(self._chunks.pop(key))
 
 
-_KEPT = _Kept()
+_RECENT = _RecentChunks()
 _FILES = itertools.count()
 
 
@@ -79,16 +79,16 @@ class Chunks:
         packed: Callable[[int], bool],
         threads: bool,
     ) -> None:
-        """`load` reads and unpacks one, in any thread where `threads`; it raises BadChunkError, which `damaged` is told
-        in the thread that asks. `size` says how many bytes there will be, `packed` whether to keep them."""
+        """`load` reads and unpacks one, in any thread where `threads`; for its BadChunkError `damaged` is called in the
+        thread of the caller. `size` says how many bytes there will be, `packed` whether to keep them."""
         self._load, self._damaged, self._size, self._packed = load, damaged, size, packed
         self._threads = min(_THREADS, allowed()) if threads else 0
         self._file = next(_FILES)
-        weakref.finalize(self, _KEPT.forget, self._file)
+        weakref.finalize(self, _RECENT.forget, self._file)
 
     def __call__(self, number: int) -> bytes:
-        kept = _KEPT.get((self._file, number))
-        return self._take(number, lambda: self._load(number)) if kept is None else kept
+        recent = _RECENT.get((self._file, number))
+        return self._take(number, lambda: self._load(number)) if recent is None else recent
 
     def part(self, number: int, start: int, stop: int) -> Octets:
         """Bytes of a chunk, as `part_of`."""
@@ -128,7 +128,7 @@ class Chunks:
                     if waiting and waiting_bytes + size > _AHEAD_BYTES:
                         break
                     handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not (stays and stays(following))
-                    handed = handed and _KEPT.get((self._file, following)) is None
+                    handed = handed and _RECENT.get((self._file, following)) is None
                     waiting.append((following, pool.submit(self._load, following) if handed else None))
                     waiting_bytes += size
                     following = next(numbers, None)
@@ -150,7 +150,7 @@ class Chunks:
             self._damaged(number, error)
             data = b""
         if self._packed(number):
-            _KEPT.put((self._file, number), data)
+            _RECENT.put((self._file, number), data)
         return data
 
 

@@ -107,24 +107,24 @@ class Contents:
 
 @dataclass
 class Notes:
-    """What is said of a log: remarks, each once, in the order they were found, and the account of what is lost."""
+    """Remarks on a log, each once, in the order they were found, and the account of what is lost."""
 
     account: Account = field(default_factory=Account)
-    _said: list[str] = field(default_factory=list)
+    _remarks: list[str] = field(default_factory=list)
 
     def add(self, line: str) -> None:
-        if line not in self._said:
-            self._said.append(line)
+        if line not in self._remarks:
+            self._remarks.append(line)
 
     def extend(self, other: Notes) -> None:
         self.account.extend(other.account)
-        for line in other._said:
+        for line in other._remarks:
             self.add(line)
 
     @property
     def lines(self) -> list[str]:
         """The losses first."""
-        return [*self.account.sentences, *self._said]
+        return [*self.account.sentences, *self._remarks]
 
 
 class Container(Protocol):
@@ -137,7 +137,7 @@ class Container(Protocol):
         ...
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        """The same by the bytes they lie in, one block in memory at a time. Of large messages of `brief` channels, in
+        """Messages by the bytes they lie in, one block in memory at a time. Of large messages of `brief` channels, in
         the encodings of ROS, only the header's stamp is there: what follows it, up to their stop and beyond the end of
         the block, are bytes of others. `read` gives them whole."""
         ...
@@ -148,7 +148,7 @@ class Container(Protocol):
 
 
 def ordered(counts: dict[Channel, int]) -> dict[Channel, int]:
-    """The same counts in an order that does not depend on the file."""
+    """Counts in an order that does not depend on the file."""
     return dict(sorted(counts.items()))
 
 

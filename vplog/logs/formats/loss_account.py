@@ -1,4 +1,4 @@
-"""What of a log could not be used: counted by topic, placed in time, and said in one line each.
+"""What of a log could not be used: counted by topic, placed in time, in one sentence for each reason.
 
 Times are log times, as the recorder wrote them: they are there even where a message's own stamp is the damage.
 """
@@ -20,6 +20,7 @@ Span = tuple[int, int]
 
 REASONS = {
     "cut": "after the place where the file is cut off or unreadable to its end",
+    "appended": "behind the end of the recording",
     "missing_file": "in storage files that are missing or unreadable",
     "damaged_bytes": "in bytes that hold no record",
     "damaged_chunk": "in damaged chunks or pages",
@@ -80,7 +81,7 @@ class Account:
     """Messages by topic of each file, as far as anything says."""
     _found: dict[tuple[str, str], dict[tuple[str, int], _Lost]] = field(default_factory=dict)
     _settled: set[tuple[str, tuple[str, int]]] = field(default_factory=set)
-    """Losses that were given their numbers: found again without any, they say nothing new."""
+    """Losses that what was recorded gave their numbers: found again, they say nothing new."""
 
     def add(
         self,
@@ -94,12 +95,19 @@ class Account:
 
         `key`, a file or topic and a place in it, makes the same loss found again replace itself.
         """
-        if (reason, key) in self._settled and (counts is None or "" in counts):
+        if (reason, key) in self._settled:
             return
         self._found.get((reason, ""), {}).pop(key, None)  # their topic, or how many, may be known by now
         spans = [(min(span), max(span)) for span in spans]  # damage may have turned them around
         for topic, count in ({"": None} if counts is None else counts).items():
             self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)
+
+    def add_appended(self, file: str, at: int, length: int) -> None:
+        """Bytes behind the end of a recording, from `at` to the file's `length`: another one was appended to it."""
+        detail = (
+            f"{file} ends at byte {at} of {length}, and another recording follows, which is not read. Split it there."
+        )
+        self.add("appended", None, (file, at), [], detail)
 
     def extend(self, other: Account) -> None:
         """Add what another found."""
@@ -124,11 +132,14 @@ class Account:
     def settle(
         self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
     ) -> dict[str, int]:
-        """Give the losses in these files that nothing counted their numbers: what was recorded, less what was found
-        and what is counted already. `end_ns` is when the recording ended. Gives what no loss explains.
+        """Make the losses in these files add up to what was recorded less what was found: those that nothing counted
+        get what is left, and those that were counted twice, by an index in the wrong place, lose it. `end_ns` is when
+        the recording ended. Gives what no loss explains.
         """
         if not recorded:
             return {}
+        for topic, count in recorded.items():
+            self._reduce(topic, files, found.get(topic, 0) + self._outside(topic, files) - count)
         short = {topic: count - found.get(topic, 0) - self._outside(topic, files) for topic, count in recorded.items()}
         short = {topic: count for topic, count in short.items() if count > 0}
         left_open = [
@@ -150,8 +161,28 @@ class Account:
         self._settled.update((reason, key) for reason, key, _ in left_open)
         return {}
 
+    def _reduce(self, topic: str, files: Collection[str], excess: int) -> None:
+        """Take as many messages from the counted losses of a topic, the last first; none where there are not as many:
+        then it is the number of recorded ones that is wrong."""
+        counted = [
+            (reason, key, lost)
+            for reason in _HOW_MANY_OPEN
+            for key, lost in sorted(self._found.get((reason, topic), {}).items(), key=lambda item: item[0])
+            if key[0] in files and lost.messages and topic
+        ]
+        if excess > sum(lost.messages or 0 for _, _, lost in counted):
+            return
+        for reason, key, lost in reversed(counted):
+            less = min(max(excess, 0), lost.messages or 0)
+            if less:
+                lost.messages, excess = (lost.messages or 0) - less, excess - less
+                self._settled.add((reason, key))
+            if not lost.messages:
+                del self._found[reason, topic][key]
+
     def _outside(self, topic: str, files: Collection[str]) -> int:
-        places = [lost for reason in _OUTSIDE for lost in self._found.get((reason, topic), {}).items()]
+        reasons = _OUTSIDE if topic else ("damaged_chunk",)  # what has no topic yet may get one, or is in none
+        places = [lost for reason in reasons for lost in self._found.get((reason, topic), {}).items()]
         return sum(lost.messages or 0 for key, lost in places if key[0] in files)
 
     @property

@@ -20,7 +20,7 @@ from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
 from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, ordered, plural, topics_of
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
-from vplog.logs.formats.mcap_walk import Walk
+from vplog.logs.formats.mcap_walk import ChunkReader
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class McapFile:
     """A Container over one MCAP file."""
 
     def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
-        """`name` is what the file is called where something is said of it."""
+        """`name` is what the file is called in remarks."""
         self._name, self._notes = name or path.name, notes
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
@@ -54,7 +54,7 @@ class McapFile:
         self._sound = bytearray(len(self._layout.chunks))
         """1 for chunks whose checksum was found right."""
         sizes = [chunk.stop - chunk.start if self._is_plain(chunk) else chunk.size for chunk in self._layout.chunks]
-        self._data = Chunks(self._unpack, self._lose, sizes.__getitem__, self._is_kept, self._local)
+        self._data = Chunks(self._unpack, self._add_damaged_chunk, sizes.__getitem__, self._is_cached, self._local)
 
     def contents(self) -> Contents:
         """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
@@ -84,10 +84,10 @@ class McapFile:
                 times += (chunk.first_ns, chunk.last_ns)
             else:
                 data = self._data(number)
-                walk = Walk(number, len(data), self._channels, self._define, None, cut=chunk.cut)
-                times += walk.whole(data).log_ns
-                damaged = self._account_for_chunk(chunk, walk) or not data
-                counts.append(walk.seen | Counter(chunk.counts) if damaged else walk.seen)
+                reader = ChunkReader(number, len(data), self._channels, self._define, None, cut=chunk.cut)
+                times += reader.whole(data).log_ns
+                damaged = self._account_for_chunk(chunk, reader) or not data
+                counts.append(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
             times = [min(times), max(times)] if times else []
         return _total(counts), times
 
@@ -104,12 +104,12 @@ class McapFile:
             if not self._may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
             end = chunk.stop - chunk.start if data is None else len(data)
-            walk = Walk(number, end, self._channels, self._define, wanted, brief, chunk.cut)
+            reader = ChunkReader(number, end, self._channels, self._define, wanted, brief, chunk.cut)
             if data is None:
-                yield walk.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
+                yield reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
-                yield walk.whole(data)
-            self._account_for_chunk(chunk, walk)
+                yield reader.whole(data)
+            self._account_for_chunk(chunk, reader)
 
     def read(self, place: Place) -> Octets:
         number, start, stop = place
@@ -119,7 +119,7 @@ class McapFile:
         return self._data.part(number, start, stop)
 
     def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
-        """What the walk could not find, and how much of what was recorded that is."""
+        """What was not found, and how much of what was recorded that is."""
         layout, account, name = self._layout, self._notes.account, self._name
         recorded = topics_of(layout.recorded, self._channels)
         lost = dict(found)
@@ -131,9 +131,8 @@ class McapFile:
             for topic, count in counts.items():
                 lost[topic] = lost.get(topic, 0) + count
         for start, stop in layout.gaps:
-            if not any(start <= chunk.start < stop for chunk in layout.missing):
-                detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
-                account.add("damaged_bytes", None, (name, start), self._between(start, start_ns, end_ns), detail)
+            detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
+            account.add("damaged_bytes", None, (name, -start), self._between(start, start_ns, end_ns), detail)
         if layout.unknown_at is not None and (not recorded or sum(lost.values()) < sum(recorded.values())):
             detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
             account.add("damaged_bytes", None, (name, layout.unknown_at), [(start_ns, end_ns)], detail)
@@ -144,9 +143,10 @@ class McapFile:
                 f"the {plural(total, 'message')} before it are read."
             )
             account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)], detail)
+        if layout.appended_at is not None:
+            account.add_appended(name, layout.appended_at, self._length)
         if layout.index_cut_at is not None:
-            at = layout.index_cut_at
-            self._notes.add(f"{name} is cut or damaged at byte {at}, after its last message; none is lost.")
+            self._notes.add(f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message.")
         whole = layout.cut_at is None and not layout.gaps
         account.know(name, recorded or (lost if whole or layout.missing else {}), start_ns)
         unexplained = account.settle({name}, recorded, found)
@@ -182,7 +182,7 @@ class McapFile:
         """Take schemas and channels of a damaged summary where no chunk has them."""
         for number in range(len(self._layout.chunks)):
             data = self._data(number)
-            Walk(number, len(data), self._channels, self._define, None).whole(data)
+            ChunkReader(number, len(data), self._channels, self._define, None).whole(data)
         for opcode, data in self._layout.spare:
             self._define(opcode, data, doubtful=True)
         self._layout.spare.clear()
@@ -196,20 +196,20 @@ class McapFile:
             self._doubtful.discard((opcode, number))
         return news
 
-    def _account_for_chunk(self, chunk: Chunk, walk: Walk) -> bool:
-        """Account for what a chunk is short of that was walked; whether it is damaged."""
-        key, account, seen = (self._name, chunk.start), self._notes.account, walk.seen
+    def _account_for_chunk(self, chunk: Chunk, reader: ChunkReader) -> bool:
+        """Account for what a chunk lacks; whether it is damaged."""
+        key, account, counts = (self._name, chunk.start), self._notes.account, reader.counts
         known = {i: n for i, n in chunk.counts.items() if i in self._channels}
-        fewer = not self._sound[walk.number] and seen.total() < sum(chunk.counts.values())
-        damaged = walk.end > 0 and not chunk.cut and (walk.position < walk.end or fewer)
+        fewer = not self._sound[reader.number] and counts.total() < sum(chunk.counts.values())
+        damaged = reader.end > 0 and not chunk.cut and (reader.position < reader.end or fewer)
         if damaged:
-            short = topics_of({i: n - seen[i] for i, n in known.items()}, self._channels)
+            short = topics_of({i: n - counts[i] for i, n in known.items()}, self._channels)
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
-            last_ns = chunk.first_ns if walk.last_ns is None else walk.last_ns
+            last_ns = chunk.first_ns if reader.last_ns is None else reader.last_ns
             span = (min(last_ns, chunk.last_ns), chunk.last_ns)
             account.add("damaged_chunk", short if chunk.counts else None, key, [span], detail)
-        elif walk.unknown:
-            account.add("unknown_channel", {"": walk.unknown}, key, [(chunk.first_ns, chunk.last_ns)])
+        elif reader.unknown:
+            account.add("unknown_channel", {"": reader.unknown}, key, [(chunk.first_ns, chunk.last_ns)])
         return damaged
 
     def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
@@ -229,7 +229,7 @@ class McapFile:
             self._sound[number] = 1
         return data
 
-    def _lose(self, number: int, error: BadChunkError) -> None:
+    def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
         """Account for a damaged chunk."""
         self._define_all(error.data)
         chunk = self._layout.chunks[number]
@@ -238,7 +238,7 @@ class McapFile:
         counts = topics_of(chunk.counts, self._channels) if chunk.counts else None
         self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), [span], detail)
 
-    def _is_kept(self, number: int) -> bool:
+    def _is_cached(self, number: int) -> bool:
         """Parts of what is not packed can be read again by themselves, unless each costs a request."""
         return not self._local or not self._is_plain(self._layout.chunks[number])
 

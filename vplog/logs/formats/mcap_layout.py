@@ -1,7 +1,7 @@
-"""Where the chunks of an MCAP file lie (mcap.dev/spec): found by walking it record by record, over damage too.
+"""Where the chunks of an MCAP file lie (mcap.dev/spec): read record by record, over damage too.
 
-Chunks are stepped over, so the walk reads a few kB per MB. A record says its length twice, before its fields and by
-them: where the two differ, the one with a record behind it holds. Where neither has, the walk goes on at the next chunk
+Chunks are stepped over, so that it reads a few kB per MB. A record says its length twice, before its fields and by
+them: where the two differ, the one with a record behind it holds. Where neither has, reading goes on at the next chunk
 that the file's own index names, or else at the next bytes that can be a record.
 """
 
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
 """Opcode and length before every record."""
+_INDEX_HEAD = struct.Struct("<BQHI")
+"""Opcode, length, channel id, bytes of entries: a message index up to its entries."""
+_MESSAGE_INDEX = int(Opcode.MESSAGE_INDEX)
 _CHUNK_HEAD = struct.Struct("<QQQII")
 """Start, end, unpacked size, CRC, length of the compression's name: the head of a chunk record."""
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -39,11 +42,15 @@ _MAX_DEFINITION = 16 * 2**20
 _MAX_SUMMARY = 64 * 2**20
 """Bytes of a summary whose checksum is tried; one of 100,000 chunks has some 10 MB."""
 _RUN = 2**20
-"""Bytes up to which neighbouring messages outside chunks are kept as one run."""
+"""Bytes up to which neighbouring messages outside chunks form one run."""
 _FARTHEST_NS = 10 * 365 * 86_400 * 10**9
 """ns between two messages of a log above which bytes that look like a message are none: ten years."""
 _PRIVATE = 0x80
-"""Opcodes from here on are an application's own and stepped over, as the specification asks."""
+"""Opcodes from here on are an application's own and stepped over, as the specification requires."""
+_BEGIN = re.compile(re.escape(MAGIC) + rb"\x01")
+"""How a recording begins: another one may be appended to the first."""
+_FILLED = re.compile(rb"[^\0]")
+"""Anything but the zeros that a disk may leave behind the end."""
 _U32, _U64 = -4, -8
 """Bytes behind a length of 4 or 8 bytes, in _SHAPES."""
 _SHAPES: dict[int, tuple[int, ...]] = {
@@ -92,7 +99,7 @@ class Chunk:
 
 @dataclass
 class Layout:
-    """What the walk found."""
+    """Chunks and damage of a file."""
 
     chunks: list[Chunk] = field(default_factory=list)
     missing: list[Chunk] = field(default_factory=list)
@@ -100,29 +107,31 @@ class Layout:
     recorded: dict[int, int] = field(default_factory=dict)
     """Messages per channel id by the file's statistics; empty where it has none."""
     gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Where damage may begin, and where the walk goes on."""
+    """Where damage may begin, and where reading goes on."""
     cut_at: int | None = None
     """Byte behind which nothing can be read, where messages may have been."""
     unknown_at: int | None = None
     """The first record of an unknown kind that would be a message if that byte were damaged."""
     spare: list[tuple[int, bytes]] = field(default_factory=list)
     """Schemas and channels of a summary whose checksum is wrong, for those that no other place defines."""
+    appended_at: int | None = None
+    """Byte behind the end of the recording where another one follows."""
     index_cut_at: int | None = None
     """Byte behind which nothing can be read, where the messages had ended."""
 
 
 def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None], name: str) -> Layout:
-    """Walk the file; `define` gets every schema and channel record outside the chunks. Raises LogError."""
-    walk = _Walk(file, length, define)
-    if walk.at(0, len(MAGIC)) != MAGIC:
+    """Read the records of a file; `define` gets every schema and channel record outside the chunks. Raises LogError."""
+    reader = _LayoutReader(file, length, define)
+    if reader.at(0, len(MAGIC)) != MAGIC:
         raise LogError(f"{name} is not an MCAP file: it does not start with MCAP's magic bytes.")
-    walk.check_summary()
-    walk.records(len(MAGIC))
-    walk.finish()
-    return walk.layout
+    reader.check_summary()
+    reader.records(len(MAGIC))
+    reader.finish()
+    return reader.layout
 
 
-class _Walk:
+class _LayoutReader:
     def __init__(self, file: BinaryIO, length: int, define: Callable[[int, bytes], None]) -> None:
         self._length, self._define = length, define
         self.layout = Layout()
@@ -145,15 +154,20 @@ class _Walk:
             if not opcode:
                 if data_ended:
                     self.layout.index_cut_at = min(position, self._length)
+                    self.layout.appended_at = self._search.first(_BEGIN, position)
                     return
                 resumed = self._resume(before, position) if len(self.layout.gaps) < MOST_GAPS else None
                 if resumed is None:
+                    if self._indexing is not None and position < self._length:
+                        self._indexing.doubtful = True
                     self.layout.cut_at = min(position, self._length)
                     return
                 before = position = resumed
                 continue
             self._record(opcode, position, min(stop, self._length), cut=stop > self._length)
             if opcode == Opcode.FOOTER or (opcode == Opcode.DATA_END and self._summary_sound):  # read before
+                if opcode == Opcode.FOOTER and self._search.first(_FILLED, stop + len(MAGIC)) is not None:
+                    self.layout.appended_at = stop + len(MAGIC)
                 return
             if stop > self._length:
                 self.layout.cut_at = self._length
@@ -199,17 +213,22 @@ class _Walk:
         """Opcode of the record at `position` and where it stops, either as what it must have been where one of them is
         damaged; opcode 0, which the specification has as invalid, where there is none. A chunk may go on behind the end
         of the file."""
-        head = self.at(position, RECORD.size)
+        head = self.at(position, _INDEX_HEAD.size)
         if len(head) < RECORD.size:
             return 0, 0
-        opcode, length = RECORD.unpack(head)
+        opcode, length = RECORD.unpack_from(head)
         start = position + RECORD.size
         stop = start + length
+        if opcode == _MESSAGE_INDEX and length == int.from_bytes(head[-4:], "little") + 6 and stop <= self._length:
+            return opcode, stop  # most records are of this kind
         if opcode == Opcode.MESSAGE and length >= _MESSAGE_HEAD.size and stop <= self._length and not self._chunked:
             return opcode, stop
         for kind in (opcode, Opcode.CHUNK, Opcode.MESSAGE_INDEX):  # of which damage may have changed the opcode
-            agrees = self._length_by_fields(kind, start) == length
-            if agrees and (self._is_chunk(position, length) if kind == Opcode.CHUNK else stop <= self._length):
+            if kind == Opcode.CHUNK:
+                agrees = self._is_chunk(position, length)
+            else:
+                agrees = self._length_by_fields(kind, start) == length and stop <= self._length
+            if agrees:
                 return kind, stop
         by_fields = start + (self._length_by_fields(opcode, start) or 0)
         for end in sorted({stop, by_fields}):
@@ -249,7 +268,9 @@ class _Walk:
     def _record(self, opcode: int, position: int, stop: int, cut: bool) -> None:
         start = position + RECORD.size
         length = stop - start
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if opcode == _MESSAGE_INDEX:
+            self._add_message_index(start, length)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             data = self.at(start, min(length, _MAX_DEFINITION))
             if self._summary_sound is False and position >= (self._summary_start or 0):
                 self.layout.spare.append((opcode, data))
@@ -259,11 +280,6 @@ class _Walk:
             self._add_chunk(start, stop, cut)
         elif opcode == Opcode.MESSAGE:
             self._add_message(start, stop)
-        elif opcode == Opcode.MESSAGE_INDEX and self._indexing is not None and length >= 6:
-            chunk, channel_id = self._indexing, int.from_bytes(self.at(start, 2), "little")
-            chunk.doubtful |= channel_id in chunk.counts or (length - 6) % _ENTRY > 0
-            if length > 6:
-                chunk.counts[channel_id] = (length - 6) // _ENTRY
         elif opcode == Opcode.STATISTICS and 46 <= length <= _MAX_DEFINITION:  # 42 bytes of totals, then id and count
             data = self.at(start, length)
             total, size = struct.unpack_from("<Q34xI", data)
@@ -272,6 +288,14 @@ class _Walk:
             self.layout.recorded = counts if sum(counts.values()) == total <= self._length else {}
         elif opcode == Opcode.CHUNK_INDEX and 64 <= length <= _MAX_DEFINITION:
             self._add_index(self.at(start, length))
+
+    def _add_message_index(self, start: int, length: int) -> None:
+        if self._indexing is None or length < 6:
+            return
+        chunk, channel_id = self._indexing, int.from_bytes(self.at(start, 2), "little")
+        chunk.doubtful |= channel_id in chunk.counts or (length - 6) % _ENTRY > 0
+        if length > 6:
+            chunk.counts[channel_id] = (length - 6) // _ENTRY
 
     def _add_chunk(self, start: int, stop: int, cut: bool) -> None:
         head = self.at(start, _CHUNK_HEAD.size)
@@ -325,7 +349,8 @@ class _Walk:
         else:
             found = self._search.first(_UNCHUNKED, position + 1, self._is_likely)
         found = self._summary_start if found is None else found
-        if found is None or found <= position:
+        self.layout.appended_at = self._search.first(_BEGIN, before, stop=found)
+        if found is None or found <= position or self.layout.appended_at is not None:
             return None
         self._indexing = None
         if chunks and chunks[-1].record >= 0:

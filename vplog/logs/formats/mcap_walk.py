@@ -1,4 +1,4 @@
-"""The messages of one chunk of an MCAP file (mcap.dev/spec), found by walking it record by record."""
+"""The messages of one chunk of an MCAP file (mcap.dev/spec), read record by record."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
 _IS_MESSAGE, _IS_SCHEMA, _DEFINES = int(Opcode.MESSAGE), int(Opcode.SCHEMA), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
 _OUTSIDE = frozenset({0, *map(int, Opcode)}.difference(_DEFINES, [_IS_MESSAGE]))
-"""Opcodes that no record in a chunk has; those not known yet are stepped over, as the specification asks."""
+"""Opcodes that no record in a chunk has; those not known yet are stepped over, as the specification requires."""
 _WINDOW = 4096
 """Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
 _BRIEF = 16
 """Bytes of a message that are there where it is only wanted briefly: up to the stamp in a header of ROS."""
 
 
-class Walk:
-    """What has been found so far in chunk `number`, from its first byte to `position`."""
+class ChunkReader:
+    """Messages found so far in chunk `number`, from its first byte to `position`."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Walk:
         brief: Collection[Channel] = (),
         cut: bool = False,
     ) -> None:
-        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are kept (None: on
+        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are given (None: on
         all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
         `channels`."""
         self.position = 0
@@ -59,7 +59,7 @@ class Walk:
         self._places: list[Place] = []
 
     @property
-    def seen(self) -> Counter[int]:
+    def counts(self) -> Counter[int]:
         """Messages by channel id."""
         return Counter(self._ids)
 
@@ -70,7 +70,7 @@ class Walk:
         return Block(data, self._found, self._log_ns, self._starts, self._stops, self._places)
 
     def in_place(self, read: Callable[[int, int], bytes]) -> Block:
-        """The same of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
+        """The messages of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
         parts: list[bytes] = []
         size = 0
         while (left := self.end - self.position) >= RECORD.size:

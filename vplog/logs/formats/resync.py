@@ -39,17 +39,23 @@ class Search:
         self._window, self._start = self._file.read(_WINDOW), position
         return self._window[:length]
 
-    def first(self, pattern: re.Pattern[bytes], start: int, accept: Callable[[int], bool]) -> int | None:
-        """The first offset from `start` on where the pattern matches and `accept(offset)` holds, else None.
+    def first(
+        self,
+        pattern: re.Pattern[bytes],
+        start: int,
+        accept: Callable[[int], bool] = lambda _: True,
+        stop: int | None = None,
+    ) -> int | None:
+        """The first offset from `start` on, below `stop`, where the pattern matches and `accept(offset)` holds.
 
         The pattern matches at most 64 bytes, so that none is missed between two blocks.
         """
-        position = start
-        while position < self._length and self._left > 0:
+        position, stop = start, self._length if stop is None else stop
+        while position < stop and self._left > 0:
             self._file.seek(position)
             block = self._file.read(_BLOCK + 64)
             for match in pattern.finditer(block):
-                if match.start() >= _BLOCK:
+                if match.start() >= min(_BLOCK, stop - position):
                     break
                 self._left -= 1
                 if self._left <= 0:

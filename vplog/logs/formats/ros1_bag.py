@@ -27,7 +27,7 @@ class Ros1Bag:
     """A Container over one bag file."""
 
     def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
-        """`name` is what the file is called where something is said of it."""
+        """`name` is what the file is called in remarks."""
         self._name, self._notes = name or path.name, notes
         self._file = path.open("rb")
         self._length = path.stat().st_size
@@ -38,7 +38,7 @@ class Ros1Bag:
         local = not isinstance(path, RemotePath)
         self._at = reader_at(self._file, local)
         sizes = [chunk.size for chunk in self._layout.chunks]
-        self._data = Chunks(self._unpack, self._lose, sizes.__getitem__, lambda _: True, local)
+        self._data = Chunks(self._unpack, self._add_damaged_chunk, sizes.__getitem__, lambda _: True, local)
 
     def contents(self) -> Contents:
         """Counted by the indexes; a chunk without is unpacked."""
@@ -58,6 +58,10 @@ class Ros1Bag:
                     found[connection] = found.get(connection, 0) + 1
                     start_ns, end_ns = min(start_ns, log_ns), max(end_ns, log_ns)
                     chunk.first_ns, chunk.last_ns = min(chunk.first_ns or log_ns, log_ns), max(chunk.last_ns, log_ns)
+            if chunk.damaged:
+                found = Counter(found) | Counter(chunk.counts)
+            if chunk.listed and not chunk.damaged and found != chunk.listed:
+                self._layout.recorded = {}  # the bag's index is what is damaged
             for connection, messages in found.items():
                 if connection in self._channels:
                     channel = self._channels[connection]
@@ -110,12 +114,14 @@ class Ros1Bag:
                 f"the {plural(sum(found.values()), 'message')} before it are read."
             )
             account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)] if end_ns else [], detail)
+        if layout.appended_at is not None:
+            account.add_appended(name, layout.appended_at, self._length)
         if layout.index_cut_at is not None:
-            self._notes.add(
-                f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message; none is lost."
-            )
+            self._notes.add(f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message.")
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
-        account.know(name, recorded if whole else {}, start_ns)
+        listed = topics_of(layout.recorded, self._channels)
+        account.know(name, listed or (recorded if whole else {}), start_ns)
+        account.settle({name}, listed, found)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
@@ -151,12 +157,13 @@ class Ros1Bag:
         if damaged and found:
             found.pop()  # its length may be what is damaged
         key, account = (self._name, chunk.start), self._notes.account
-        seen = Counter(connection for connection, _, _, _ in found)
+        counts = Counter(connection for connection, _, _, _ in found)
         last_ns = found[-1][1] if found else chunk.first_ns
         span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
-        unknown = sum(messages for connection, messages in seen.items() if connection not in self._channels)
+        unknown = sum(messages for connection, messages in counts.items() if connection not in self._channels)
         if damaged:
-            short = topics_of({i: messages - seen[i] for i, messages in chunk.counts.items()}, self._channels)
+            chunk.damaged = True
+            short = topics_of({i: messages - counts[i] for i, messages in chunk.counts.items()}, self._channels)
             detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
             account.add("damaged_chunk", short if chunk.counts else None, key, span, detail)
         if unknown:
@@ -172,9 +179,10 @@ class Ros1Bag:
         chunk = self._layout.chunks[count]
         return unpack(chunk.compression, self._at(chunk.start, chunk.stop - chunk.start), chunk.size, chunk.cut)
 
-    def _lose(self, count: int, error: BadChunkError) -> None:
+    def _add_damaged_chunk(self, count: int, error: BadChunkError) -> None:
         """Account for a damaged chunk."""
         chunk = self._layout.chunks[count]
+        chunk.damaged = True
         detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
         span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
         counts = topics_of(chunk.counts, self._channels) if chunk.counts else None

@@ -1,6 +1,6 @@
-"""Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): found by walking it, over damage too.
+"""Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): read record by record, over damage too.
 
-A record is believed where another lies behind it. Where none does, the walk goes on at the next bytes that can be the
+A record is believed where another lies behind it. Where none does, reading goes on at the next bytes that can be the
 head of a chunk, or of a record of an index; what lay between is held against the index at the end.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,8 @@ _FIRST = re.compile(rb"(?:op|compression|size|ver|conn|count|chunk_pos|start_tim
 """Names in the headers of chunks and of indexes."""
 _RECORD_START = re.compile(rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=%s)" % _FIRST.pattern, re.DOTALL)
 """Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
+_BEGIN = re.compile(re.escape(MAGIC))
+"""How a recording begins: another one may be appended to the first."""
 _HEAD = 256
 """Bytes in which the head of a record ends, but for a connection's of a long topic."""
 _NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn_count|chunk_count|chunk_pos)=")
@@ -63,6 +66,10 @@ class Chunk:
     """Damage lies between the index records behind it, so that they may not be all."""
     counts: dict[int, int] = field(default_factory=dict)
     """Messages per connection, from the index records behind it; empty where there are none."""
+    listed: dict[int, int] = field(default_factory=dict)
+    """Messages per connection by the bag's index."""
+    damaged: bool = False
+    """Not all of it could be unpacked and read."""
     first_ns: int = 0
     """From the indexes; 0 where there are none."""
     last_ns: int = 0
@@ -70,35 +77,41 @@ class Chunk:
 
 @dataclass
 class Layout:
-    """What the walk found."""
+    """Chunks and damage of a file."""
 
     chunks: list[Chunk] = field(default_factory=list)
     missing: list[Chunk] = field(default_factory=list)
     """Chunks that lie in damaged bytes, as the bag's index or the index records behind them tell."""
+    recorded: dict[int, int] = field(default_factory=dict)
+    """Messages per connection by the bag's index; empty where it is not whole."""
     gaps: list[tuple[int, int]] = field(default_factory=list)
     """Bytes without a record, from and to."""
     cut_at: int | None = None
     """Byte behind which nothing can be read, where messages may have been."""
+    appended_at: int | None = None
+    """Byte behind the end of the recording where another one follows."""
     index_cut_at: int | None = None
-    """The same where all chunks that the bag had were found before."""
+    """Byte behind which nothing can be read, where all chunks that the bag had were found before."""
 
 
 def read_layout(file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None], name: str) -> Layout:
-    """Walk the bag; `connect` gets header and data of every connection record outside the chunks. Raises LogError."""
-    walk = _Walk(file, length, connect)
-    if walk.at(0, len(MAGIC)) != MAGIC:
+    """Read the records of a bag; `connect` gets the connections outside the chunks. Raises LogError."""
+    reader = _LayoutReader(file, length, connect)
+    if reader.at(0, len(MAGIC)) != MAGIC:
         raise LogError(f"{name} is not a ROS 1 bag of format 2.0: it does not start with its magic bytes.")
-    walk.records(len(MAGIC))
-    walk.finish()
-    return walk.layout
+    reader.records(len(MAGIC))
+    reader.finish()
+    return reader.layout
 
 
-class _Walk:
+class _LayoutReader:
     def __init__(self, file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None]) -> None:
         self._length, self._connect = length, connect
         self.layout = Layout()
         self._infos: dict[int, Chunk] = {}
         """By offset of their record: chunks as the bag's index lists them."""
+        self._index_sound = True
+        """Whether the records of the bag's index are as long as they say."""
         self._indexing: Chunk | None = None
         """The chunk whose index records come by."""
         self._index_at = self._chunk_count = 0
@@ -113,6 +126,8 @@ class _Walk:
             if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
                 found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
                 if header is None or not self._is_sound(header):
+                    if position == self.layout.appended_at:
+                        return
                     if found is None:
                         if self._indexing is not None:
                             self._indexing.doubtful = True
@@ -164,6 +179,7 @@ class _Walk:
             if (chunk := found.get(offset)) is not None:
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
                 chunk.doubtful |= bool(chunk.counts) and chunk.counts != info.counts
+                chunk.listed = info.counts
                 chunk.counts = chunk.counts or info.counts
             elif self._is_chunk(offset):  # it was jumped over
                 header, start, stop = self._head(offset)
@@ -174,6 +190,8 @@ class _Walk:
                 skipped[offset] = info
             else:
                 listed = False
+        if self._index_sound and len(self._infos) == self._chunk_count:
+            layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
         layout.chunks.sort(key=lambda chunk: chunk.start)
         for chunk in layout.chunks:
             chunk.counts = {} if chunk.doubtful else chunk.counts
@@ -229,7 +247,12 @@ class _Walk:
 
     def _next_record(self, position: int) -> int | None:
         """The next chunk, or record of an index, behind `position`; connections may as well lie in a chunk."""
-        return self._search.first(_RECORD_START, position + 1, self._is_record)
+        found = self._search.first(_RECORD_START, position + 1, self._is_record)
+        appended_at = self._search.first(_BEGIN, position, stop=found)
+        if appended_at is None:
+            return found
+        self.layout.appended_at = self._length = appended_at
+        return None
 
     def _record(self, op: int, header: dict[bytes, bytes], position: int, start: int, stop: int) -> None:
         if op == _CHUNK:
@@ -262,6 +285,7 @@ class _Walk:
         for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
             if 0 < count <= self._length:
                 info.counts[connection] = count
+        self._index_sound &= len(info.counts) == number(header, b"count") and position not in self._infos
         self._infos[position] = info
 
 

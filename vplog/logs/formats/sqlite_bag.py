@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
+import struct
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks, ordered
+from vplog.logs.formats.resync import Search
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -34,7 +37,7 @@ class SqliteBag:
     """A Container over one .db3 file."""
 
     def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
-        """`name` is what the file is called where something is said of it."""
+        """`name` is what the file is called in remarks."""
         self._path, self._name, self._notes = path, name or path.name, notes
         self._damaged = False
         self._holes: dict[int, int] = {}
@@ -51,6 +54,9 @@ class SqliteBag:
             notes.add(f"{log.name} (write-ahead log) holds messages that cannot be read here; they are left out.")
             self._db = self._connect("immutable=1")
         self._topics = self._read_topics()
+        appended_at = _appended_at(path)
+        if appended_at is not None:
+            notes.account.add_appended(self._name, appended_at, path.stat().st_size)
 
     def contents(self) -> Contents:
         counts = dict.fromkeys(self._topics.values(), 0)
@@ -104,7 +110,7 @@ class SqliteBag:
             if isinstance(data, bytes) and isinstance(time_ns, int):
                 yield Message(self._topics[topic], time_ns, data, (row, time_ns))
             else:
-                self._lose_data(row, f"{self._name} is damaged: row {row} holds no message.")
+                self._add_damaged_row(row, f"{self._name} is damaged: row {row} holds no message.")
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         return in_blocks(self.messages(channels))
@@ -149,7 +155,7 @@ class SqliteBag:
                 tried, missing, last = tried + 1, missing + step - last - 1, step
                 row = self._row(last, columns)
                 if row is None:
-                    missing += topics is None or not self._lose_data(last, detail)
+                    missing += topics is None or not self._add_damaged_row(last, detail)
                     continue
                 found = row
                 if topics is None or row[1] in topics:
@@ -162,9 +168,9 @@ class SqliteBag:
             if topics is None and not again:
                 self._holes[before] = last
             before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
-            self._lose_rows(before, missing, (before_ns, last_ns), detail)
+            self._add_missing_rows(before, missing, (before_ns, last_ns), detail)
 
-    def _lose_rows(self, before: int, missing: int, span: tuple[int, int], detail: str) -> None:
+    def _add_missing_rows(self, before: int, missing: int, span: tuple[int, int], detail: str) -> None:
         if missing:
             self._notes.account.add("damaged_bytes", {"": missing}, (self._name, before), [span], detail)
 
@@ -210,7 +216,7 @@ class SqliteBag:
         except _DAMAGE:
             return None
 
-    def _lose_data(self, row: int, detail: str) -> bool:
+    def _add_damaged_row(self, row: int, detail: str) -> bool:
         """A message whose topic and time can be read, but not the rest; others were missed when they were counted."""
         found = self._row(row, "rowid, topic_id, timestamp")
         if found is not None and found[1] in self._topics:
@@ -242,7 +248,7 @@ class SqliteBag:
         rows = (row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics"))
         # damage may have put anything, or nothing, in any column
         rows = sorted(row for row in rows if [type(value) for value in row] == [int, str, str, str])
-        times = Counter(row[0] for row in rows)  # of two topics of one number, none can be told from the other
+        times = Counter(row[0] for row in rows)  # of two topics of one number, none can be distinguished
         rows = [row for row in rows if times[row[0]] == 1]
         return {number: Channel(name, kind, encoding) for number, name, kind, encoding in rows}
 
@@ -253,6 +259,14 @@ class SqliteBag:
         except _DAMAGE as error:
             self._damaged = True
             self._notes.add(f"{self._name}: the list of topics is damaged, read as far as it goes: {error}.")
+
+
+def _appended_at(path: Path) -> int | None:
+    """Where another database begins in a file that is not as long as its head says (sqlite.org/fileformat2.html)."""
+    with path.open("rb") as file:
+        page, pages = struct.unpack(">16xH10xI", file.read(32).ljust(32, b"\0"))
+        length = path.stat().st_size
+        return None if length == page * pages else Search(file, length).first(re.compile(MAGIC), len(MAGIC))
 
 
 def _integer(value: object) -> int:
