@@ -64,7 +64,7 @@ def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Se
                     fate += [] if taken is None else [taken]
                     progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
                 warnings += left_out(other)
-        return {"map": str(store), "library": library, "drives": fate, "warnings": warnings}
+        return {"map": str(store), "library": library, "drives": fate, "warnings": left_out(store) + warnings}
 
 
 def _check_libraries(sources: Sequence[Path], target: Path) -> str:

@@ -67,6 +67,11 @@ class Store:
         return self.root / "index"
 
     @property
+    def joint_damage(self) -> str:
+        """What is damaged of what joins the drives, where a writer goes on without it; a map on an object store."""
+        return "" if self.mirror is None else self.mirror.rest_damage
+
+    @property
     def staging(self) -> Path:
         """Where a writer makes what it renames in; hidden, on the same file system."""
         return self.root / ".staging"
