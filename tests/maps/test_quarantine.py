@@ -11,7 +11,7 @@ import pytest
 
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
-from tests.maps.runs import PLACES, make_map
+from tests.maps.runs import LIBRARY, PLACES, make_map
 from vplog.errors import ResultError
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.search.index import update_index
@@ -241,3 +241,23 @@ def test_the_check_reads_what_joins_drives_too(root: Path, verb: Verb, tmp_path:
     said = verb("map", "info", here, "--check")
     assert said.code == 1
     assert str(path) in said.err
+
+
+def test_a_damaged_head_is_written_again_from_the_drives(tmp_path: Path) -> None:
+    """Where these have one library and the same settings; else nobody guesses."""
+    store = Store(make_map(tmp_path / "map", {"walk": 1, "ride": 1}))
+    path = store.root / "map.json"
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(ResultError, match=r"map\.json"):
+        store.head()
+    head = store.sound_head()
+    assert (head.library, head.settings) == (LIBRARY, {"seed": 1})
+    store.write_head(head)
+    assert store.head() == head
+    other = Store(make_map(tmp_path / "other", {"walk": 1, "ride": 2}))
+    (other.root / "map.json").write_text("{")
+    with pytest.raises(ResultError, match=r"map\.json"):
+        other.sound_head()
+    path.unlink()
+    with pytest.raises(ResultError, match="is not a map"):
+        store.sound_head()

@@ -237,8 +237,25 @@ class Store:
         library, settings = record.get("library"), record.get("settings")
         known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
-            raise ResultError(f"{path} has no sound library or settings. Run `vplog batch` again to write it anew.")
+            raise ResultError(f"{path} has no sound library or settings. Write it again: vplog batch LOG -o {self}")
         return Head(library, settings)
+
+    def sound_head(self) -> Head:
+        """`head`, where map.json is damaged as the drives have it: their library and, where all have the same, their
+        settings. Raises ResultError where there is no such drive."""
+        try:
+            return self.head()
+        except NewerError:
+            raise
+        except ResultError:
+            if not (self.root / "map.json").is_file():
+                raise
+            drives = self.drives()
+            found = [run_record.read_run_json(self.run(drive) / "run.json").get("settings") for drive in drives]
+            libraries = {about["library"] for about in drives.values()}
+            if len(libraries) != 1 or not isinstance(found[0], dict) or any(one != found[0] for one in found):
+                raise
+            return Head(libraries.pop(), found[0])
 
     def write_head(self, head: Head) -> None:
         """map.json, unless it says that already."""
@@ -251,8 +268,13 @@ class Store:
     def _write(self, name: str, record: dict[str, Any]) -> None:
         """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
         path = self.root / name
-        if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
-            return
+        try:
+            if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+                return
+        except NewerError:
+            raise
+        except ResultError:  # damaged
+            pass
         run_record.write_run_json(path, record, checksum=name != "failures.json")  # whose keys are drives
         if self.mirror is not None:
             write_json(self.mirror, name)
