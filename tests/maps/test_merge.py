@@ -125,6 +125,23 @@ def test_a_merge_that_was_stopped_while_it_copied_leaves_no_half_drive(
             assert list(store.drives()) == ["one"]
 
 
+def test_a_merge_that_was_killed_right_behind_the_library_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = make_map(tmp_path / "source", {"one": 1}), tmp_path / "target"
+    add_library = map_store.add_library
+
+    def killed(*arguments: Any) -> None:
+        add_library(*arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(map_store, "add_library", killed)
+        merge_maps([source], target)
+    assert [one["drive"] for one in merge_maps([source], target)["drives"]] == ["one"]
+    assert map_store.Store(target).head() == map_store.Store(source).head()
+
+
 def test_no_drive_of_the_target_gives_way(tmp_path: Path) -> None:
     """Not where it has two of one content either."""
     a, b = make_map(tmp_path / "a", {"run": 1, "run-2": 1}), make_map(tmp_path / "b", {"run": 2})

@@ -324,6 +324,4 @@ def test_a_damaged_graph_is_refused(finished: Path, verb: Verb, tmp_path: Path) 
     (run / "graph.g2o").write_bytes(data)
     said = verb("export", run, "--format", "g2o", "-o", tmp_path / "graph")
     assert "graph.g2o does not have the sha256" in said.error
-        "graph.g2o does not have the sha256" in verb("export", run, "--format", "g2o", "-o", tmp_path / "graph").error
-    )
     assert not (tmp_path / "graph").exists()

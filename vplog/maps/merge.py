@@ -122,8 +122,10 @@ def _take_library(store: Store, other: Store, library: str) -> None:
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
     shutil.copytree(other.library(library), made, symlinks=True)
+    settings = other.head().settings
+    store.write_head(map_store.Head(None, settings))  # a folder that holds a library alone is no map
     map_store.add_library(store, made, library)
-    store.write_head(map_store.Head(library, other.head().settings))
+    store.write_head(map_store.Head(library, settings))
 
 
 class _There:
