@@ -51,7 +51,7 @@ def read_run_json(path: Path) -> dict[str, Any]:
             f"Cannot read {path}: {error.strerror or error}. Is {path.parent} the output of `vplog run`?"
         ) from None
     except (ValueError, RecursionError):
-        raise ResultError(f"{path} is not JSON. Run `vplog run` again.") from None
+        raise ResultError(f"{path} is not JSON: it is damaged. Copy it back from a backup, or run again.") from None
     if not isinstance(record, dict):
         raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again.")
     if not has_checksum(record):
