@@ -125,6 +125,23 @@ def test_a_merge_that_was_stopped_while_it_copied_leaves_no_half_drive(
             assert list(store.drives()) == ["one"]
 
 
+def test_a_merge_that_was_killed_right_behind_the_library_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = make_map(tmp_path / "source", {"one": 1}), tmp_path / "target"
+    add_library = map_store.add_library
+
+    def killed(*arguments: Any) -> None:
+        add_library(*arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(map_store, "add_library", killed)
+        merge_maps([source], target)
+    assert [one["drive"] for one in merge_maps([source], target)["drives"]] == ["one"]
+    assert map_store.Store(target).head() == map_store.Store(source).head()
+
+
 def test_no_drive_of_the_target_gives_way(tmp_path: Path) -> None:
     """Not where it has two of one content either."""
     a, b = make_map(tmp_path / "a", {"run": 1, "run-2": 1}), make_map(tmp_path / "b", {"run": 2})
@@ -188,7 +205,8 @@ def test_removing_is_as_removing_the_folders(verb: Verb, tmp_path: Path) -> None
             (root / name / "drive=one" / "file").write_text("of one")
         run_record.write_run_json(root / "failures.json", {"bad": {"log": "/bad", "error": "why"}})
     told = verb("map", "remove", a, "one", "three", "bad", "--json").json
-    assert told == {"map": str(a), "removed": ["one", "three", "bad"], "drives": ["two"], "still_joined": []}
+    empty = {"still_joined": [], "warnings": []}
+    assert told == {"map": str(a), "removed": ["one", "three", "bad"], "drives": ["two"], **empty}
     for drive in ("one", "three"):
         for folder in [*b.glob(f"*/drive={drive}"), b / ".cache" / f"drive={drive}"]:
             shutil.rmtree(folder, ignore_errors=True)

@@ -11,14 +11,16 @@ import pytest
 
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
-from tests.maps.runs import PLACES, make_map
-from vplog.errors import ResultError
+from tests.maps.runs import LIBRARY, PLACES, make_map
+from vplog.batch.batch import settings_for
+from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.search.index import update_index
 from vplog.maps.storage import map_store
 from vplog.maps.storage.damage import damaged_files, left_out, without_damaged
 from vplog.maps.storage.layout import drive_record
 from vplog.maps.storage.map_store import Store, folder_name
+from vplog.pipeline import load_pipeline
 from vplog.places.bobb import BobbSettings
 from vplog.results import run_record
 
@@ -241,3 +243,37 @@ def test_the_check_reads_what_joins_drives_too(root: Path, verb: Verb, tmp_path:
     said = verb("map", "info", here, "--check")
     assert said.code == 1
     assert str(path) in said.err
+
+
+def test_a_damaged_head_is_written_again_from_the_drives(tmp_path: Path) -> None:
+    """Where these have one library and the same settings; else nobody guesses."""
+    store = Store(make_map(tmp_path / "map", {"walk": 1, "ride": 1}))
+    path = store.root / "map.json"
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(ResultError, match=r"map\.json"):
+        store.head()
+    head = store.sound_head()
+    assert (head.library, head.settings) == (LIBRARY, {"seed": 1})
+    store.write_head(head)
+    assert store.head() == head
+    other = Store(make_map(tmp_path / "other", {"walk": 1, "ride": 2}))
+    (other.root / "map.json").write_text("{")
+    with pytest.raises(ResultError, match=r"map\.json"):
+        other.sound_head()
+    path.unlink()
+    with pytest.raises(ResultError, match="is not a map"):
+        store.sound_head()
+
+
+def test_a_setting_that_is_gone_and_was_off_stops_no_old_map(tmp_path: Path) -> None:
+    """A map holds every setting of the vplog that made it."""
+    store = Store(make_map(tmp_path / "map", {"walk": 1}))
+    settings = load_pipeline("default").model_dump(mode="json")
+    for keep in (False, True):
+        old = {**settings, "verify": {**settings["verify"], "direction": {"keep": keep, "rounds": 1000}}}
+        store.write_head(map_store.Head(LIBRARY, old))
+        if keep:
+            with pytest.raises(SettingsError, match="direction"):
+                settings_for(store.root)
+        else:
+            assert settings_for(store.root) == load_pipeline("default")

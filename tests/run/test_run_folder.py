@@ -425,3 +425,13 @@ def test_what_cannot_be_begun_leaves_no_folder(drive: Drive, tmp_path: Path, ver
     ):  # fmt: skip
         assert verb(*arguments, "-o", new).code == 1, arguments
         assert not (tmp_path / "new").exists(), arguments
+
+
+def test_caches_of_an_unfinished_run_of_several_go_with_it(tmp_path: Path) -> None:
+    """Its drives are in no run.json yet; those of the new run stay."""
+    for drive in ("before", "after"):
+        (tmp_path / ".cache" / drive).mkdir(parents=True)
+        (tmp_path / ".cache" / drive / "extract-000000-0.stage").touch()
+    patterns = run_folder._results_in(tmp_path, None, {"after": tmp_path / "after.mcap"}, resumable=True)
+    found = {path.relative_to(tmp_path).as_posix() for pattern in patterns for path in tmp_path.glob(pattern)}
+    assert found == {".cache/before/extract-000000-0.stage"}

@@ -313,3 +313,15 @@ def test_a_dash_is_refused_where_it_cannot_be(
         assert "name a path" in said.err, words
     assert "-" in verb("evaluate", finished, "--truth", "-").error
     assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_graph_is_refused(finished: Path, verb: Verb, tmp_path: Path) -> None:
+    """It is text: one flipped bit is another number."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    data = bytearray((run / "graph.g2o").read_bytes())
+    data[data.rindex(b"1")] ^= 2
+    (run / "graph.g2o").write_bytes(data)
+    said = verb("export", run, "--format", "g2o", "-o", tmp_path / "graph")
+    assert "graph.g2o does not have the sha256" in said.error
+    assert not (tmp_path / "graph").exists()

@@ -86,7 +86,7 @@ def settings_for(root: Path, name: str | None = None, assignments: Sequence[str]
     `a.b=c` overrides. Raises SettingsError, ResultError."""
     if name is None and (root / "map.json").exists():
         with map_store.reading(root) as store:
-            head = store.head()
+            head = store.sound_head()
         if head.library is not None:  # there may be drives
             try:
                 return pipeline_from(head.settings, f"{root}/map.json", assignments)

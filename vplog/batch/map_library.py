@@ -37,7 +37,7 @@ def map_library(
     Raises LibraryError where another one is given, or where the settings describe places otherwise.
     """
     begun = (store.root / "map.json").exists()
-    known = store.head().library if begun else None
+    known = store.sound_head().library if begun else None
     if known is not None and not store.library(known).is_dir():
         raise LibraryError(
             f"{store} lacks its library {known[:12]}. Copy it back, or make another map with `vplog batch`."

@@ -79,6 +79,7 @@ def remove_drives(arguments: argparse.Namespace) -> None:
         if found["still_joined"]:
             print_line("to solve", f"{', '.join(found['still_joined'])} were joined with what is removed")
             print(f"next      vplog map join {shlex.quote(str(found['map']))}")
+        warn(found["warnings"])
 
 
 def redescribe_map(arguments: argparse.Namespace) -> None:

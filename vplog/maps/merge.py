@@ -64,7 +64,7 @@ def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Se
                     fate += [] if taken is None else [taken]
                     progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
                 warnings += left_out(other)
-        return {"map": str(store), "library": library, "drives": fate, "warnings": warnings}
+        return {"map": str(store), "library": library, "drives": fate, "warnings": left_out(store) + warnings}
 
 
 def _check_libraries(sources: Sequence[Path], target: Path) -> str:
@@ -122,8 +122,10 @@ def _take_library(store: Store, other: Store, library: str) -> None:
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
     shutil.copytree(other.library(library), made, symlinks=True)
+    settings = other.head().settings
+    store.write_head(map_store.Head(None, settings))  # a folder that holds a library alone is no map
     map_store.add_library(store, made, library)
-    store.write_head(map_store.Head(library, other.head().settings))
+    store.write_head(map_store.Head(library, settings))
 
 
 class _There:

@@ -34,7 +34,7 @@ _MOST_DEPTH = 100
 
 def write_run_json(path: Path, record: dict[str, Any], checksum: bool = False) -> None:
     """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
-    record = {**plain(record), CHECKSUM: _sha256(record)} if checksum else plain(record)
+    record = with_checksum(record) if checksum else plain(record)
     text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with replacing(path) as stream:
         stream.write(text.encode())
@@ -51,14 +51,25 @@ def read_run_json(path: Path) -> dict[str, Any]:
             f"Cannot read {path}: {error.strerror or error}. Is {path.parent} the output of `vplog run`?"
         ) from None
     except (ValueError, RecursionError):
-        raise ResultError(f"{path} is not JSON. Run `vplog run` again.") from None
+        raise ResultError(f"{path} is not JSON: it is damaged. Copy it back from a backup, or run again.") from None
     if not isinstance(record, dict):
         raise ResultError(f"{path} must hold one JSON object. Run `vplog run` again.")
-    if CHECKSUM in record and record.pop(CHECKSUM) != _sha256(record):
+    if not has_checksum(record):
         raise ResultError(f"{path} is damaged: its checksum does not match. Copy it back from a backup, or run again.")
     if type(version := record.get("format")) is int:
         check_version(path, version, FORMAT, record.get("vplog"))
     return record
+
+
+def with_checksum(record: dict[str, Any]) -> dict[str, Any]:
+    """A record as plain values, with its checksum in place of the one that it may have."""
+    record = {name: value for name, value in record.items() if name != CHECKSUM}
+    return {**plain(record), CHECKSUM: _sha256(record)}
+
+
+def has_checksum(record: dict[str, Any]) -> bool:
+    """Whether a record has the checksum in it, which is taken out, or none at all."""
+    return CHECKSUM not in record or record.pop(CHECKSUM) == _sha256(record)
 
 
 def _sha256(record: dict[str, Any]) -> str:

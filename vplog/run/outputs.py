@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -113,6 +114,7 @@ def write(
 def report(folder: Path, run: Run, head: dict[str, Any], *, steps: Steps) -> dict[str, Any]:
     """Write report.html of the run in `folder`; the record for its run.json, but for the time that this step takes."""
     account = {**head, **_account(run), "inputs": steps.cache.hashes(), "warnings": run.log.warnings + steps.warnings}
+    account["graph_sha256"] = hashlib.sha256((folder / "graph.g2o").read_bytes()).hexdigest()
     write_report(folder, {**account, **steps.account()})
     return account
 

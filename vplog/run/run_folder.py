@@ -117,7 +117,7 @@ def _results_in(out: Path, library: Path | None, drives: Mapping[str, Path], res
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
     given = library is not None and library.resolve() == (out / "library").resolve()
     earlier = [escape(name) for name in _drives_in(account)]
-    caches = [f"{CACHE}/{name}" for name in earlier if name not in map(escape, drives)]
+    caches = [f"{CACHE}/{escape(one.name)}" for one in (out / CACHE).glob("*/") if one.name not in drives]
     caches += [f"{name}/{CACHE}" for name in earlier] + ([CACHE] if drives or not resumable else [])
     return [
         REQUEST,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
@@ -23,7 +24,8 @@ FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
 
 def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
     """Write the run in `folder` as one of `FORMATS`; what was written. Raises ResultError."""
-    tracks = gather_tracks(folder, read_single_run(folder))
+    record = read_single_run(folder)
+    tracks = gather_tracks(folder, record)
     written = [str(path)]
     match kind:
         case "tum":
@@ -33,7 +35,7 @@ def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
         case "euroc":
             poses.write_euroc(path, tracks.after)
         case "g2o":
-            _copy(folder / "graph.g2o", path)
+            _copy(folder / "graph.g2o", path, record.get("graph_sha256"))
         case "geojson":
             closures = tables.read_closures(folder / "closures.parquet")
             where = _earth(folder, kind, tracks)
@@ -53,11 +55,14 @@ def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
     return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}
 
 
-def _copy(source: Path, path: Path) -> None:
+def _copy(source: Path, path: Path, sha256: object) -> None:
+    """Copy a file that has this sha256, if run.json names one. Raises ResultError."""
     try:
         data = source.read_bytes()
     except OSError as error:
         raise ResultError(f"Cannot read {source}: {error.strerror}. Write it again with `vplog run`.") from None
+    if sha256 not in (None, hashlib.sha256(data).hexdigest()):
+        raise ResultError(f"{source} does not have the sha256 that run.json names. Write it again with `vplog run`.")
     with replacing(path) as stream:
         stream.write(data)
 

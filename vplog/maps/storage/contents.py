@@ -67,6 +67,11 @@ class Store:
         return self.root / "index"
 
     @property
+    def joint_damage(self) -> str:
+        """What is damaged of what joins the drives, where a writer goes on without it; a map on an object store."""
+        return "" if self.mirror is None else self.mirror.rest_damage
+
+    @property
     def staging(self) -> Path:
         """Where a writer makes what it renames in; hidden, on the same file system."""
         return self.root / ".staging"
@@ -232,8 +237,25 @@ class Store:
         library, settings = record.get("library"), record.get("settings")
         known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
-            raise ResultError(f"{path} lacks a valid library or settings. Run `vplog batch` again.")
-        return Head(library, settings)
+            raise ResultError(f"{path} lacks a valid library or settings. Write it again: vplog batch LOG -o {self}")
+        return Head(library, _without_retired(settings))
+
+    def sound_head(self) -> Head:
+        """`head`, where map.json is damaged as the drives have it: their library and, where all have the same, their
+        settings. Raises ResultError where there is no such drive."""
+        try:
+            return self.head()
+        except NewerError:
+            raise
+        except ResultError:
+            if not (self.root / "map.json").is_file():
+                raise
+            drives = self.drives()
+            found = [run_record.read_run_json(self.run(drive) / "run.json").get("settings") for drive in drives]
+            libraries = {about["library"] for about in drives.values()}
+            if len(libraries) != 1 or not isinstance(found[0], dict) or any(one != found[0] for one in found):
+                raise
+            return Head(libraries.pop(), found[0])
 
     def write_head(self, head: Head) -> None:
         """map.json, unless it says that already."""
@@ -246,11 +268,25 @@ class Store:
     def _write(self, name: str, record: dict[str, Any]) -> None:
         """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
         path = self.root / name
-        if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
-            return
+        try:
+            if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+                return
+        except NewerError:
+            raise
+        except ResultError:  # damaged
+            pass
         run_record.write_run_json(path, record, checksum=name != "failures.json")  # whose keys are drives
         if self.mirror is not None:
             write_json(self.mirror, name)
+
+
+def _without_retired(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an older vplog without those that are gone and were off: `verify.direction`."""
+    verify = settings.get("verify")
+    direction = verify.get("direction") if isinstance(verify, dict) else None
+    if not (isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False):
+        return settings
+    return {**settings, "verify": {name: value for name, value in verify.items() if name != "direction"}}
 
 
 def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:

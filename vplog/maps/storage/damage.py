@@ -27,6 +27,11 @@ class Quarantining(Protocol):
         """Drives that are left out of answers, and why."""
         ...
 
+    @property
+    def joint_damage(self) -> str:
+        """Why a writer has dropped the joint graphs; empty where it has not."""
+        ...
+
 
 class UnreachableError(ResultError):
     """An object store refuses a request or cannot be reached: no drive is damaged."""
@@ -64,7 +69,8 @@ def without_damaged(store: Quarantining, work: Callable[[], T]) -> T:
 
 def left_out(store: Quarantining) -> list[str]:
     """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
-    return [
+    dropped = f"{store.joint_damage}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
+    return [dropped] * bool(store.joint_damage) + [
         f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
         f"Compute it again from its log: vplog batch LOG -o {store}"
         for drive, why in sorted(store.damaged.items())

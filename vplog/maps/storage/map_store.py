@@ -88,8 +88,8 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
         mirror = Mirror(root, folder, lock)
         store = Store(folder, mirror, mirror.damaged)
         _sweep(store)
-        upload.begin(mirror)
         mirror.rest()
+        upload.begin(mirror)
         store.staging.mkdir()
         try:
             yield store

@@ -31,6 +31,7 @@ from vplog.errors import NewerError, ResultError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, folder_name, sound_record
+from vplog.results import run_record
 from vplog.storage.folders import is_below
 from vplog.storage.remote_path import reason
 
@@ -64,6 +65,8 @@ class Mirror:
         self.damaged: dict[str, str] = {}
         """Drives whose manifest is damaged or missing, and why."""
         self.rest_manifest: dict[str, Any] = {}
+        self.rest_damage = ""
+        """What is damaged of all else, where a writer goes on without it."""
         self._fetched: set[str] = set()
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         with told(remote):
@@ -169,34 +172,55 @@ class Mirror:
         part.rename(target)
 
     def rest(self, names: Collection[str] = ()) -> None:
-        """Have all else that the map has in the local folder, or what of it has these names. Raises ResultError."""
+        """Have all else that the map has in the local folder, or what of it has these names.
+
+        Raises ResultError where some of it is damaged. A writer goes on without that and without the joint graphs,
+        which `map join` makes again; `rest_damage` says why.
+        """
+        if self.rest_damage:
+            return
+        damage = self._fetch_rest(names)
+        if damage and self.lock is None:
+            raise ResultError(f"{damage}. Join the drives again: vplog map join {self.remote}")
+        if damage:
+            self.rest_damage = damage
+            self.rest_manifest = self.rest_manifest or self._rest_without_manifest()
+            (self.local / "joint.json").unlink(missing_ok=True)
+            shutil.rmtree(self.local / "joint", ignore_errors=True)
+
+    def _rest_without_manifest(self) -> dict[str, Any]:
+        """A manifest of the copies that joins have by their own names; it has none of their lengths and hashes."""
+        with told(self.remote):
+            below = [f"{top}/{name}" for top in ("joint", "joins") for name in objects.files_below(self.remote / top)]
+        return {"files": {name: {"sha256": ""} for name in ("joint.json", *below)}}
+
+    def _fetch_rest(self, names: Collection[str]) -> str:
+        """What is damaged of it, if anything. Raises ResultError."""
         before = None
         for _ in range(3):
-            with told(self.remote):
-                manifest = read_rest(self.remote)
+            try:
+                with told(self.remote):
+                    manifest = read_rest(self.remote)
+            except UnreachableError:
+                raise
+            except ResultError as error:
+                return str(error).partition(". ")[0]
             if manifest is None:
-                return
-            if manifest["generation"] == before:
-                raise ResultError(
-                    f"{self.remote}/rest has lost files that rest.json names. Move {self.remote}/rest.json away, and "
-                    f"join the drives again: vplog map join {self.remote}"
-                )
-            before = manifest["generation"]
-            place = self.remote / "rest" / manifest["generation"]
+                return ""
+            self.rest_manifest, place = manifest, self.remote / "rest" / manifest["generation"]
             files = {name: about for name, about in manifest["files"].items() if self._is_of_a_drive(name)}
             wanted = {name: about for name, about in files.items() if name in names or not names}
-            try:
-                for name, about in wanted.items():
-                    if why := self._bring(place / name, self.local / name, about):
-                        raise ResultError(
-                            f"{why}. Move {self.remote}/rest.json away, and join the drives again: vplog map join "
-                            f"{self.remote}"
-                        )
-                self.rest_manifest = manifest
-                return
-            except FileNotFoundError:
-                for name in wanted:
-                    (self.local / name).unlink(missing_ok=True)
+            damaged, gone = list[str](), list[str]()
+            for name, about in wanted.items():
+                try:
+                    damaged += filter(None, [self._bring(place / name, self.local / name, about)])
+                except FileNotFoundError:
+                    gone.append(f"{place / name} is not there")
+            if not gone or manifest["generation"] == before:
+                return "; ".join((gone + damaged)[:1])
+            before = manifest["generation"]
+            for name in wanted:
+                (self.local / name).unlink(missing_ok=True)
         raise ResultError(f"{self.remote}/rest is replaced faster than it can be read. Try again later.")
 
     def _is_of_a_drive(self, name: str) -> bool:
@@ -285,12 +309,16 @@ def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
         manifest = json.loads(data)
         files = manifest["files"]
         generations = [manifest["generation"], manifest["replaces"] or manifest["generation"]]
-        sound = all(_GENERATION.fullmatch(one) for one in generations) and all(
-            isinstance(one["bytes"], int)
-            and isinstance(one.get("rows", 0), int)
-            and is_below(name)
-            and HASH.fullmatch(one["sha256"])
-            for name, one in files.items()
+        sound = (
+            run_record.has_checksum(manifest)
+            and all(_GENERATION.fullmatch(one) for one in generations)
+            and all(
+                isinstance(one["bytes"], int)
+                and isinstance(one.get("rows", 0), int)
+                and is_below(name)
+                and HASH.fullmatch(one["sha256"])
+                for name, one in files.items()
+            )
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         sound, manifest = False, {}

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from vplog.errors import NewerError, ResultError, SettingsError
 from vplog.maps.storage import objects
 from vplog.maps.storage.layout import AT_HAND, TABLES, folder_name, sha256_of
-from vplog.maps.storage.remote_map import read_rest, told
+from vplog.maps.storage.remote_map import told
 from vplog.results import run_record
 from vplog.storage.scratch import files_in
 
@@ -58,7 +58,7 @@ def begin(mirror: Mirror) -> None:
         for left in _left_over(runs, 2, named_runs):
             if left.split("/")[0] not in damaged:
                 objects.remove(remote / "runs" / left)
-        manifest = read_rest(remote) or {}
+        manifest = mirror.rest_manifest
         before = f"{manifest.get('replaces')}/"
         if known := [name.removeprefix(before) for name in rest if name.startswith(before)]:
             _after_rest(remote, manifest, manifest["files"], known)
@@ -162,7 +162,8 @@ def write_json(mirror: Mirror, name: str) -> None:
 
 
 def put_json(place: RemotePath, record: dict[str, Any]) -> None:
-    objects.put(place, (json.dumps(run_record.plain(record), ensure_ascii=False, allow_nan=False) + "\n").encode())
+    text = json.dumps(run_record.with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n"
+    objects.put(place, text.encode())
 
 
 def send_library(mirror: Mirror, digest: str) -> None:
