@@ -188,7 +188,7 @@ def library(arguments: argparse.Namespace) -> None:
     pipeline, warnings = pipeline_of(arguments), []
     with Progress(arguments) as progress:
         state = build_library(
-            arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress,
+            arguments.logs, arguments.output, pipeline, topics_of(arguments), Execution(arguments.threads, progress),
             warnings.append, force=arguments.force,
         )  # fmt: skip
     record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
@@ -203,6 +203,8 @@ def library(arguments: argparse.Namespace) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
+    from vplog.pipeline import CacheOptions
+    from vplog.pipeline import run as run_pipeline
     from vplog.run.report import outcome_of
     from vplog.storage.remote_path import local_copy
 
@@ -212,21 +214,13 @@ def run(arguments: argparse.Namespace) -> None:
     with ExitStack() as stack, Progress(arguments) as progress:
         if library is not None:  # by URL, as an unfinished run may name it
             library = stack.enter_context(local_copy(library))
+        execution, cache = Execution(arguments.threads, progress), CacheOptions(use=use_cache, force=arguments.force)
         if len(paths) > 1 and not arguments.one_drive:
             from vplog.sessions.joint_run import run_joint
 
-            found = run_joint(
-                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress), use_cache,
-                arguments.force,
-            )  # fmt: skip
+            found = run_joint(paths, arguments.output, pipeline, library, topics, execution, cache)
         else:
-            from vplog.pipeline import CacheOptions
-            from vplog.pipeline import run as run_pipeline
-
-            found = run_pipeline(
-                paths, arguments.output, pipeline, library, topics, Execution(arguments.threads, progress),
-                CacheOptions(use=use_cache, force=arguments.force),
-            ).record  # fmt: skip
+            found = run_pipeline(paths, arguments.output, pipeline, library, topics, execution, cache).record
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
     elif "maps" in found:
@@ -303,13 +297,9 @@ def demo(arguments: argparse.Namespace) -> None:
     pipeline = pipeline_of(arguments)
     _folder(arguments.output)
     with Progress(arguments) as progress:
-        progress("render", 0, 1)
-        drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
-        progress("render", 1, 1)
-        done = run_pipeline(
-            drive.log, arguments.output / "run", pipeline, execution=Execution(arguments.threads, progress),
-            cache=CacheOptions(force=arguments.force),
-        )  # fmt: skip
+        execution, cache = Execution(arguments.threads, progress), CacheOptions(force=arguments.force)
+        drive = make_drive(arguments.output / "drive", DemoSettings(), execution)
+        done = run_pipeline(drive.log, arguments.output / "run", pipeline, execution=execution, cache=cache)
     found = evaluate_run(arguments.output / "run", str(drive.truth))
     write_report(arguments.output / "run", truth=str(drive.truth))
     if arguments.json:
