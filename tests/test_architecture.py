@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors", "data"},
-    {"settings", "stages", "execution", "storage"},
-    {"geometry"},
+    {"settings", "execution", "storage"},
+    {"stages", "geometry"},
     {"features", "places"},
     {"logs", "loops", "graph", "results", "evaluate", "demo"},
     {"cache", "figures"},

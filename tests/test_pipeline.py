@@ -247,7 +247,7 @@ def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, tmp_path:
 
 def test_a_library_of_another_drive_is_used_and_named(drive: Drive, tmp_path: Path) -> None:
     pipeline = load_pipeline("default", QUICK)
-    state = build_library([drive.log], tmp_path / "library", pipeline, threads=4)
+    state = build_library([drive.log], tmp_path / "library", pipeline, execution=Execution(4))
     known = json.loads((tmp_path / "library" / "library.json").read_text())
     assert known["references"] == 5
     record = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", execution=Execution(4)).record

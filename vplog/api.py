@@ -80,10 +80,10 @@ def run(
         folder = stack.enter_context(local_output(place))
         references = None if library is None else stack.enter_context(local_copy(located(library)))
         kept = cache and not remote  # a cache that is sent over the net costs more than it saves
+        options = CacheOptions(use=kept, force=force)
         if len(paths) > 1 and not one_drive:
-            record = run_joint(paths, folder, chosen, references, parts, execution, kept, force)
+            record = run_joint(paths, folder, chosen, references, parts, execution, options)
         else:
-            options = CacheOptions(use=kept, force=force)
             record = run_drive(paths, folder, chosen, references, parts, execution, options).record
     return open_run(out) if remote else RunFolder(place, record)
 
@@ -272,6 +272,7 @@ def compare(
     sequence: also match windows of so many frames.
     out: a local folder for compare.json, scores and curves.
     """
+    from vplog.benchmark.compare import CompareOptions
     from vplog.benchmark.compare import compare as compare_methods
     from vplog.benchmark.recogniser_specs import split_methods
     from vplog.evaluate.place_truth import TruthChoice
@@ -285,15 +286,16 @@ def compare(
             split_methods(methods) if isinstance(methods, str) else methods,
             TruthChoice(os.fspath(truth), tolerance, distance_m, heading_deg),
             _pipeline(pipeline, settings),
-            library=None if library is None else stack.enter_context(local_copy(located(library))),
-            library_size=library_size,
-            library_seed=library_seed,
-            min_gap=min_gap,
-            sequence=sequence,
-            out=None if out is None else located(out),
-            topics=_topics(topics),
-            threads=threads,
-            progress=progress,
+            CompareOptions(
+                library=None if library is None else stack.enter_context(local_copy(located(library))),
+                library_size=library_size,
+                library_seed=library_seed,
+                min_gap=min_gap,
+                sequence=sequence,
+                out=None if out is None else located(out),
+                topics=_topics(topics),
+            ),
+            Execution(threads, progress),
         )
 
 

@@ -142,15 +142,15 @@ def run(
     pipeline: Pipeline,
     library: Path | None = None,
     topics: logs.TopicChoice | None = None,
-    execution: Execution | None = None,
-    cache: CacheOptions | None = None,
+    execution: Execution = Execution(),
+    cache: CacheOptions = CacheOptions(),
 ) -> Run:
     """Drive in, run folder out. Raises VplogError with one line where that cannot be.
 
     `path` is a log, or several that are the parts of one recording, in any order. `library` holds the reference images;
     without one they are keyframes of the drive. What `out` holds stays until the new run is whole.
     """
-    topics, execution, cache = topics or logs.TopicChoice(), execution or Execution(), cache or CacheOptions()
+    topics = topics or logs.TopicChoice()
     log = logs.open_drive(files_of(path), topics)
     check_library(library, pipeline)
     resumable = cache.use and not cache.folder

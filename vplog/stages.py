@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         SharedReferences,
         Solution,
     )
+    from vplog.execution.execution import Execution
 
 
 class EncodedFrame(Protocol):
@@ -182,9 +183,9 @@ def index_of_part(state: PlaceState, descriptors: Sequence[Any]) -> PlaceIndex:
 
 
 class Recogniser(Protocol):
-    def learn(self, references: Iterable[Reference], threads: int) -> PlaceState: ...
+    def learn(self, references: Iterable[Reference], execution: Execution) -> PlaceState: ...
 
-    def load(self, folder: Path, threads: int) -> PlaceState: ...
+    def load(self, folder: Path, execution: Execution) -> PlaceState: ...
 
 
 class Optimiser(Protocol):

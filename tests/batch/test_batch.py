@@ -31,6 +31,7 @@ from vplog.batch.worker import Outcome, Task
 from vplog.demo import SMALL, make_drive
 from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store
@@ -70,7 +71,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two drives of one name, in folders of their own."""
     folder = tmp_path_factory.mktemp("logs")
     return [
-        make_drive(folder / name, TINY.model_copy(update={"seed": SMALL.seed + number}), 1).log
+        make_drive(folder / name, TINY.model_copy(update={"seed": SMALL.seed + number}), Execution()).log
         for number, name in enumerate("ab")
     ]
 

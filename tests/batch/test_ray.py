@@ -24,6 +24,7 @@ from vplog.batch.ray_cluster import Head
 from vplog.batch.ray_engine import translated
 from vplog.demo import SMALL, make_drive
 from vplog.errors import SettingsError
+from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     kinds = {"first": TINY, "second": TINY, "third": LONG}
     for number, (name, kind) in enumerate(kinds.items()):
         settings = kind.model_copy(update={"seed": SMALL.seed + number})
-        make_drive(folder / "made" / name, settings, 1).log.rename(folder / f"{name}.mcap")
+        make_drive(folder / "made" / name, settings, Execution()).log.rename(folder / f"{name}.mcap")
     (folder / "bad.mcap").write_bytes(b"no log at all")
     return [folder / f"{name}.mcap" for name in ("first", "bad", "second", "third")]
 

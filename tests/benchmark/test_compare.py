@@ -14,13 +14,14 @@ import pytest
 from tests.places.sequence_matrix import match_sequences
 from vplog import logs
 from vplog.benchmark import compare
-from vplog.benchmark.method_scores import evaluate_method, stored_bytes
+from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_bytes
 from vplog.benchmark.recogniser_specs import known_methods, read_method, split_methods
 from vplog.benchmark.traversals import candidate_stops, extract_walk
 from vplog.errors import LogError, SettingsError
 from vplog.evaluate.pairs import index_pairs
 from vplog.evaluate.place_truth import TruthChoice
 from vplog.evaluate.retrieval import rank_queries, score_retrieval
+from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings
 from vplog.features.store import FeatureStore
 from vplog.geometry import se3
@@ -36,7 +37,9 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.benchmark.traversals import Walk
+    from vplog.data import Ints
     from vplog.demo.record import Drive
+    from vplog.evaluate.pairs import Pairs
 
     Verb = Callable[..., Said]
 
@@ -77,7 +80,12 @@ def store(tmp_path: Path) -> Iterator[FeatureStore]:
 @pytest.fixture(scope="module")
 def day(walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
     with FeatureStore(tmp_path_factory.mktemp("day") / "features") as found:
-        yield extract_walk(logs.open(walks[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), threads=2)
+        yield extract_walk(logs.open(walks[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), execution=Execution(2))
+
+
+def inputs_of(walk: Walk, truth: Pairs, stops: Ints, *more: Any, **others: Any) -> MethodInputs:
+    """A drive against itself."""
+    return MethodInputs(walk.references, walk, walk, truth, stops, *more, **others)
 
 
 def without_times(record: dict[str, Any]) -> dict[str, Any]:
@@ -94,7 +102,7 @@ def without_times(record: dict[str, Any]) -> dict[str, Any]:
 def test_a_walk_holds_the_chosen_frames(walks: tuple[Path, Path], store: FeatureStore) -> None:
     log = logs.open(walks[0])
     seen = []
-    walk = extract_walk(log, SIFT, store, np.array([2, 3, 7]), np.array([3]), 2, lambda *at: seen.append(at))
+    walk = extract_walk(log, SIFT, store, np.array([2, 3, 7]), np.array([3]), Execution(2, lambda *at: seen.append(at)))
     assert walk.frames.tolist() == [2, 3, 7]
     assert walk.stamp_ns.tolist() == log.stamps()[[2, 3, 7]].tolist()
     assert [reference.stamp_ns for reference in walk.references] == [int(log.stamps()[3])]
@@ -126,7 +134,7 @@ def test_threads_and_scratch_change_nothing(day: Walk, tmp_path: Path) -> None:
     stops = candidate_stops(day.frames, day.frames, 4)
     truth = index_pairs(day.frames - 5, day.frames, 1)
     results = [
-        evaluate_method(BOBB, day.references, day, day, truth, stops, threads=threads, scratch=scratch)
+        evaluate_method(BOBB, inputs_of(day, truth, stops, scratch=scratch), Execution(threads))
         for threads, scratch in ((1, None), (3, tmp_path))
     ]
     a, b = results
@@ -141,9 +149,8 @@ def test_figures_of_a_method(day: Walk) -> None:
     """Every frame finds itself first: each has some feature in the library and no twin."""
     truth = index_pairs(day.frames, day.frames, 0)
     seen: list[tuple[str, int, int]] = []
-    result = evaluate_method(
-        BOBB, day.references, day, day, truth, np.full(FRAMES, FRAMES), progress=lambda *at: seen.append(at)
-    )
+    inputs = inputs_of(day, truth, np.full(FRAMES, FRAMES))
+    result = evaluate_method(BOBB, inputs, Execution(1, lambda *at: seen.append(at)))
     assert result.ranks.top_row.tolist() == list(range(FRAMES))
     assert (result.figures["r_at_1"], result.figures["ap"], result.figures["anr"]) == (1.0, 1.0, 0.0)
     assert result.figures["bytes_per_image"] == 4 * (2 + 1 + 9)  # J references with a weight and I boxes each
@@ -160,11 +167,9 @@ def test_figures_of_sequences(day: Walk, tmp_path: Path) -> None:
     """Beside those of single views, and the same as by the whole matrix at once."""
     truth, stops = index_pairs(day.frames - 5, day.frames, 1), candidate_stops(day.frames, day.frames, 4)
     sequence = SequenceSettings(length=5)
-    single = evaluate_method(BOBB, day.references, day, day, truth, stops)
+    single = evaluate_method(BOBB, inputs_of(day, truth, stops))
     for scratch, threads in ((None, 1), (tmp_path, 3)):
-        both = evaluate_method(
-            BOBB, day.references, day, day, truth, stops, threads, sequence=sequence, scratch=scratch
-        )
+        both = evaluate_method(BOBB, inputs_of(day, truth, stops, sequence, scratch), Execution(threads))
         lines = rank_queries(match_sequences(single.scores, sequence, stops), truth, stops)
         found = both.figures.pop("sequence")
         assert without_times({"methods": {"m": both.figures}}) == without_times({"methods": {"m": single.figures}})
@@ -238,7 +243,8 @@ def test_methods_that_do_not_exist(name: str, said: str) -> None:
 def test_the_same_frames_at_dusk(walks: tuple[Path, Path]) -> None:
     day, dusk = walks
     methods = ["bobb", "bobb:windows_along=2", "bovf:words=300"]
-    done = compare.compare(dusk, day, methods, TruthChoice("index"), SMALL, library_size=8, threads=2)
+    options = compare.CompareOptions(library_size=8)
+    done = compare.compare(dusk, day, methods, TruthChoice("index"), SMALL, options, Execution(2))
     assert done.record["queries"] == done.record["map_frames"] == done.record["positives"] == FRAMES
     assert done.record["truth"] == {"source": "index", "tolerance": 0, "pairs": FRAMES}
     assert done.record["library"]["size"] == 8

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tests.benchmarks.measure import Figure, one_thread, seconds
+from vplog.execution.execution import Execution
 from vplog.places import expected_votes, rvp
 
 if TYPE_CHECKING:
@@ -72,8 +73,8 @@ def discovery(
     references = images.references(extractor)
     features = extractor(images.images[0])
     with one_thread():
-        literal, fast, chosen = _by_partitions(paper.learn(references, 1), features)
-        closed = _in_closed_form(ours.learn(references, 1), features, chosen.windows)
+        literal, fast, chosen = _by_partitions(paper.learn(references, Execution()), features)
+        closed = _in_closed_form(ours.learn(references, Execution()), features, chosen.windows)
     facts = {
         "pair": f"1 of {images.name}",
         "windows": len(chosen.windows),

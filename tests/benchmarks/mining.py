@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -12,7 +11,7 @@ import faiss
 import numpy as np
 
 from tests.benchmarks.measure import Figure, in_turns, one_thread
-from vplog.features.extraction import map_in_order, one_thread_each
+from vplog.execution.execution import Execution
 from vplog.places import matches
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 def mining(images: Images, pipeline: Pipeline, name: str, bar: float, rounds: int) -> Figure:
     """describe, which is nearest neighbours and discovery, to bare SIFT of the same images; both on one thread."""
     with one_thread():
-        state = pipeline.places.learn(images.references(pipeline.features), 1)
+        state = pipeline.places.learn(images.references(pipeline.features), Execution())
         features = [pipeline.features(image) for image in images.images]
         sift = bare_sift(pipeline.features)
         turns = in_turns(
@@ -47,15 +46,14 @@ def mining(images: Images, pipeline: Pipeline, name: str, bar: float, rounds: in
 
 def describing(images: Images, pipeline: Pipeline, name: str, bar: float, rounds: int, threads: int) -> Figure:
     """Frames per second from image to place to those of bare SIFT, all cores busy in both. Decoding is in neither."""
-    state = pipeline.places.learn(images.references(pipeline.features), threads)
+    state = pipeline.places.learn(images.references(pipeline.features), Execution(threads))
     sift = bare_sift(pipeline.features)
 
     def describe(image: Bytes) -> Any:
         return state.describe(pipeline.features(image))
 
     def all_of(work: Callable[[Bytes], Any]) -> None:
-        with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-            list(map_in_order(pool, work, images.images, ahead=2 * threads))
+        list(Execution(threads).map(work, images.images, ahead=2))
 
     with one_thread():  # OpenCV's setting is the process's: the workers change it for all
         turns = in_turns(lambda: all_of(sift), lambda: all_of(describe), rounds, time.perf_counter)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.benchmarks.measure import Figure, in_turns, one_thread
 from vplog import logs
 from vplog.execution.cores import limited
-from vplog.features.extraction import map_in_order, one_thread_each
+from vplog.execution.execution import Execution
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 
 if TYPE_CHECKING:
@@ -83,16 +82,16 @@ def speed(path: Path, topic: str, threads: int, rounds: int, bar: float | None) 
     wanted = set(stamps.tolist())
 
     def ours() -> int:
-        with limited(threads), ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        with limited(threads):
             log = logs.open(path)
             log.odometry()
-            decoded = map_in_order(pool, lambda frame: frame.decode().image, log.frames(stamps), ahead=2 * threads)
+            decoded = Execution(threads).map(lambda frame: frame.decode().image, log.frames(stamps), ahead=2)
             return sum(image.size for image in decoded)
 
     def bare() -> int:
-        with path.open("rb") as file, ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
+        with path.open("rb") as file:
             found = (m.data for _, _, m in make_reader(file).iter_messages(topics=[topic]) if _stamp(m) in wanted)
-            return sum(image.size for image in map_in_order(pool, _jpeg, found, ahead=2 * threads))
+            return sum(image.size for image in Execution(threads).map(_jpeg, found, ahead=2))
 
     def _stamp(message: object) -> int:
         return stamp_of.get((message.log_time, len(message.data)), -1)  # type: ignore[attr-defined]

@@ -20,6 +20,7 @@ from tests.benchmarks.faiss_indexes import faiss_indexes
 from tests.benchmarks.measure import Figure, one_thread, seconds, wall
 from tests.benchmarks.search import BEST, DRIVE, LIBRARY, Places, make_places, make_queries, plain_scores
 from vplog.data import Features, Keyframes, Reference
+from vplog.execution.execution import Execution
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import update_index
 from vplog.maps.storage.map_store import Store
@@ -67,7 +68,7 @@ def made_up_library(settings: BobbSettings, references: int = LIBRARY) -> BobbSt
         found = Features(points, sizes, rng.integers(0, 256, (3, 128), dtype=np.uint8), depth, 100, 100)
         return Reference(np.zeros((100, 100), np.uint8), found, "made up", number)
 
-    return settings.learn([reference(number) for number in range(references)], 1)
+    return settings.learn([reference(number) for number in range(references)], Execution())
 
 
 def write_map(store: Store, count: int, state: BobbState, drive: int = DRIVE) -> Places:

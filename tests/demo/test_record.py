@@ -24,6 +24,7 @@ from vplog.demo.record import (
 )
 from vplog.demo.scene import make_scene, take_picture
 from vplog.errors import ResultError
+from vplog.execution.execution import Execution
 from vplog.geometry.se3 import rotation
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ SETTINGS = SMALL.model_copy(update={"width": 320, "height": 180, "laps": 0.3, "d
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    return make_drive(tmp_path_factory.mktemp("demo"), SETTINGS, threads=2)
+    return make_drive(tmp_path_factory.mktemp("demo"), SETTINGS, Execution(2))
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +128,7 @@ def test_truth_covers_every_frame_and_sample(drive: Drive) -> None:
 
 
 def test_the_number_of_threads_does_not_change_a_byte(drive: Drive, tmp_path: Path) -> None:
-    again = make_drive(tmp_path, SETTINGS, threads=1)
+    again = make_drive(tmp_path, SETTINGS, Execution())
     assert again.log.read_bytes() == drive.log.read_bytes()
     assert again.truth.read_bytes() == drive.truth.read_bytes()
 

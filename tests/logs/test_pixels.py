@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
@@ -18,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from tests.logs.drives import PERIOD_NS, START_NS, Written, store, write_foxglove, write_ros1, write_ros2
 from vplog import logs
 from vplog.execution.cores import limited
-from vplog.features.extraction import map_in_order
+from vplog.execution.execution import Execution
 from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
@@ -207,12 +206,12 @@ def test_pixels_are_those_of_the_reference_readers(form: Format, encoding: str, 
     for topic in topics:
         expected = by_levels([pixels_of(found) for found in recorded(path, form.family, topic)])
         for threads in (1, 2, 4):
-            with limited(threads), ThreadPoolExecutor(threads) as pool:
+            with limited(threads):
                 log: Any = logs.open(path, TopicChoice(image=topic))
                 log.odometry()
                 log.camera()
                 frames = log.frames(log.stamps())
-                images = list(map_in_order(pool, lambda frame: frame.decode().image, frames, ahead=2 * threads))
+                images = list(Execution(threads).map(lambda frame: frame.decode().image, frames))
             assert log.account.losses == []
             assert len(images) == len(expected)
             for image, reference in zip(images, expected, strict=True):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Camera, Features, Keyframes
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.propose import Proposals
@@ -111,10 +112,9 @@ def verify(
     lens: Camera,
     features: Callable[[int], Features],
     settings: VerifySettings,
-    threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    execution: Execution = Execution(),
     baseline_m: float | None = None,
 ) -> Closures:
     """The ledger of the proposals of one drive."""
     alone = drive_of(frames, lens, features, settings, baseline_m)
-    return verify_between(found, alone, alone, threads, progress)
+    return verify_between(found, alone, alone, execution)

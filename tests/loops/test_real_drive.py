@@ -11,6 +11,7 @@ import pytest
 
 from tests.loops.scene import proposals, verify
 from vplog.data import Camera, Features, Keyframes, Verdict
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.verify import VerifySettings
 
@@ -82,7 +83,7 @@ def test_a_real_revisit_is_found_and_the_opposite_direction_is_not(
     # no turns are at hand in these few images, so nothing is asked of the calibration check
     settings = VerifySettings()
     settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"angle": 3.0})})
-    ledger = verify(proposals(REVISITS + OPPOSITE), frames, camera, seen.__getitem__, settings, threads=2)
+    ledger = verify(proposals(REVISITS + OPPOSITE), frames, camera, seen.__getitem__, settings, Execution(2))
     assert ledger.verdict[:3] == [Verdict.ACCEPTED] * 3
     assert Verdict.ACCEPTED not in ledger.verdict[3:]
     assert (ledger.reverse_inliers[:3] >= 20).all()

@@ -9,6 +9,7 @@ import pytest
 from tests.loops.scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, verify, view
 from vplog.data import Camera, Closures, Features, Keyframes, Verdict
 from vplog.errors import LogError
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.landmarks import LandmarkSettings
 from vplog.loops.verify import VerifySettings
@@ -161,7 +162,7 @@ def test_threads_and_order_change_no_byte(calibrated: bool) -> None:
     lens, frames, _, seen = drive(False)
     lens = lens if calibrated else replace(lens, matrix=None)
     pairs = [(LAP + i, j) for i in range(0, LAP, 4) for j in (i, (i + 7) % LAP)]
-    one, four = (verify(proposals(pairs), frames, lens, seen.__getitem__, EXACT, threads=n) for n in (1, 4))
+    one, four = (verify(proposals(pairs), frames, lens, seen.__getitem__, EXACT, Execution(n)) for n in (1, 4))
     for name in (*COLUMNS, "match_from_query", "information"):
         assert getattr(one, name).tobytes() == getattr(four, name).tobytes(), name
     assert one.verdict == four.verdict
@@ -274,9 +275,10 @@ def test_a_wrong_focal_length_is_noticed_and_claims_less(caplog: pytest.LogCaptu
 def test_no_candidates_and_progress() -> None:
     lens, frames, _, seen = drive(False)
     assert len(verify(proposals([]), frames, lens, seen.__getitem__, EXACT)) == 0
-    calls: list[tuple[int, int]] = []
-    verify(proposals(lap_pairs()[:5]), frames, lens, seen.__getitem__, EXACT, 2, lambda d, t: calls.append((d, t)))
-    assert calls == [(i + 1, 5) for i in range(5)]
+    calls: list[tuple[str, int, int]] = []
+    execution = Execution(2, lambda *at: calls.append(at))
+    verify(proposals(lap_pairs()[:5]), frames, lens, seen.__getitem__, EXACT, execution)
+    assert calls == [("verify", i + 1, 5) for i in range(5)]
 
 
 def test_an_unknown_lens_stops_before_the_work() -> None:

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.maps.runs import put_rows
+from vplog.execution.execution import Execution
 from vplog.maps.search.query import search
 from vplog.maps.storage import map_store
 from vplog.maps.storage.drive_ids import drive_names
@@ -81,7 +82,7 @@ def test_a_drive_goes_with_its_folders(root: Path, verb: Verb) -> None:
 
 def test_the_best_of_the_drives_are_those_of_one_index(root: Path, library: str) -> None:
     pipeline, store = load_pipeline("default"), map_store.Store(root)
-    state = cast("PlaceState", pipeline.places.load(store.library(library), 1))
+    state = cast("PlaceState", pipeline.places.load(store.library(library), Execution()))
     views = state.from_arrow(tables.read_descriptors(store.run("all") / "descriptors.parquet")[0])
     names, known, owner, rows = list(store.drives()), [], [], []
     for number, name in enumerate(names):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.places.pictures import SMALL, reference
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from vplog.data import Reference
@@ -20,4 +21,4 @@ def references() -> list[Reference]:
 
 @pytest.fixture(scope="session")
 def state(references: list[Reference]) -> PaperBobbState:
-    return SMALL.learn(references, 2)
+    return SMALL.learn(references, Execution(2))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.places.pictures import noisy, nothing, reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places import expected_votes
 from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, Place, _rarity
 from vplog.places.code_search import CodeIndex
@@ -25,11 +26,11 @@ TINY = BobbSettings(references=4, features=250)
 
 @pytest.fixture(scope="module")
 def learned(references: list[Reference]) -> BobbState:
-    return TINY.learn(references, 2)
+    return TINY.learn(references, Execution(2))
 
 
 def test_a_place_of_the_defaults_is_stored_in_120_bytes(references: list[Reference]) -> None:
-    state = BobbSettings().learn(references, 1)
+    state = BobbSettings().learn(references, Execution())
     column = state.to_arrow([state.describe(r.features) for r in references])
     assert state.bits == 960
     leaves = [column.field(i).flatten() for i in range(column.type.num_fields)]
@@ -55,7 +56,7 @@ def test_a_reference_is_explained_by_itself_as_much_as_by_the_best_other(
 
 
 def test_without_its_own_image_others_explain_a_reference(references: list[Reference]) -> None:
-    learned = BobbSettings(references=4, features=250, own=False).learn(references, 2)
+    learned = BobbSettings(references=4, features=250, own=False).learn(references, Execution(2))
     for row, r in enumerate(references):
         assert row not in learned.describe(r.features).references.tolist()
 

@@ -15,6 +15,7 @@ from tests.places.literal import all_boxes
 from tests.places.pictures import SMALL, noisy, nothing, reference
 from vplog.data import Features
 from vplog.errors import LibraryError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.places import rvp
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState, Place
 
@@ -50,7 +51,7 @@ def test_describing_from_many_threads_changes_nothing(
 def test_learning_with_many_threads_changes_nothing(state: PaperBobbState, references: list[Reference]) -> None:
     words = state.library.words
     for threads in (1, 4):
-        other = SMALL.learn(references, threads)
+        other = SMALL.learn(references, Execution(threads))
         assert other.hash == state.hash
         np.testing.assert_array_equal(other.library.words.start, words.start)
         np.testing.assert_array_equal(other.library.words.values, words.values)
@@ -63,7 +64,7 @@ def test_a_saved_library_describes_the_same(
     state: PaperBobbState, queries: list[Features], places: list[Place], tmp_path: Path
 ) -> None:
     state.save(tmp_path / "a" / "library")
-    loaded = PaperBobbSettings().load(tmp_path / "a" / "library", 2)  # the folder's settings count, not these
+    loaded = PaperBobbSettings().load(tmp_path / "a" / "library", Execution(2))  # the folder's settings count
     assert loaded.settings == SMALL
     assert loaded.hash == state.hash
     assert all(map(_equal, map(loaded.describe, queries), places))
@@ -74,7 +75,7 @@ def test_a_saved_library_describes_the_same(
 
 def test_seeds_give_other_windows_and_partitions(references: list[Reference]) -> None:
     a, b = (
-        PaperBobbSettings(partitions=5, features=100, references=2, seed=seed).learn(references[:3], 1)
+        PaperBobbSettings(partitions=5, features=100, references=2, seed=seed).learn(references[:3], Execution())
         for seed in (0, 1)
     )
     assert a.hash != b.hash
@@ -84,8 +85,8 @@ def test_seeds_give_other_windows_and_partitions(references: list[Reference]) ->
 
 
 def test_the_hash_tells_libraries_apart(state: PaperBobbState, references: list[Reference]) -> None:
-    assert SMALL.learn(references[::-1], 1).hash != state.hash
-    assert SMALL.learn(references[:-1], 1).hash != state.hash
+    assert SMALL.learn(references[::-1], Execution()).hash != state.hash
+    assert SMALL.learn(references[:-1], Execution()).hash != state.hash
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_the_hash_tells_libraries_apart(state: PaperBobbState, references: list[
 )
 def test_bits_of_a_place(references: list[Reference], change: dict[str, Any]) -> None:
     settings = PaperBobbSettings(**{"partitions": 1, "features": 20, "grid": 20, **change})
-    state = settings.learn(references[:7], 1)
+    state = settings.learn(references[:7], Execution())
     boxes = len(all_boxes(settings.grid, rvp.box_shapes(settings.grid, settings.max_box_share, settings.aspects))) + 1
     sets = math.factorial(7) // math.factorial(settings.references) // math.factorial(7 - settings.references)
     per_box = next(bits for bits in range(64) if 2**bits >= boxes)
@@ -104,7 +105,7 @@ def test_bits_of_a_place(references: list[Reference], change: dict[str, Any]) ->
 def test_the_papers_references_take_22_bits(references: list[Reference]) -> None:
     """Section V: log2 C(100, 4) is told in 22 bits."""
     many = [references[row % 12] for row in range(100)]
-    state = PaperBobbSettings(partitions=1, features=3).learn(many, 1)
+    state = PaperBobbSettings(partitions=1, features=3).learn(many, Execution())
     per_box = math.ceil(math.log2(rvp.count_boxes(64, rvp.box_shapes(64, 0.1, state.settings.aspects))))
     assert state.bits == 22 + 16 * per_box
 
@@ -201,7 +202,7 @@ def test_columns_with_empty_rows_are_refused(state: PaperBobbState, places: list
 
 def test_too_small_a_library_is_refused(references: list[Reference]) -> None:
     with pytest.raises(LibraryError, match=r"3 reference images, but places\.references is 4"):
-        SMALL.learn(references[:3], 1)
+        SMALL.learn(references[:3], Execution())
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.bovf import BovfSettings, BovfState, Words
 
 if TYPE_CHECKING:
@@ -19,17 +20,17 @@ SMALL = BovfSettings(words=300, features=250)
 
 @pytest.fixture(scope="module")
 def learned(references: list[Reference]) -> BovfState:
-    return SMALL.learn(references, 2)
+    return SMALL.learn(references, Execution(2))
 
 
 def test_one_reference_is_too_few(references: list[Reference]) -> None:
     with pytest.raises(LibraryError, match="at least two"):
-        SMALL.learn(references[:1], 1)
+        SMALL.learn(references[:1], Execution())
 
 
 @pytest.mark.parametrize("damped", [False, True])
 def test_scores_are_cosines_of_tf_idf(references: list[Reference], damped: bool) -> None:
-    state = BovfSettings(words=300, features=250, damp_bursts=damped).learn(references, 2)
+    state = BovfSettings(words=300, features=250, damp_bursts=damped).learn(references, Execution(2))
     V = len(state.vocabulary)
     counts = np.array(
         [np.bincount(state.vocabulary.quantise(r.features.descriptors[:250]), minlength=V) for r in references]
@@ -46,7 +47,7 @@ def test_scores_are_cosines_of_tf_idf(references: list[Reference], damped: bool)
 def test_a_cut_place_fits_its_bytes_and_keeps_the_weightiest(
     references: list[Reference], learned: BovfState, max_bytes: int
 ) -> None:
-    state = BovfSettings(words=300, features=250, max_bytes=max_bytes).learn(references, 2)
+    state = BovfSettings(words=300, features=250, max_bytes=max_bytes).learn(references, Execution(2))
     places = [state.describe(r.features) for r in references]
     column = state.to_arrow(places)
     assert column.nbytes <= (max_bytes + 0.5) * len(places)  # half a byte: the list of n places has n + 1 offsets

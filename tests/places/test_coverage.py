@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.places.pictures import SMALL, noisy, nothing, reference
-from vplog.data import Reference
+from vplog.data import Keyframes, Reference
+from vplog.execution.execution import Execution
 from vplog.places import coverage as cov
 from vplog.places.reference_choice import LEAST_SIZE, LibrarySettings
 
@@ -70,12 +71,12 @@ def _walk(places: int, frames: int, seed: int, features: int = 60) -> list[Bytes
 
 def _choose(descriptors: list[Bytes], threads: int = 1, **options: object) -> list[int]:
     wanted = LibrarySettings.read({"choose": "coverage", **options}, "test")
-    return cov.choose_by_coverage(len(descriptors), descriptors.__getitem__, wanted, threads).tolist()
+    return cov.choose_by_coverage(len(descriptors), descriptors.__getitem__, wanted, Execution(threads)).tolist()
 
 
 def test_who_explains_whom() -> None:
     descriptors = _walk(places=5, frames=4, seed=0)
-    found = cov.explanations(descriptors, np.arange(0, 20, 2), 2)
+    found = cov.explanations(descriptors, np.arange(0, 20, 2), Execution(2))
     for frame, (begin, end) in enumerate(pairwise(found.start.tolist())):
         who = 2 * found.candidate[begin:end]
         same_place = {row for row in range(0, 20, 2) if row // 4 == frame // 4 and row != frame}
@@ -135,7 +136,7 @@ def test_a_long_drive_is_looked_at_in_even_steps() -> None:
         asked.append(row)
         return np.zeros((0, 128), np.uint8)
 
-    cov.choose_by_coverage(100_000, descriptors_of, LibrarySettings(choose="coverage", size=20), 1)
+    cov.choose_by_coverage(100_000, descriptors_of, LibrarySettings(choose="coverage", size=20), Execution())
     assert len(asked) == cov.frames_needed(20) < 1000
     gaps = np.diff(sorted(asked))
     assert gaps.max() - gaps.min() <= 1
@@ -172,7 +173,8 @@ def test_views_beside_explain_each_other(state: PaperBobbState) -> None:
 def _measure(state: PaperBobbState, seeds: list[int], drive: str = "another", threads: int = 2) -> cov.Coverage:
     frames = [reference(seed) for seed in seeds]
     stamps = np.array([frame.stamp_ns for frame in frames])
-    return cov.measure_coverage(len(frames), lambda row: frames[row].features, stamps, drive, state.library, threads)
+    keyframes = Keyframes(drive, stamps, np.tile(np.eye(4), (len(frames), 1, 1)))
+    return cov.measure_coverage(keyframes, lambda row: frames[row].features, state.library, Execution(threads))
 
 
 def test_the_figure_of_a_run(state: PaperBobbState) -> None:
@@ -198,7 +200,7 @@ def test_more_frames_are_looked_at_where_few_leave_it_open(
 
 def test_an_image_does_not_explain_itself() -> None:
     alone = [Reference(r.image, r.features, "one", r.stamp_ns) for r in map(reference, (0, 20, 40, 60))]
-    state = SMALL.learn(alone, 1)
+    state = SMALL.learn(alone, Execution())
     assert _measure(state, [0, 20, 40, 60], drive="one").explained == 0.0
     assert _measure(state, [0, 20, 40, 60], drive="two").explained == 1.0
 

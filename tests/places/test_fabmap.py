@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from tests.places.pictures import noisy
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.chow_liu import ChowLiuTree
 from vplog.places.fabmap import FabmapSettings, FabmapState
 from vplog.places.fabmap_model import Model, log_likelihood_table
@@ -162,7 +163,7 @@ SMALL = FabmapSettings(words=150, features=250)
 
 @pytest.fixture(scope="module")
 def learned(references: list[Reference]) -> FabmapState:
-    return SMALL.learn(references, 2)
+    return SMALL.learn(references, Execution(2))
 
 
 def test_finds_the_same_picture_again_and_knows_a_new_one(learned: FabmapState, references: list[Reference]) -> None:
@@ -179,7 +180,7 @@ def test_a_sampled_new_place_converges_to_the_mean_over_all(references: list[Ref
         sampled = SMALL.model_copy(update={"new_place": "sampled", "samples": samples, "calibrate": False})
         distance = []
         for seed in range(3):
-            state = sampled.model_copy(update={"seed": seed}).learn(references, 1)
+            state = sampled.model_copy(update={"seed": seed}).learn(references, Execution())
             index = state.index([state.describe(reference.features) for reference in references])
             for _ in range(50):
                 query = np.flatnonzero(rng.random(len(state.vocabulary)) < 0.4).astype(np.uint16)
@@ -194,18 +195,18 @@ def test_evidence_is_weighed_less_where_neighbours_are_hard_to_tell(references: 
     order = np.random.default_rng(3).permutation(len(references))
     in_order = [replace(r, drive="one", stamp_ns=row) for row, r in enumerate(references)]
     at_random = [replace(references[at], drive="one", stamp_ns=row) for row, at in enumerate(order)]
-    weights = [SMALL.learn(given, 1).weight for given in (in_order, at_random)]
+    weights = [SMALL.learn(given, Execution()).weight for given in (in_order, at_random)]
     assert 0.01 <= weights[1] < weights[0] <= 1
     # as they are the references are 12 of three drives, too few of each to say anything: the papers' own
-    few = SMALL.learn(references, 1)
+    few = SMALL.learn(references, Execution())
     assert (few.weight, few.new_place_nats) == (1.0, 0.0)
-    unweighed = SMALL.model_copy(update={"calibrate": False}).learn(in_order, 1)
+    unweighed = SMALL.model_copy(update={"calibrate": False}).learn(in_order, Execution())
     assert (unweighed.weight, unweighed.new_place_nats) == (1.0, 0.0)
 
 
 def test_any_number_of_threads_learns_the_same(references: list[Reference]) -> None:
     given = [replace(r, drive="one", stamp_ns=row) for row, r in enumerate(references)]
-    one, four = SMALL.learn(given, 1), SMALL.learn(given, 4)
+    one, four = SMALL.learn(given, Execution()), SMALL.learn(given, Execution(4))
     assert one.hash == four.hash
     assert (one.weight, one.new_place_nats) == (four.weight, four.new_place_nats)
     assert one.model.table.tobytes() == four.model.table.tobytes()
@@ -229,6 +230,6 @@ def test_refuses_foreign_descriptors(learned: FabmapState) -> None:
 
 def test_refuses_what_cannot_be_learned(references: list[Reference]) -> None:
     with pytest.raises(LibraryError, match="at least two"):
-        SMALL.learn(references[:1], 1)
+        SMALL.learn(references[:1], Execution())
     with pytest.raises(ValidationError, match="must be below"):
         FabmapSettings(seen_if_there=0.1, seen_if_absent=0.2)

@@ -10,6 +10,7 @@ import pytest
 
 from tests.places.pictures import nothing
 from vplog.data import THUMBNAIL_SIDE, Features
+from vplog.execution.execution import Execution
 from vplog.places.gist import GistSettings, gabor_filters
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def _of(image: np.ndarray) -> Features:
 def test_a_grating_is_seen_by_the_filter_of_its_scale_and_direction(
     references: list[Reference], scale: int, orientation: int
 ) -> None:
-    state = SETTINGS.learn(references[:1], 1)
+    state = SETTINGS.learn(references[:1], Execution())
     frequency, angle = 0.3 / 1.85**scale, -np.pi * orientation / 8  # filters turn against the image's y, which is down
     y, x = np.mgrid[:THUMBNAIL_SIDE, :THUMBNAIL_SIDE]
     grating = 128 + 60 * np.cos(2 * np.pi * frequency * (x * np.cos(angle) + y * np.sin(angle)))
@@ -38,13 +39,13 @@ def test_a_grating_is_seen_by_the_filter_of_its_scale_and_direction(
 def test_texture_in_one_corner_is_seen_in_its_block(references: list[Reference]) -> None:
     image = np.full((THUMBNAIL_SIDE, THUMBNAIL_SIDE), 100.0)
     image[:32, 96:] += np.random.default_rng(0).normal(0, 30, (32, 32))
-    energy = SETTINGS.learn(references[:1], 1).describe(_of(image)).astype(np.float64).reshape(4, 8, 4, 4)
+    energy = SETTINGS.learn(references[:1], Execution()).describe(_of(image)).astype(np.float64).reshape(4, 8, 4, 4)
     assert np.all(energy.argmax(axis=3)[0][:, 0] == 3)
     assert energy[0, :, 0, 3].min() > 3 * energy[0, :, 3, 0].max()
 
 
 def test_light_matters_little(references: list[Reference]) -> None:
-    state = SETTINGS.learn(references[:1], 1)
+    state = SETTINGS.learn(references[:1], Execution())
     image = references[0].features.thumbnail
     assert image is not None
     index = state.index([state.describe(_of(image * 0.5)), state.describe(references[9].features)])
@@ -60,7 +61,7 @@ def test_filters_pass_no_constant_and_cover_a_half_plane() -> None:
 
 
 def test_scores_fall_with_the_distance(references: list[Reference]) -> None:
-    state = SETTINGS.learn(references, 1)
+    state = SETTINGS.learn(references, Execution())
     places = [state.describe(r.features) for r in references]
     matrix = np.array(places, np.float64)
     expected = 1 / (1 + np.linalg.norm(matrix - matrix[2], axis=1))

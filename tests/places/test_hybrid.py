@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.places.pictures import noisy, nothing, reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.bobb import BobbSettings, Place
 from vplog.places.dense import thumbnail_of
 from vplog.places.hybrid import Described, HybridIndex, HybridSettings, HybridState, learn_words
@@ -28,7 +29,7 @@ SMALL = HybridSettings(bobb=BobbSettings(references=4, features=250), words=4)
 
 @pytest.fixture(scope="module")
 def hybrid(references: list[Reference]) -> HybridState:
-    return SMALL.learn(references, 2)
+    return SMALL.learn(references, Execution(2))
 
 
 class NoBoxes:
@@ -68,7 +69,7 @@ def literal_signs(state: HybridState, features: Features) -> list[bool]:
 
 def test_signs_are_those_of_the_words_residuals(references: list[Reference]) -> None:
     whole = SMALL.model_copy(update={"bobb": SMALL.bobb.model_copy(update={"least_size": 0.0})})
-    state = whole.learn(references, 1)
+    state = whole.learn(references, Execution())
     for row in (0, 5):
         features = state.bobb.matcher.references[row].features
         bits = np.unpackbits(state.describe(features).signs).astype(bool)
@@ -119,12 +120,12 @@ def test_at_a_half_both_vary_alike_between_the_references(hybrid: HybridState, r
     boxes, words = (part[~np.eye(len(places), dtype=bool)].std() for part in alike.transpose(1, 0, 2))
     assert (1 - hybrid.share) * boxes == pytest.approx(hybrid.share * words, rel=1e-4)
     for share in (0.0, 1.0):
-        assert SMALL.model_copy(update={"share": share}).learn(references, 1).share == share
+        assert SMALL.model_copy(update={"share": share}).learn(references, Execution()).share == share
 
 
 def test_words_tell_places_that_the_library_does_not_explain(references: list[Reference]) -> None:
     """References of one panorama, places of another: no box is of use, the words are."""
-    state = SMALL.learn(references[:6], 1)
+    state = SMALL.learn(references[:6], Execution())
     elsewhere = [reference(seed) for seed in range(40, 52, 2)]
     index = state.index([state.describe(row.features) for row in elsewhere])
     found = [index.query(state.describe(noisy(row.features, 1)), 1).rows[0] for row in elsewhere]
@@ -132,12 +133,12 @@ def test_words_tell_places_that_the_library_does_not_explain(references: list[Re
 
 
 def test_a_place_fits_160_bytes(references: list[Reference]) -> None:
-    state = HybridSettings().learn(references[:2], 1)
+    state = HybridSettings().learn(references[:2], Execution())
     assert state.bits <= 8 * 160
 
 
 def test_one_reference_is_enough(references: list[Reference]) -> None:
-    state = SMALL.learn(references[:1], 1)
+    state = SMALL.learn(references[:1], Execution())
     assert state.share == SMALL.share
     assert not state.describe(nothing()).signs.any()
 

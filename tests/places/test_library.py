@@ -14,6 +14,7 @@ import pytest
 
 from tests.places.pictures import SMALL, noisy, nothing, reference, texture
 from vplog.errors import LibraryError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.places import library as lib
 from vplog.places import library_files
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -71,7 +72,7 @@ def test_own_words_hold_the_feature_itself(state: PaperBobbState) -> None:
 
 def test_repeated_features_are_words_of_each_other() -> None:
     once = reference(3)
-    library = lib.build_library([once, once], lib.WordSettings(features=50), 1)
+    library = lib.build_library([once, once], lib.WordSettings(features=50), Execution())
     words = _lists(library.words)
     shared = sum(feature + 50 in words[feature] for feature in range(50))
     assert shared > 45
@@ -90,7 +91,7 @@ def test_words_do_not_depend_on_batches_or_threads(state: PaperBobbState, refere
 
 
 def test_only_the_strongest_features_are_kept(references: list[Reference]) -> None:
-    library = lib.build_library(references[:3], lib.WordSettings(features=20), 1)
+    library = lib.build_library(references[:3], lib.WordSettings(features=20), Execution())
     assert library.start.tolist() == [0, 20, 40, 60]
     np.testing.assert_array_equal(library.descriptors[20:40], references[1].features.descriptors[:20])
     assert library.size(2) == (320, 200)
@@ -98,28 +99,28 @@ def test_only_the_strongest_features_are_kept(references: list[Reference]) -> No
 
 def test_a_library_needs_features() -> None:
     with pytest.raises(LibraryError, match="at least one reference"):
-        lib.build_library([], SMALL, 1)
+        lib.build_library([], SMALL, Execution())
     empty = replace(reference(0), features=nothing())
     with pytest.raises(LibraryError, match="None of the 2 reference images"):
-        lib.build_library([empty, empty], SMALL, 1)
+        lib.build_library([empty, empty], SMALL, Execution())
 
 
 @pytest.fixture
 def saved(tmp_path: Path, references: list[Reference]) -> Path:
-    SMALL.learn([*references[:4], replace(reference(5), features=nothing())], 1).save(tmp_path / "library")
+    SMALL.learn([*references[:4], replace(reference(5), features=nothing())], Execution()).save(tmp_path / "library")
     return tmp_path / "library"
 
 
 def _refused(folder: Path) -> str:
     with pytest.raises((LibraryError, SettingsError)) as error:
-        PaperBobbSettings().load(folder, 1)
+        PaperBobbSettings().load(folder, Execution())
     message = str(error.value)
     assert "\n" not in message
     return message
 
 
 def test_a_reference_without_features_survives_the_disk(saved: Path) -> None:
-    loaded = PaperBobbSettings().load(saved, 1)
+    loaded = PaperBobbSettings().load(saved, Execution())
     assert len(loaded.library) == 5
     assert loaded.library.start[-1] == loaded.library.start[-2]
     np.testing.assert_array_equal(loaded.library.references[4].image, texture(5))

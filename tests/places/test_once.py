@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from vplog.execution.execution import Execution
 from vplog.places import matches
 from vplog.places.bobb import BobbSettings
 from vplog.places.once import Once
@@ -56,13 +57,13 @@ def test_places_are_compared_without_an_index_of_the_library(
     references: list[Reference], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = BobbSettings(references=4, features=100)
-    learned = settings.learn(references[:6], 1)
+    learned = settings.learn(references[:6], Execution())
     learned.save(tmp_path / "library")
     places = [learned.describe(reference.features) for reference in references[:6]]
     column = learned.to_arrow(places)
     indexed = []
     monkeypatch.setattr(matches, "hnsw", lambda *told: indexed.append(told))
-    loaded = settings.load(tmp_path / "library", 2)
+    loaded = settings.load(tmp_path / "library", Execution(2))
     known = loaded.from_arrow(column)
     np.testing.assert_array_equal(loaded.index(known).scores(known[0]), learned.index(places).scores(places[0]))
     assert loaded.hash == learned.hash

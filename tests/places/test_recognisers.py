@@ -15,6 +15,7 @@ import pytest
 from tests.places.pictures import nothing
 from vplog.data import THUMBNAIL_SIDE
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places import PlaceSettings
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -69,7 +70,7 @@ class Case:
 def cases(references: list[Reference]) -> dict[str, Case]:
     made = {}
     for name, settings in CASES.items():
-        state = settings.learn(references, 1)
+        state = settings.learn(references, Execution())
         places = [state.describe(reference.features) for reference in references]
         made[name] = Case(settings, state, places, state.to_arrow(places))
     return made
@@ -92,7 +93,7 @@ def test_every_member_is_tested_under_its_kind(settings: type[Settings]) -> None
 
 
 def test_any_number_of_threads_gives_the_same_bytes(case: Case, references: list[Reference]) -> None:
-    other = case.settings.learn(iter(references), 3)
+    other = case.settings.learn(iter(references), Execution(3))
     assert other.hash == case.state.hash
     assert described(other, references, 3).equals(case.column)
     blank = other.describe(BLANK)
@@ -103,16 +104,16 @@ def test_any_number_of_threads_gives_the_same_bytes(case: Case, references: list
 
 def test_a_saved_library_is_the_same_recogniser(case: Case, references: list[Reference], tmp_path: Path) -> None:
     case.state.save(tmp_path)
-    loaded = type(case.settings)().load(tmp_path, 2)  # the folder's settings count, not these
+    loaded = type(case.settings)().load(tmp_path, Execution(2))  # the folder's settings count, not these
     assert loaded.settings == case.settings
     assert loaded.hash == case.state.hash
     assert described(loaded, references, 1).equals(case.column)
     record = tmp_path / "library.json"
     record.write_text(record.read_text().replace(case.state.hash, "0" * 64))
     with pytest.raises(LibraryError, match="hash"):
-        case.settings.load(tmp_path, 1)
+        case.settings.load(tmp_path, Execution())
     with pytest.raises(LibraryError, match="not a library"):
-        case.settings.load(tmp_path / "none", 1)
+        case.settings.load(tmp_path / "none", Execution())
 
 
 def test_settings_that_differ_give_other_hashes(cases: dict[str, Case]) -> None:
@@ -190,7 +191,7 @@ def test_an_image_without_features_is_described(case: Case, references: list[Ref
         assert len(index.query(blank, 5).rows) == 0
         assert index.query(case.places[0], 5).rows.tolist() == [1]
         with pytest.raises(LibraryError, match="feature"):
-            case.settings.learn([replace(reference, features=BLANK) for reference in references[:3]], 1)
+            case.settings.learn([replace(reference, features=BLANK) for reference in references[:3]], Execution())
 
 
 def test_boxes_of_any_recogniser_that_has_them(case: Case, references: list[Reference]) -> None:
@@ -221,7 +222,7 @@ def test_boxes_of_any_recogniser_that_has_them(case: Case, references: list[Refe
 
 def test_a_library_needs_references(case: Case) -> None:
     with pytest.raises(LibraryError, match="at least"):
-        case.settings.learn([], 1)
+        case.settings.learn([], Execution())
 
 
 def test_columns_of_another_kind_are_refused(case: Case, cases: dict[str, Case]) -> None:

@@ -91,7 +91,7 @@ def test_a_run_keeps_the_images_that_its_features_chose(drive: Drive, tmp_path: 
 
 def test_what_one_drive_explains_the_other_need_not(drive: Drive, tmp_path: Path) -> None:
     pipeline = load_pipeline("default", [*QUICK, "library.size=12"])
-    build_library([drive.log, drive.log], tmp_path / "twice", pipeline, threads=2)
+    build_library([drive.log, drive.log], tmp_path / "twice", pipeline, execution=Execution(2))
     stamps = [reference.stamp_ns for reference in load_references(tmp_path / "twice")]
     assert len(stamps) == 12
     assert len(set(stamps)) == 12, "two equal drives, and no view of them twice"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from tests.places.literal import Picture, all_boxes, box_sum, cell_sums, dominant_sum, voting_image
 from tests.places.pictures import SMALL, noisy
+from vplog.execution.execution import Execution
 from vplog.places import bobb_paper as bobb
 from vplog.places import rvp
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -88,7 +89,7 @@ def test_votes_and_box_agree_with_the_literal_algorithm() -> None:
 def test_described_boxes_agree_with_the_literal_algorithm(state: PaperBobbState, references: list[Reference]) -> None:
     """End to end: library words, random windows, the reference's own partitions, the box that is kept."""
     tiny = PaperBobbSettings(partitions=3, columns=8, rows=4, features=80, references=2, boxes=2, grid=12)
-    learned = tiny.learn(references[:4], 1)
+    learned = tiny.learn(references[:4], Execution())
     features = noisy(references[1].features, 5)
     place = learned.describe(features)
     windows = np.array(learned._windows)

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from tests.places.sequence_matrix import match_sequences
 from vplog.data import Ranking
+from vplog.execution.execution import Execution
 from vplog.places.sequence import SequenceSettings, rank_places, sequence_rows
 
 
@@ -192,7 +193,7 @@ def test_ranks_are_those_of_the_sequence_scores() -> None:
     scores = walks(np.random.default_rng(9), np.arange(150.0) % 75, 150)
     stops = np.maximum(np.arange(150) - 20, 0)
     expected = match_sequences(scores, SequenceSettings(), stops)
-    ranked = list(rank_places(Index(scores), list(range(150)), stops, 5, SequenceSettings(), threads=2))
+    ranked = list(rank_places(Index(scores), list(range(150)), stops, 5, SequenceSettings(), execution=Execution(2)))
     assert len(ranked) == 150
     for row, (ranking, support) in zip(expected, ranked, strict=True):
         order = np.argsort(-np.nan_to_num(row, nan=-1.0), kind="stable")[:5]
@@ -205,7 +206,7 @@ def test_ranks_are_those_of_the_sequence_scores() -> None:
 def test_single_views_are_ranked_by_the_index_itself() -> None:
     index, stops = Index(np.zeros((100, 100), np.float32)), np.arange(100)
     for query, (ranking, support) in enumerate(
-        rank_places(index, list(range(100)), stops, 5, SequenceSettings(length=1), threads=2)
+        rank_places(index, list(range(100)), stops, 5, SequenceSettings(length=1), execution=Execution(2))
     ):
         assert len(ranking.rows) == len(support) == min(query, 5)
         assert (ranking.score == query).all()
@@ -215,8 +216,8 @@ def test_single_views_are_ranked_by_the_index_itself() -> None:
 def test_nothing_to_match() -> None:
     for length in (1, 21):
         chosen = SequenceSettings(length=length)
-        assert list(rank_places(Index(np.zeros((0, 0))), [], np.zeros(0, np.int64), 5, chosen)) == []
-        ranked = list(rank_places(Index(np.zeros((3, 3))), [0, 1, 2], np.zeros(3, np.int64), 5, chosen))
+        assert list(rank_places(Index(np.zeros((0, 0))), [], np.zeros(0, np.int64), 5, chosen, Execution())) == []
+        ranked = list(rank_places(Index(np.zeros((3, 3))), [0, 1, 2], np.zeros(3, np.int64), 5, chosen, Execution()))
         assert [len(ranking.rows) for ranking, _ in ranked] == [0, 0, 0]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.places.pictures import noisy, nothing
+from vplog.execution.execution import Execution
 from vplog.places import shared_references
 from vplog.places.bobb import BobbSettings
 from vplog.places.bovf import BovfSettings
@@ -28,7 +29,7 @@ def pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("pairing", ["best", "same", "both"])
 def test_parts_of_the_score_add_up(references: list[Reference], pairing: Any) -> None:
-    state = TINY.model_copy(update={"pairing": pairing}).learn(references, 1)
+    state = TINY.model_copy(update={"pairing": pairing}).learn(references, Execution())
     places = [state.describe(noisy(r.features, 3)) for r in references] + [state.describe(nothing())]
     query, match = pairs(len(places))
     found = state.shared(places, query, match)
@@ -67,7 +68,7 @@ def test_parts_of_eq_1_add_up(state: PaperBobbState, references: list[Reference]
 def test_pairs_are_compared_alike_however_many_at_once(
     references: list[Reference], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    state = TINY.learn(references, 1)
+    state = TINY.learn(references, Execution())
     places = [state.describe(noisy(r.features, 3)) for r in references]
     query, match = pairs(len(places))
     whole = state.shared(places, query, match)
@@ -81,11 +82,11 @@ def test_pairs_are_compared_alike_however_many_at_once(
 
 
 def test_only_recognisers_with_boxes_share_references(references: list[Reference]) -> None:
-    hybrid = HybridSettings(bobb=TINY, words=2, bits=8).learn(references, 1)
+    hybrid = HybridSettings(bobb=TINY, words=2, bits=8).learn(references, Execution())
     assert isinstance(hybrid, BoxState)
     places = [hybrid.describe(r.features) for r in references]
     query, match = pairs(len(places))
     found = hybrid.shared(places, query, match)
     boxes = hybrid.bobb.shared([place.boxes for place in places], query, match)
     assert all(map(np.array_equal, found.references, boxes.references))
-    assert not isinstance(BovfSettings(features=250).learn(references, 1), BoxState)
+    assert not isinstance(BovfSettings(features=250).learn(references, Execution()), BoxState)

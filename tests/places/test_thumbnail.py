@@ -9,6 +9,7 @@ import numpy as np
 
 from tests.places.pictures import nothing
 from vplog.data import THUMBNAIL_SIDE
+from vplog.execution.execution import Execution
 from vplog.places.thumbnail import ThumbnailSettings
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ SETTINGS = ThumbnailSettings()
 
 
 def test_patches_have_mean_zero_and_deviation_one(references: list[Reference]) -> None:
-    state = SETTINGS.learn(references[:1], 1)
+    state = SETTINGS.learn(references[:1], Execution())
     image = state.describe(references[0].features)
     assert image.dtype == np.uint8
     assert state.bits == 8 * image.size
@@ -28,7 +29,7 @@ def test_patches_have_mean_zero_and_deviation_one(references: list[Reference]) -
 
 
 def test_light_and_contrast_do_not_matter_but_flat_patches_stay_flat(references: list[Reference]) -> None:
-    state = SETTINGS.learn(references[:1], 1)
+    state = SETTINGS.learn(references[:1], Execution())
     rough = np.kron(np.random.default_rng(0).integers(0, 60, (32, 64)) * 2, np.ones((4, 2))).astype(np.uint8)
     darker = (rough // 2 + 100).astype(np.uint8)
     a, b = (state.describe(replace(nothing(), thumbnail=image)) for image in (rough, darker))
@@ -38,7 +39,7 @@ def test_light_and_contrast_do_not_matter_but_flat_patches_stay_flat(references:
 
 
 def test_scores_fall_with_the_sum_of_absolute_differences(references: list[Reference]) -> None:
-    state = SETTINGS.learn(references, 1)
+    state = SETTINGS.learn(references, Execution())
     places = [state.describe(r.features) for r in references]
     apart = np.abs(np.array(places, float) - places[2].astype(float)).sum(axis=1)
     np.testing.assert_allclose(state.index(places).scores(places[2]), 1 - apart / (255 * 2048), atol=1e-6)

@@ -10,6 +10,7 @@ import pytest
 
 from tests.places.pictures import nothing
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.vlad import VladSettings, Whitening, aggregate
 from vplog.places.vocabulary import learn_vocabulary, root_sift
 
@@ -22,8 +23,8 @@ WHOLE = VladSettings(centres=8, features=250, dimensions=None)
 
 def test_bad_input(references: list[Reference]) -> None:
     with pytest.raises(LibraryError, match="at least two"):
-        SMALL.learn(references[:1], 1)
-    state = SMALL.learn(references, 1)
+        SMALL.learn(references[:1], Execution())
+    state = SMALL.learn(references, Execution())
     broken = np.full(state.bits // 16, np.nan, np.float16)
     with pytest.raises(LibraryError, match="finite"):
         state.from_arrow(state.to_arrow([broken]))
@@ -33,7 +34,7 @@ def test_bad_input(references: list[Reference]) -> None:
 
 def test_a_vector_is_the_residuals_centre_by_centre(references: list[Reference]) -> None:
     features = references[0].features
-    vocabulary = learn_vocabulary(features.descriptors, 5, 0, 1)
+    vocabulary = learn_vocabulary(features.descriptors, 5, 0, Execution())
     parts = np.zeros((len(vocabulary), 128))
     for descriptor in root_sift(features.descriptors[:100]).astype(np.float64):
         nearest = np.square(vocabulary.centres - descriptor).sum(axis=1).argmin()
@@ -53,8 +54,8 @@ def test_without_shrinkage_the_whitened_references_are_white() -> None:
 
 
 def test_places_are_of_unit_length_and_as_long_as_the_references_allow(references: list[Reference]) -> None:
-    state = SMALL.learn(references, 1)
+    state = SMALL.learn(references, Execution())
     place = state.describe(references[0].features)
     assert place.shape == (len(references) - 1,)
     assert np.linalg.norm(place.astype(np.float64)) == pytest.approx(1, abs=2e-3)
-    assert WHOLE.learn(references, 1).bits == 8 * 128 * 16
+    assert WHOLE.learn(references, Execution()).bits == 8 * 128 * 16

@@ -7,6 +7,7 @@ import pytest
 
 from tests.places.pictures import reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift
 
 
@@ -29,7 +30,7 @@ def test_root_sift_is_of_unit_length_and_its_products_are_hellinger_kernels() ->
 def test_any_number_of_threads_gives_the_same_words() -> None:
     # views apart by their width or more: features seen twice would be words twice, and one of the two is dropped
     descriptors = np.concatenate([reference(seed).features.descriptors for seed in range(0, 52, 4)])
-    one, four = (learn_vocabulary(descriptors, 1150, 3, threads) for threads in (1, 4))
+    one, four = (learn_vocabulary(descriptors, 1150, 3, Execution(threads)) for threads in (1, 4))
     assert 1024 < len(one) <= 1150  # more words than are searched exactly
     np.testing.assert_array_equal(one.centres, four.centres)
     np.testing.assert_array_equal(one.quantise(descriptors), four.quantise(descriptors))
@@ -37,7 +38,7 @@ def test_any_number_of_threads_gives_the_same_words() -> None:
 
 def test_the_seed_draws_other_words() -> None:
     descriptors = _blobs(40, 5)
-    a, b = (learn_vocabulary(descriptors, 20, seed, 1) for seed in (0, 1))
+    a, b = (learn_vocabulary(descriptors, 20, seed, Execution()) for seed in (0, 1))
     assert not np.array_equal(a.centres, b.centres)
 
 
@@ -56,20 +57,20 @@ def test_a_feature_has_the_word_of_the_nearest_centre(words: int, share: float) 
 
 def test_centres_are_the_means_of_their_features() -> None:
     descriptors = _blobs(12, 40)
-    vocabulary = learn_vocabulary(descriptors, 12, 0, 2)
+    vocabulary = learn_vocabulary(descriptors, 12, 0, Execution(2))
     words = vocabulary.quantise(descriptors)
     means = np.array([root_sift(descriptors)[words == word].mean(axis=0) for word in range(len(vocabulary))])
     np.testing.assert_allclose(vocabulary.centres, means, atol=0.51 / 512)
 
 
 def test_few_features_make_few_words() -> None:
-    assert len(learn_vocabulary(_blobs(20, 2), 16_000, 0, 2)) <= 10
-    assert len(learn_vocabulary(_blobs(1, 1), 16_000, 0, 2)) == 1
+    assert len(learn_vocabulary(_blobs(20, 2), 16_000, 0, Execution(2))) <= 10
+    assert len(learn_vocabulary(_blobs(1, 1), 16_000, 0, Execution(2))) == 1
     same = np.repeat(_blobs(1, 1), 50, axis=0)
-    assert len(learn_vocabulary(same, 12, 0, 2)) == 1
+    assert len(learn_vocabulary(same, 12, 0, Execution(2))) == 1
 
 
 def test_no_feature_is_an_error_and_no_query_is_none() -> None:
     with pytest.raises(LibraryError, match="not a single feature"):
-        learn_vocabulary(np.zeros((0, 128), np.uint8), 10, 0, 1)
-    assert learn_vocabulary(_blobs(5, 5), 5, 0, 1).quantise(np.zeros((0, 128), np.uint8)).shape == (0,)
+        learn_vocabulary(np.zeros((0, 128), np.uint8), 10, 0, Execution())
+    assert learn_vocabulary(_blobs(5, 5), 5, 0, Execution()).quantise(np.zeros((0, 128), np.uint8)).shape == (0,)

@@ -10,7 +10,6 @@ import pytest
 
 from tests.graph.drive import ODOMETRY_SIGMA, ledger, position_error, ring
 from vplog.data import Odometry, Verdict
-from vplog.execution.execution import Execution
 from vplog.graph.consistency import is_loop
 from vplog.pipeline import Pipeline
 from vplog.run.back_end import solve
@@ -32,7 +31,7 @@ def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
         drive.odometry.odom_from_body,
         np.tile(np.diag(claimed * ODOMETRY_SIGMA**2), (count, 1, 1)),
     )
-    return solve(odometry, drive.keyframes, closures, None, Pipeline(), execution=Execution())
+    return solve(odometry, drive.keyframes, closures, None, Pipeline())
 
 
 @pytest.mark.parametrize("claimed", [1e-6, 1 / 64, 1.0, 64.0])

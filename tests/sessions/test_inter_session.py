@@ -10,6 +10,7 @@ import numpy as np
 
 from tests.graph.drive import ledger
 from vplog.data import Closures, Verdict
+from vplog.execution.execution import Execution
 from vplog.graph.joint import JoinSettings
 from vplog.loops.propose import Proposals
 from vplog.sessions import inter_session
@@ -43,7 +44,8 @@ def looked_at(
 
     monkeypatch.setattr(inter_session, "verify_between", verify)
     drive: Any = SimpleNamespace(camera=SimpleNamespace(matrix=np.eye(3) if calibrated else None))
-    return looks, inter_session.closures_between(proposals(), drive, drive, settings or JoinSettings(), share=0.0)
+    settings = settings or JoinSettings()
+    return looks, inter_session.closures_between(proposals(), drive, drive, settings, 0.0, Execution())
 
 
 def test_drives_that_do_not_meet_cost_one_look_at_the_highest_scores(monkeypatch: pytest.MonkeyPatch) -> None:

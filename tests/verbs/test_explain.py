@@ -321,7 +321,7 @@ def test_matches_by_chance_agree_with_nothing(count: int) -> None:
 
 def test_the_windows_drawn_are_those_whose_boxes_agree_best(finished: Path) -> None:
     ledger = tables.read_closures(finished / "closures.parquet")
-    state = Pipeline().places.load(finished / "library", 1)
+    state = Pipeline().places.load(finished / "library", Execution())
     places = state.from_arrow(tables.read_descriptors(finished / "descriptors.parquet")[0])
     number = of(finished, Verdict.ACCEPTED)
     numbers = ledger.shared_references[number].tolist()

@@ -280,7 +280,7 @@ def test_parts_computed_elsewhere_spare_the_run_all_images(
     todo = parts_of(log, pipeline)
     assert [len(part.stamp_ns) for part in todo] == [PART] * (COUNT // PART)
     for part in reversed(todo):
-        data = compute_part(part, threads=1 + part.number)
+        data = compute_part(part, Execution(1 + part.number))
         assert data == (whole / ".cache" / part.file).read_bytes()
         with pytest.raises(ResultError, match="arrived damaged"):
             put_part(cache, part, data[:-1])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError, VplogError
+from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
 from vplog.places.library_files import read_library_record
 from vplog.places.reference_choice import PAPER_SIZE, evenly
@@ -52,7 +53,7 @@ def map_library(
                 f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
             )
         if known is None:
-            digest = pipeline.places.load(given, threads).hash  # held against what it says of itself
+            digest = pipeline.places.load(given, Execution(threads)).hash  # held against what it says of itself
             try:
                 shutil.copytree(given, made, symlinks=True)
             except (OSError, shutil.Error) as error:
@@ -60,7 +61,9 @@ def map_library(
                 told = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error
                 raise ResultError(f"Cannot copy the library {given} into {store}: {told}.") from None
     elif known is None:
-        digest = build_library(_that_can_be_read(paths, topics), made, pipeline, topics, threads, progress).hash
+        digest = build_library(
+            _that_can_be_read(paths, topics), made, pipeline, topics, Execution(threads, progress)
+        ).hash
     else:
         check_library(store.library(known), pipeline)
         digest = known

@@ -12,6 +12,7 @@ from vplog import logs
 from vplog.batch.batch import Drive, run_batch, tell_failures
 from vplog.batch.engine import RETRIES
 from vplog.errors import LogError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.maps.import_places import ALONE
 from vplog.maps.merge import in_order
 from vplog.maps.storage import map_store
@@ -125,7 +126,7 @@ def _made(library: Path, pipeline: Pipeline, threads: int, progress: Progress) -
         return
     with scratch("made") as made:
         folder = made / "library"
-        build_library([library], folder, pipeline, logs.TopicChoice(), threads, progress)
+        build_library([library], folder, pipeline, logs.TopicChoice(), Execution(threads, progress))
         yield folder, pipeline
 
 

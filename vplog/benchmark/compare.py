@@ -18,12 +18,12 @@ import numpy as np
 import vplog
 from vplog import logs
 from vplog.benchmark import compare_figures
-from vplog.benchmark.method_scores import evaluate_method
+from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.traversals import Walk, candidate_stops, extract_walk
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
-from vplog.execution.execution import logged_warnings
+from vplog.execution.execution import Execution, logged_warnings
 from vplog.features.store import FeatureStore
 from vplog.places.library_files import load_references, references_hash
 from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
@@ -33,9 +33,8 @@ from vplog.results.staging import staged
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
-    from vplog.benchmark.traversals import Progress
     from vplog.data import Float32s, Ints, Reference
     from vplog.evaluate.calibration import Reliability
     from vplog.evaluate.retrieval import Ranks
@@ -53,29 +52,40 @@ class Comparison:
     """By name; a method by sequences has `, L=..` added."""
 
 
+@dataclass(frozen=True)
+class CompareOptions:
+    """How recognisers are compared."""
+
+    library: Path | None = None
+    """A drive, or a saved library; None for the map."""
+    library_size: int = PAPER_SIZE
+    library_seed: int = 0
+    min_gap: int | None = None
+    """Frames that a match is older, at least, in a drive compared with itself."""
+    sequence: int | None = None
+    """Frames of a sequence, other settings of which are the pipeline's; None for single views only."""
+    out: Path | None = None
+    """Folder of compare.json, scores and curves; None writes nothing."""
+    topics: logs.TopicChoice | None = None
+
+
 def compare(
     query: Path,
     other: Path | None,
     methods: Iterable[str],
     truth: TruthChoice,
     pipeline: Pipeline,
-    library: Path | None = None,
-    library_size: int = PAPER_SIZE,
-    library_seed: int = 0,
-    min_gap: int | None = None,
-    sequence: int | None = None,
-    out: Path | None = None,
-    topics: logs.TopicChoice | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    options: CompareOptions = CompareOptions(),
+    execution: Execution = Execution(),
 ) -> Comparison:
     """Every method on a query and a map drive; without a map, or with the same one, frames among their own past.
 
-    `library` is a drive or a saved library, None the map. `sequence` is a length in frames, the rest of it the
-    pipeline's; None for single views only. With `out`, compare.json, the scores and the curves are written there.
     Raises VplogError with one line where that cannot be.
     """
     other = query if other is None else other
+    library, min_gap, sequence, out, topics = (
+        options.library, options.min_gap, options.sequence, options.out, options.topics
+    )  # fmt: skip
     recognisers = read_methods(methods, pipeline)
     sequences = None
     if sequence is not None:
@@ -93,10 +103,16 @@ def compare(
         warnings += check_truth(known, query_log, map_log, min_gap)  # before the long part
         if library is None or same_drive(library, other):
             library = None
-        wanted = LibrarySettings(choose="random", size=library_size, seed=library_seed)
-        map_walk, query_walk, references, notes = _extract_all(
-            query_log, map_log, known, library, wanted, pipeline, topics, threads, progress, stack, scratch
-        )
+        wanted = LibrarySettings(choose="random", size=options.library_size, seed=options.library_seed)
+
+        def walk_of(log: Log, role: str, frames: Ints, references: Ints | None = None) -> Walk:
+            store = stack.enter_context(FeatureStore(scratch / f"{role}.features"))
+            return extract_walk(log, pipeline.features, store, frames, references, execution)
+
+        source = None
+        if library is not None:
+            source = load_references(library, execution) if _is_saved(library) else logs.open(library, topics)
+        map_walk, query_walk, references, notes = _extract_all(query_log, map_log, known, source, wanted, walk_of)
         warnings += notes
         stops = candidate_stops(query_walk.frames, map_walk.frames, min_gap)
         pairs = known.pairs(query_walk.frames, map_walk.frames).below(stops)
@@ -108,7 +124,7 @@ def compare(
             "library": {
                 "from": str(library or other),
                 "size": len(references),
-                "seed": None if _is_saved(library) else library_seed,
+                "seed": None if _is_saved(library) else options.library_seed,
                 "hash": references_hash(references, pipeline.features),
             },
             "truth": {**known.about, "pairs": pairs.count},
@@ -118,13 +134,11 @@ def compare(
             "features": pipeline.features.model_dump(mode="json"),
             "methods": {},
         }
+        inputs = MethodInputs(references, map_walk, query_walk, pairs, stops, sequences, scratch)
         ranks: dict[str, Ranks] = {}
         reliable: dict[str, Reliability] = {}
         for number, (name, settings) in enumerate(recognisers.items(), start=1):
-            result = evaluate_method(
-                settings, references, map_walk, query_walk, pairs, stops, threads,
-                lambda stage, done, total, name=name: progress(f"{name}: {stage}", done, total), sequences, scratch,
-            )  # fmt: skip
+            result = evaluate_method(settings, inputs, execution.within(name))
             account["methods"][name] = result.figures
             ranks[name] = result.ranks
             if result.reliability is not None:
@@ -146,33 +160,21 @@ def _extract_all(
     query: Log,
     other: Log,
     known: PlaceTruth,
-    library: Path | None,
+    library: Log | list[Reference] | None,
     wanted: LibrarySettings,
-    pipeline: Pipeline,
-    topics: logs.TopicChoice | None,
-    threads: int,
-    progress: Progress,
-    stack: ExitStack,
-    scratch: Path,
+    walk_of: Callable[..., Walk],
 ) -> tuple[Walk, Walk, list[Reference], list[str]]:
     """Walks of the map and the query, one and the same for a drive against itself, the references, and warnings."""
-
-    def walk_of(log: Log, role: str, frames: Ints, chosen: Ints | None = None) -> Walk:
-        store = stack.enter_context(FeatureStore(scratch / f"{role}.features"))
-        return extract_walk(log, pipeline.features, store, frames, chosen, threads, progress)
-
-    saved = load_references(library) if library is not None and _is_saved(library) else None
     chosen = known.map_frames[choose(other.stamps()[known.map_frames], wanted)] if library is None else None
     map_walk = walk_of(other, "map", known.map_frames, chosen)
     query_walk = map_walk if query is other else walk_of(query, "query", known.query_frames)
     warnings = list(dict.fromkeys(map_walk.warnings + query_walk.warnings))
-    if saved is not None:
-        return map_walk, query_walk, saved, warnings
+    if isinstance(library, list):
+        return map_walk, query_walk, library, warnings
     references = map_walk.references
     if library is not None:
-        log = logs.open(library, topics)
-        rows = choose(log.stamps(), wanted)
-        walk = walk_of(log, "library", rows, rows)
+        rows = choose(library.stamps(), wanted)
+        walk = walk_of(library, "library", rows, rows)
         references = walk.references
         warnings += walk.warnings
     if len(references) < (wanted.size or 0):

@@ -6,7 +6,6 @@ Times are CPU time of the thread that does the work, so they are those of one th
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from shutil import disk_usage
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ import pyarrow as pa
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.evaluate.calibration import reliability
-from vplog.features.extraction import map_in_order, one_thread_each
+from vplog.execution.execution import Execution
 from vplog.places.sequence import sequence_rows
 from vplog.stages import ProbableIndex
 
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from vplog.benchmark.traversals import Progress, Walk
+    from vplog.benchmark.traversals import Walk
     from vplog.data import Float32s, Floats, Ints, Reference
     from vplog.evaluate.calibration import Reliability
     from vplog.evaluate.pairs import Pairs
@@ -56,34 +55,39 @@ class MethodResult:
     """Whether its probabilities mean what they say, where it gives any."""
 
 
-def evaluate_method(
-    settings: PlaceSettings,
-    references: Sequence[Reference],
-    map_walk: Walk,
-    query_walk: Walk,
-    truth: Pairs,
-    stops: Ints,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
-    sequence: SequenceSettings | None = None,
-    scratch: Path | None = None,
-) -> MethodResult:
-    """Learn the references, describe both walks, look for every query among the map rows below `stops[q]`, (Q,).
+@dataclass(frozen=True, eq=False)
+class MethodInputs:
+    """What every method of a comparison gets."""
 
-    A drive against itself is the same walk twice, described once. The map is rebuilt from what a table would store of
-    it, so the bytes counted are all that is used. Scores are kept in a file of the folder `scratch`, or in memory.
+    references: Sequence[Reference]
+    map_walk: Walk
+    query_walk: Walk
+    """The same object for a drive against itself, which is described once."""
+    truth: Pairs
+    stops: Ints
+    """(Q,) each query's candidates are the map rows below."""
+    sequence: SequenceSettings | None = None
+    scratch: Path | None = None
+    """Folder of the files of scores; None keeps them in memory."""
+
+
+def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Execution = Execution()) -> MethodResult:
+    """Learn the references, describe both walks, search the map for every query.
+
+    The map is rebuilt from what a table would store of it, so the bytes counted are all that is used.
     Raises TruthError without a true pair, and whatever the method raises.
     """
-    state, learn_s = _learn(settings, references, threads)
-    places, mining_ms = describe_walk(state, map_walk, threads, lambda *at: progress("describe map", *at))
+    map_walk, query_walk, truth, stops = inputs.map_walk, inputs.query_walk, inputs.truth, inputs.stops
+    state, learn_s = _learn(settings, inputs.references, execution)
+    places, mining_ms = describe_walk(state, map_walk, "describe map", execution)
     column = state.to_arrow(places)
     places = state.from_arrow(column)
     index, queries = state.index(places), places
     if query_walk is not map_walk:
-        queries, more = describe_walk(state, query_walk, threads, lambda *at: progress("describe queries", *at))
+        queries, more = describe_walk(state, query_walk, "describe queries", execution)
         mining_ms = np.concatenate([mining_ms, more])
-    scores = score_table(len(queries), len(index), scratch, "scores")
-    query_ms = search(index, queries, stops, scores, threads, lambda *at: progress("search", *at))
+    scores = score_table(len(queries), len(index), inputs.scratch, "scores")
+    query_ms = search(index, queries, stops, scores, execution)
     ranks = retrieval.rank_queries(scores, truth, stops)
     walks = [map_walk] if query_walk is map_walk else [map_walk, query_walk]
     feature_ms = float(np.median(np.concatenate([walk.feature_ms for walk in walks])))
@@ -100,29 +104,27 @@ def evaluate_method(
         "settings": settings.model_dump(mode="json"),
     }
     reliable = (
-        reliability_of(index, queries, stops, ranks, truth, threads) if isinstance(index, ProbableIndex) else None
+        reliability_of(index, queries, stops, ranks, truth, execution) if isinstance(index, ProbableIndex) else None
     )
     if reliable is not None:
         figures["calibration"] = reliable.as_json()
-    if sequence is None:
+    if (sequence := inputs.sequence) is None:
         return MethodResult(state, scores, ranks, figures, reliability=reliable)
-    lines = score_table(len(queries), len(index), scratch, "sequences")
-    match_lines(scores, sequence, stops, lines, threads, lambda *at: progress("sequences", *at))
+    lines = score_table(len(queries), len(index), inputs.scratch, "sequences")
+    match_lines(scores, sequence, stops, lines, execution)
     by_sequence = retrieval.rank_queries(lines, truth, stops)
     figures["sequence"] = {**sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
     return MethodResult(state, scores, ranks, figures, by_sequence, reliable)
 
 
-def _learn(recogniser: Recogniser, references: Sequence[Reference], threads: int) -> tuple[PlaceState, float]:
+def _learn(recogniser: Recogniser, references: Sequence[Reference], execution: Execution) -> tuple[PlaceState, float]:
     """What it learned, and the CPU s that all threads took."""
     began = time.process_time()
-    state = recogniser.learn(references, threads)
+    state = recogniser.learn(references, execution)
     return state, time.process_time() - began
 
 
-def describe_walk(
-    state: PlaceState, walk: Walk, threads: int, progress: Callable[[int, int], None]
-) -> tuple[list[Any], Floats]:
+def describe_walk(state: PlaceState, walk: Walk, stage: str, execution: Execution) -> tuple[list[Any], Floats]:
     """A descriptor for every row, and the CPU ms (N,) each took."""
 
     def work(row: int) -> tuple[Any, float]:
@@ -131,17 +133,10 @@ def describe_walk(
         place = state.describe(features)
         return place, 1e3 * (time.thread_time() - began)
 
-    return _timed_map(work, len(walk), threads, progress)
+    return _timed_map(work, len(walk), stage, execution)
 
 
-def search(
-    index: PlaceIndex,
-    queries: Sequence[Any],
-    stops: Ints,
-    scores: Float32s,
-    threads: int,
-    progress: Callable[[int, int], None],
-) -> Floats:
+def search(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, execution: Execution) -> Floats:
     """Fill `scores` (Q, M), NaN beyond each query's stop; CPU ms (Q,) of a search for the best ANSWERS rows."""
 
     def work(row: int) -> tuple[None, float]:
@@ -153,10 +148,10 @@ def search(
         scores[row, stop:] = np.nan
         return None, 1e3 * spent
 
-    return _timed_map(work, len(queries), threads, progress)[1]
+    return _timed_map(work, len(queries), "search", execution)[1]
 
 
-def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, threads: int) -> None:
+def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, execution: Execution) -> None:
     """Fill `scores` (Q, M), NaN beyond each query's stop, without timing a search."""
 
     def work(row: int) -> None:
@@ -164,13 +159,12 @@ def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: F
         scores[row, :stop] = index.scores(queries[row], stop)
         scores[row, stop:] = np.nan
 
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        for _ in map_in_order(pool, work, range(len(queries)), ahead=4 * threads):
-            pass
+    for _ in execution.map(work, range(len(queries))):
+        pass
 
 
 def reliability_of(
-    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, truth: Pairs, threads: int
+    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, truth: Pairs, execution: Execution
 ) -> Reliability | None:
     """The probabilities of the best answers against how often these are right; None without an answer.
 
@@ -187,37 +181,25 @@ def reliability_of(
     answered = np.flatnonzero(ranks.top_row >= 0)
     if not len(answered):
         return None
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        said = list(map_in_order(pool, work, answered.tolist(), ahead=4 * threads))
-    return reliability(said, ranks.top_true[answered] > 0.5, RELIABILITY_BINS)
+    probabilities = list(execution.map(work, answered.tolist()))
+    return reliability(probabilities, ranks.top_true[answered] > 0.5, RELIABILITY_BINS)
 
 
 def match_lines(
-    scores: Float32s,
-    settings: SequenceSettings,
-    stops: Ints,
-    lines: Float32s,
-    threads: int,
-    progress: Callable[[int, int], None],
+    scores: Float32s, settings: SequenceSettings, stops: Ints, lines: Float32s, execution: Execution
 ) -> None:
     """Fill `lines` (Q, M) with the scores of sequences, NaN beyond each query's stop; a few rows at a time."""
-    found = sequence_rows(lambda query: scores[query, : stops[query]], stops, settings, threads)
-    for query, (row, _) in enumerate(found):
+    found = sequence_rows(lambda query: scores[query, : stops[query]], stops, settings, execution.threads)
+    for query, (row, _) in enumerate(execution.counted("sequences", found, len(stops))):
         lines[query, : len(row)] = row
         lines[query, len(row) :] = np.nan
-        progress(query + 1, len(stops))
 
 
 def _timed_map(
-    work: Callable[[int], tuple[Any, float]], count: int, threads: int, progress: Callable[[int, int], None]
+    work: Callable[[int], tuple[Any, float]], count: int, stage: str, execution: Execution
 ) -> tuple[list[Any], Floats]:
-    results, spent = [], []
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        for result, ms in map_in_order(pool, work, range(count), ahead=4 * threads):
-            results.append(result)
-            spent.append(ms)
-            progress(len(results), count)
-    return results, np.array(spent)
+    found = list(execution.counted(stage, execution.map(work, range(count)), count))
+    return [result for result, _ in found], np.array([ms for _, ms in found])
 
 
 def score_table(queries: int, rows: int, scratch: Path | None, name: str) -> Float32s:

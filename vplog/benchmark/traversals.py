@@ -10,16 +10,13 @@ import numpy as np
 
 from vplog.data import Reference
 from vplog.errors import LogError
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vplog.data import Bytes, Features, Float32s, Floats, Ints
     from vplog.features.store import FeatureStore
     from vplog.stages import Extractor, Log
-
-    Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +46,7 @@ def extract_walk(
     store: FeatureStore,
     frames: Ints | None = None,
     chosen: Ints | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    execution: Execution = Execution(),
 ) -> Walk:
     """Features of the frames with these numbers (all where None), streamed into an empty store.
 
@@ -68,9 +64,8 @@ def extract_walk(
         spent.append(1e3 * (time.thread_time() - began))
         return features
 
-    found = extract_frames(log.frames(stamps[frames]), timed, threads)
-    for done, (stamp_ns, frame, features, why) in enumerate(found, start=1):
-        progress(f"extract {log.name}", done, len(frames))
+    found = extract_frames(log.frames(stamps[frames]), timed, execution)
+    for stamp_ns, frame, features, why in execution.counted(f"extract {log.name}", found, len(frames)):
         if frame is None or features is None:
             lost.append(why)
             continue

@@ -14,11 +14,13 @@ from __future__ import annotations
 import inspect
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
 from vplog.cache.checked_file import AbsentError
 from vplog.cache.code_hash import code_of
 from vplog.cache.stage_cache import StageCache, digest_of, key_of
+from vplog.execution.cores import limited
 from vplog.execution.execution import logged_warnings
 from vplog.execution.timing import Watch
 from vplog.settings import Settings
@@ -82,6 +84,7 @@ class Steps:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
+        self._stack.enter_context(limited(self._execution.threads))
         self._stack.enter_context(self.cache)
         self._stack.enter_context(logged_warnings(self.warnings))
         return self
@@ -100,9 +103,13 @@ class Steps:
         """The result of a step that is done within another."""
         return self._result(one, one.name, inputs)[0]
 
-    def in_parts(self, one: Step[T], parts: Iterable[Sequence[Any]]) -> list[T]:
+    def in_parts(self, one: Step[T], parts: Sequence[Sequence[Any]]) -> list[T]:
         """Results of a step on the inputs of every part, each cached by itself, so that a kill costs at most one."""
-        found = [self._result(one, f"{one.name}-{number:06d}", inputs) for number, inputs in enumerate(parts)]
+        ends = [0, *accumulate(one.items(*inputs) if one.items else 1 for inputs in parts)]
+        found = [
+            self._result(one, f"{one.name}-{number:06d}", inputs, self._execution.part(before, ends[-1]))
+            for number, (before, inputs) in enumerate(zip(ends, parts, strict=False))
+        ]
         self.count(one.name, len(found), sum(reused for _, reused in found))
         return [value for value, _ in found]
 
@@ -118,9 +125,12 @@ class Steps:
         }
         return {"stages": stages, "totals": self._watch.totals()}
 
-    def _result(self, one: Step[T], name: str, inputs: Sequence[Any]) -> tuple[T, bool]:
+    def _result(
+        self, one: Step[T], name: str, inputs: Sequence[Any], execution: Execution | None = None
+    ) -> tuple[T, bool]:
         """The value, and whether it was found."""
-        given = {key: value for key, value in self._given().items() if key in one.parameters}
+        given = {"execution": execution or self._execution, "steps": self}
+        given = {key: value for key, value in given.items() if key in one.parameters}
         if one.codec is None:
             return one.function(*inputs, **given), False
         codec, key = one.codec(*inputs), _key(one, inputs)
@@ -131,9 +141,6 @@ class Steps:
             value = one.function(*inputs, **given)
             self.cache.store(name, key, self.warnings[before:], codec.to_bytes(value))
             return value, False
-
-    def _given(self) -> dict[str, Any]:
-        return {"execution": self._execution, "steps": self}
 
 
 def _key(one: Step[Any], inputs: Sequence[Any]) -> str:

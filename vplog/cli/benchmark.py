@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from vplog.cli.options import at_least, at_least_one, local, pipeline_of, place, positive, topics_of
 from vplog.cli.printing import Progress, print_comparison, print_json, print_result, print_study
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 def compare(arguments: argparse.Namespace) -> None:
     """Compare recognisers on two drives, or on one that revisits places."""
+    from vplog.benchmark.compare import CompareOptions
     from vplog.benchmark.compare import compare as compare_methods
     from vplog.benchmark.recogniser_specs import split_methods
 
@@ -26,23 +28,19 @@ def compare(arguments: argparse.Namespace) -> None:
             split_methods(arguments.methods),
             _truth(arguments),
             pipeline_of(arguments),
-            library=arguments.library,
-            library_size=arguments.library_size,
-            library_seed=arguments.library_seed,
-            min_gap=arguments.min_gap,
-            sequence=arguments.sequence,
-            out=arguments.output,
-            topics=topics_of(arguments),
-            threads=arguments.threads,
-            progress=progress,
-        )
+            CompareOptions(
+                arguments.library, arguments.library_size, arguments.library_seed, arguments.min_gap,
+                arguments.sequence, arguments.output, topics_of(arguments),
+            ),
+            Execution(arguments.threads, progress),
+        )  # fmt: skip
     print_result(arguments, done.record, print_comparison)
 
 
 def study(arguments: argparse.Namespace) -> None:
     """Run the paper's experiments on two or more drives of one route, or on one that revisits places."""
     from vplog.benchmark.recogniser_specs import split_methods
-    from vplog.benchmark.study.study import METHODS
+    from vplog.benchmark.study.study import METHODS, StudyOptions
     from vplog.benchmark.study.study import study as run_study
 
     with Progress(arguments) as progress:
@@ -51,16 +49,12 @@ def study(arguments: argparse.Namespace) -> None:
             _truth(arguments),
             pipeline_of(arguments),
             arguments.output,
-            methods=METHODS if arguments.methods is None else split_methods(arguments.methods),
-            sizes=arguments.sizes,
-            seeds=arguments.seeds,
-            library_size=arguments.library_size,
-            min_gap=arguments.min_gap,
-            only=arguments.only,
-            topics=topics_of(arguments),
-            threads=arguments.threads,
-            progress=progress,
-        )
+            StudyOptions(
+                METHODS if arguments.methods is None else split_methods(arguments.methods), arguments.sizes,
+                arguments.seeds, arguments.library_size, arguments.min_gap, arguments.only, topics_of(arguments),
+            ),
+            Execution(arguments.threads, progress),
+        )  # fmt: skip
     if arguments.json:
         print_json(found)
     else:

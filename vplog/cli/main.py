@@ -42,6 +42,7 @@ from vplog.cli.printing import (
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, was_interrupted
 from vplog.execution.cores import available, limited
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -186,7 +187,7 @@ def library(arguments: argparse.Namespace) -> None:
     pipeline, warnings = pipeline_of(arguments), []
     with Progress(arguments) as progress:
         state = build_library(
-            arguments.logs, arguments.output, pipeline, topics_of(arguments), arguments.threads, progress,
+            arguments.logs, arguments.output, pipeline, topics_of(arguments), Execution(arguments.threads, progress),
             warnings.append, force=arguments.force,
         )  # fmt: skip
     record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
@@ -283,9 +284,7 @@ def demo(arguments: argparse.Namespace) -> None:
     pipeline = pipeline_of(arguments)
     _folder(arguments.output)
     with Progress(arguments) as progress:
-        progress("render", 0, 1)
-        drive = make_drive(arguments.output / "drive", DemoSettings(), arguments.threads)
-        progress("render", 1, 1)
+        drive = make_drive(arguments.output / "drive", DemoSettings(), Execution(arguments.threads, progress))
         out = arguments.output / "run"
         done = api.run(drive.log, out, pipeline, force=arguments.force, threads=arguments.threads, progress=progress)
     found = api.evaluate(done, drive.truth)

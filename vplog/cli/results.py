@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from vplog.cli.options import STDOUT, local_file, local_file_or_stdout, place, positive, topics_of
 from vplog.cli.printing import print_evaluation, print_explanation, print_json, print_optimised, print_result
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -62,8 +63,8 @@ def report(arguments: argparse.Namespace) -> None:
     from vplog.verbs.report import report as write_report
 
     found = write_report(
-        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments), arguments.threads,
-        _truth_options(arguments),
+        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments),
+        _truth_options(arguments), Execution(arguments.threads),
     )  # fmt: skip
     if arguments.json:
         print_json(found)

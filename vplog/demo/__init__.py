@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from vplog.demo.settings import SMALL, DemoSettings
+from vplog.execution.cores import allowed
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,12 +19,11 @@ if TYPE_CHECKING:
 __all__ = ["SMALL", "DemoSettings", "make_drive"]
 
 
-def make_drive(folder: Path, settings: DemoSettings | None = None, threads: int | None = None) -> Drive:
+def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Execution | None = None) -> Drive:
     """Write `folder`/drive.mcap and `folder`/truth.tum and say what is in them.
 
-    threads: how many render at once, one per core where None; the files are the same for any number.
-    Raises ResultError where the folder cannot be written.
+    Frames are rendered on all cores where `execution` is None. Raises ResultError where the folder cannot be written.
     """
     from vplog.demo.record import record_drive  # numba, OpenCV, mcap and rosbags load here, not with the package
 
-    return record_drive(folder, settings or DemoSettings(), threads)
+    return record_drive(folder, settings or DemoSettings(), execution or Execution(allowed()))

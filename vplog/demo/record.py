@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import struct
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -16,7 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 from vplog.demo import route
 from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
 from vplog.errors import ResultError
-from vplog.execution.cores import allowed
 from vplog.geometry.se3 import quaternion
 
 if TYPE_CHECKING:
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Bytes, Camera, Float32s, Floats, Ints
     from vplog.demo.settings import DemoSettings
+    from vplog.execution.execution import Execution
 
 IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"
@@ -70,7 +70,7 @@ class Drive:
     """(F, 4, 4) truth at the frames."""
 
 
-def record_drive(folder: Path, settings: DemoSettings, threads: int | None = None) -> Drive:
+def record_drive(folder: Path, settings: DemoSettings, execution: Execution) -> Drive:
     """Render and write the whole drive; see `vplog.demo.make_drive`."""
     scene = make_scene(settings)
     log, truth = folder / "drive.mcap", folder / "truth.tum"
@@ -79,7 +79,7 @@ def record_drive(folder: Path, settings: DemoSettings, threads: int | None = Non
         _check_own(log, b"vplog demo")
         _check_own(truth, _TRUTH_HEAD.encode())
         _write_truth(truth, settings, scene)
-        _write_log(log, settings, scene, threads or allowed())
+        _write_log(log, settings, scene, execution)
     except OSError as error:
         raise ResultError(f"Cannot write the demo drive to {folder}: {error}. Choose another folder.") from None
     return Drive(log, truth, scene.camera, scene.stamp_ns, scene.world_from_body)
@@ -104,10 +104,9 @@ def _write_truth(path: Path, settings: DemoSettings, scene: Scene) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def _write_log(path: Path, settings: DemoSettings, scene: Scene, threads: int) -> None:
+def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Execution) -> None:
     """All messages in the order in which they reach the recorder."""
-    with ThreadPoolExecutor(threads) as pool:
-        messages = [*_mounting(scene.camera), *_odometry(settings), *_fixes(settings), *_frames(scene, pool)]
+    messages = [*_mounting(scene.camera), *_odometry(settings), *_fixes(settings), *_frames(scene, execution)]
     rng = np.random.default_rng([settings.seed, 5])
     delays = rng.integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
     logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
@@ -198,7 +197,7 @@ def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
         yield GPS, stamp, message
 
 
-def _frames(scene: Scene, pool: ThreadPoolExecutor) -> Iterator[tuple[str, int, Any]]:
+def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]]:
     """Image, calibration and, if asked for, depth and the right image of every frame."""
     settings, baseline_m = scene.settings, scene.settings.stereo_baseline_m
 
@@ -210,10 +209,11 @@ def _frames(scene: Scene, pool: ThreadPoolExecutor) -> Iterator[tuple[str, int, 
         right = jpeg(take_picture(scene, frame, baseline_m)[0]) if baseline_m else None
         return jpeg(image), _compressed_depth(depth) if settings.depth else None, right
 
+    count = len(scene.stamp_ns)
     # One frame first: numba compiles in one thread while the others would only wait for it.
-    first = encoded(0)
-    rest = pool.map(encoded, range(1, len(scene.stamp_ns)))
-    for stamp, (left, depth, right) in zip(scene.stamp_ns.tolist(), (first, *rest), strict=True):
+    frames = chain([encoded(0)], execution.map(encoded, range(1, count)))
+    rendered = execution.counted("render", frames, count)
+    for stamp, (left, depth, right) in zip(scene.stamp_ns.tolist(), rendered, strict=True):
         header = _header(stamp, CAMERA_FRAME)
         jpegs = "mono8; jpeg compressed mono8"
         topics = (LEFT, LEFT_INFO) if baseline_m else (IMAGE, CAMERA_INFO)

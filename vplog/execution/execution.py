@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
+In = TypeVar("In")
+Out = TypeVar("Out")
 Progress = Callable[[str, int, int], None]
 """(stage, items done, items in all), from any thread."""
 
@@ -17,7 +22,10 @@ def silent(_stage: str, _done: int, _total: int) -> None:
 
 @dataclass(frozen=True)
 class Execution:
-    """Threads and progress of a piece of work. The same bytes come of it whatever they are."""
+    """Threads and progress of a piece of work. The same bytes come of it whatever they are.
+
+    An exception that `progress` raises ends the work.
+    """
 
     threads: int = 1
     progress: Progress = silent
@@ -25,6 +33,44 @@ class Execution:
     def within(self, name: str) -> Execution:
         """For a part of the work, whose stages are told as `name: stage`."""
         return replace(self, progress=lambda stage, done, total: self.progress(f"{name}: {stage}", done, total))
+
+    def part(self, before: int, total: int) -> Execution:
+        """For a part of the items of a stage, of which `before` are done."""
+        return replace(self, progress=lambda stage, done, _: self.progress(stage, before + done, total))
+
+    def counted(self, stage: str, items: Iterable[Out], total: int) -> Iterator[Out]:
+        """The items; progress is reported as each is given out."""
+        for done, item in enumerate(items, start=1):
+            self.progress(stage, done, total)
+            yield item
+
+    def map(self, work: Callable[[In], Out], items: Iterable[In], ahead: int = 4) -> Iterator[Out]:
+        """work(item) of every item, in order, with at most `ahead` items a thread read but not yet given out.
+
+        OpenCV and faiss start no threads of their own within `work`.
+        """
+        waiting: deque[Future[Out]] = deque()
+        threads = max(self.threads, 1)
+        with ThreadPoolExecutor(threads, initializer=_one_thread_each) as pool:
+            try:
+                for item in items:
+                    waiting.append(pool.submit(work, item))
+                    if len(waiting) >= ahead * threads:
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                for future in waiting:
+                    future.cancel()
+
+
+def _one_thread_each() -> None:
+    """Libraries start no threads inside a worker: the pool already fills the cores."""
+    import cv2
+    import faiss
+
+    cv2.setNumThreads(1)
+    faiss.omp_set_num_threads(1)
 
 
 @contextmanager

@@ -2,41 +2,22 @@
 
 from __future__ import annotations
 
-from collections import deque
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
 
     from vplog.data import Features, Frame
+    from vplog.execution.execution import Execution
     from vplog.stages import EncodedFrame, Extractor
-
-In = TypeVar("In")
-Out = TypeVar("Out")
-
-
-def map_in_order(pool: Executor, work: Callable[[In], Out], items: Iterable[In], ahead: int) -> Iterator[Out]:
-    """work(item) for every item, in order, with at most `ahead` items read but not yet given out."""
-    waiting: deque[Future[Out]] = deque()
-    try:
-        for item in items:
-            waiting.append(pool.submit(work, item))
-            if len(waiting) >= ahead:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()
 
 
 def extract_frames(
-    frames: Iterable[EncodedFrame], extractor: Extractor, threads: int, stereo: StereoSettings | None = None
+    frames: Iterable[EncodedFrame], extractor: Extractor, execution: Execution, stereo: StereoSettings | None = None
 ) -> Iterator[tuple[int, Frame | None, Features | None, str]]:
     """(stamp_ns, frame, features, why not) of every frame in order; frame and features are None where undecodable.
 
@@ -53,8 +34,7 @@ def extract_frames(
             features = with_stereo_depth(features, frame, extractor, stereo)
         return encoded.stamp_ns, frame, features, ""
 
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        yield from map_in_order(pool, work, frames, ahead=2 * threads)
+    return execution.map(work, frames, ahead=2)
 
 
 def with_stereo_depth(features: Features, frame: Frame, extractor: Extractor, settings: StereoSettings) -> Features:
@@ -66,12 +46,3 @@ def with_stereo_depth(features: Features, frame: Frame, extractor: Extractor, se
     right = extractor(frame.right, None)
     depth_m = stereo_depth(features, right, focal_px, camera.baseline_m, settings, camera.disparity_zero_px)
     return replace(features, depth_m=depth_m)
-
-
-def one_thread_each() -> None:
-    """Libraries that would start threads of their own inside a worker must not: the pool already fills the cores."""
-    import cv2
-    import faiss
-
-    cv2.setNumThreads(1)
-    faiss.omp_set_num_threads(1)

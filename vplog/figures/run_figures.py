@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,6 @@ import numpy as np
 
 from vplog.data import Verdict
 from vplog.errors import ResultError
-from vplog.features.extraction import one_thread_each
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
 from vplog.results.collage import Half, Panel, collage
@@ -22,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from vplog.data import Bytes, Camera, Closures, Features, Gps, Reference, Trajectory
+    from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
     from vplog.results.previews import PictureSettings, Previews
     from vplog.stages import PlaceState
@@ -52,7 +51,7 @@ class ClosureInputs:
 
 def finished_picture(
     inputs: ClosureInputs, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
-    pictures: PictureSettings, threads: int, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
+    pictures: PictureSettings, gps: Gps | None, earth: Earth | None, about: dict[str, Any], execution: Execution
 ) -> Shown:  # fmt: skip
     """All that result.mcap shows of a run, made while its features are at hand."""
     state, camera = inputs.state, inputs.camera
@@ -63,7 +62,7 @@ def finished_picture(
     drawn = {}
     if len(previews):
         rows = choose_examples(closures, pictures.closures)
-        drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, threads)
+        drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, execution)
     return Shown(
         image=previews.__getitem__ if len(previews) else None,
         image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
@@ -114,13 +113,17 @@ def choose_examples(closures: Closures, count: int) -> list[int]:
 
 
 def draw_closures(
-    rows: Sequence[int], inputs: ClosureInputs, closures: Closures, verify: VerifySettings, quality: int, threads: int
+    rows: Sequence[int],
+    inputs: ClosureInputs,
+    closures: Closures,
+    verify: VerifySettings,
+    quality: int,
+    execution: Execution,
 ) -> dict[int, bytes]:
     """JPEGs of ledger rows."""
     images = {node: inputs.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        drawn = pool.map(lambda row: jpeg(_draw(row, inputs, images, closures, verify), quality), rows)
-        return dict(zip(rows, drawn, strict=True))
+    drawn = execution.map(lambda row: jpeg(_draw(row, inputs, images, closures, verify), quality), rows)
+    return dict(zip(rows, drawn, strict=True))
 
 
 def _draw(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from vplog.data import Closures, Verdict
@@ -17,13 +15,10 @@ from vplog.loops.candidate import Drive, Row, VerifySettings, check_back, check_
 from vplog.loops.landmarks import for_stereo
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vplog.data import Camera, Floats, Int32s, Ints, Keyframes
+    from vplog.execution.execution import Execution
     from vplog.loops.landmarks import FeaturesOf
     from vplog.loops.propose import Proposals
-
-    Progress = Callable[[int, int], None]
 
 __all__ = ["Drive", "VerifySettings", "calibration_share", "drive_of", "verify_between"]
 _LOG = logging.getLogger(__name__)
@@ -56,15 +51,13 @@ def verify_between(
     proposals: Proposals,
     later: Drive,
     earlier: Drive,
-    threads: int = 1,
-    progress: Progress | None = None,
+    execution: Execution,
     share: float | None = None,
 ) -> Closures:
     """The ledger of proposals whose queries are rows of `later` and whose matches are rows of `earlier`, in order.
 
-    Both may be the same drive. `progress(done, total)` counts candidates and is called from the caller's thread. The
-    result does not depend on `threads`. Candidates are worked through by map frame, whose landmarks are made once, and
-    only when some query shares enough features with it; those believed are then looked at the other way round.
+    Both may be the same drive. Progress counts candidates. They are verified by map frame, whose landmarks are made
+    once, and only when some query shares enough features with it; those accepted are then checked in reverse.
     `share` is the larger `calibration_share` of the two drives, where it is known already.
     """
     total = len(proposals.query)
@@ -73,33 +66,25 @@ def verify_between(
         bent = share
     elif total and later.camera.matrix is not None and earlier.camera.matrix is not None:
         drives = [later] if later is earlier else [later, earlier]
-        bent = max(calibration_share(drive, threads) for drive in drives)
+        bent = max(calibration_share(drive, execution) for drive in drives)
 
-    def check(match: int, queries: list[int]) -> list[Row]:
-        cv2.setNumThreads(1)  # one candidate, one thread; the pool is the only parallelism
-        return check_queries(later, earlier, match, queries)
+    def check(group: Ints) -> list[Row]:
+        return check_queries(later, earlier, int(proposals.match[group[0]]), proposals.query[group].tolist())
 
-    def back(query: int, matches: list[int], accepted: list[Row]) -> list[Row]:
-        cv2.setNumThreads(1)
-        return check_back(later, earlier, query, matches, accepted, bent)
+    def back(group: Ints) -> list[Row]:
+        query, matches = int(proposals.query[group[0]]), proposals.match[group].tolist()
+        return check_back(later, earlier, query, matches, [rows[at] for at in group.tolist()], bent)
 
     rows: dict[int, Row] = {}
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        groups = _by(proposals.match, proposals.query, np.arange(total))
-        matches = [int(proposals.match[group[0]]) for group in groups]
-        queries = [proposals.query[group].tolist() for group in groups]
-        for group, found in zip(groups, pool.map(check, matches, queries), strict=True):
+    groups = _by(proposals.match, proposals.query, np.arange(total))
+    for group, found in zip(groups, execution.map(check, groups), strict=True):
+        rows.update(zip(group.tolist(), found, strict=True))
+        execution.progress("verify", len(rows), total)
+    if later.settings.both_ways:
+        accepted = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
+        groups = _by(proposals.query, proposals.match, accepted)
+        for group, found in zip(groups, list(execution.map(back, groups)), strict=True):
             rows.update(zip(group.tolist(), found, strict=True))
-            if progress is not None:
-                progress(len(rows), total)
-        if later.settings.both_ways:
-            accepted = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
-            groups = _by(proposals.query, proposals.match, accepted)
-            queries = [int(proposals.query[group[0]]) for group in groups]
-            matches = [proposals.match[group].tolist() for group in groups]
-            one_way = [[rows[at] for at in group.tolist()] for group in groups]
-            for group, found in zip(groups, pool.map(back, queries, matches, one_way), strict=True):
-                rows.update(zip(group.tolist(), found, strict=True))
     return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, bent)
 
 
@@ -109,18 +94,12 @@ def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
     return np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(rows) else []
 
 
-def calibration_share(drive: Drive, threads: int = 1) -> float:
+def calibration_share(drive: Drive, execution: Execution) -> float:
     """By what share the rotations of a calibrated camera disagree with the odometry's, over turning pairs."""
-
-    def check(match: int, queries: list[int]) -> list[Row]:
-        cv2.setNumThreads(1)
-        return check_queries(drive, drive, match, queries)
-
     keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
     pairs = turning_pairs(keyframes, settings)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        turns = pool.map(check, pairs[:, 0].tolist(), [[later] for later in pairs[:, 1].tolist()])
-        poses = [row.pose for (row,) in turns]
+    turns = execution.map(lambda pair: check_queries(drive, drive, pair[0], pair[1:]), pairs.tolist())
+    poses = [row.pose for (row,) in turns]
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
     driven = se3.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])

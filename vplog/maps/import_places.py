@@ -15,6 +15,7 @@ import numpy as np
 
 from vplog.data import EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory
 from vplog.errors import LibraryError, ResultError
+from vplog.execution.execution import Execution
 from vplog.loops.verify import no_closures
 from vplog.maps.geo_bounds import earth_as_plain, earth_from_plain
 from vplog.maps.storage import drive_ids, map_store
@@ -96,7 +97,7 @@ def _kind(store: Store, path: Path) -> pa.DataType:
     if library is None:
         raise LibraryError(f"{store} has no library yet, and {path} holds places alone. Add a drive first: vplog batch")
     pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
-    return pipeline.places.load(store.library(library), 1).arrow_type
+    return pipeline.places.load(store.library(library), Execution()).arrow_type
 
 
 def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap, kind: pa.DataType) -> None:

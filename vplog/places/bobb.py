@@ -7,11 +7,9 @@ to the letter; here votes have the closed form of `expected_votes.py`, and the o
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
-import faiss
 import numba
 import numpy as np
 import pyarrow as pa
@@ -33,6 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
+    from vplog.execution.execution import Execution
     from vplog.places.code_search import Pairing, Uint16s
     from vplog.places.matches import Matcher
 
@@ -107,29 +106,28 @@ class BobbSettings(WeighedMatchSettings):
         """I: boxes on each reference."""
         return self.windows_along**2
 
-    def learn(self, references: Iterable[Reference], threads: int) -> BobbState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> BobbState:
         """Index the references, and how popular they are. Raises LibraryError where they have no features."""
-        state = self.prepare(references, threads)
+        state = self.prepare(references, execution)
         state.learned()
         return state
 
-    def prepare(self, references: Iterable[Reference], threads: int) -> BobbState:
-        """`learn` without the index, which the first image described makes: comparing places needs none."""
+    def prepare(self, references: Iterable[Reference], execution: Execution) -> BobbState:
+        """`learn` without the index, which the first image to describe makes: comparing places needs none."""
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
             raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
 
         def rarity() -> Floats:
-            with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
-                explained = list(pool.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
+            explained = list(execution.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
             return _rarity(np.array(explained), self.popularity)
 
         return BobbState(self, matcher, Once(rarity))
 
-    def load(self, folder: Path, threads: int) -> BobbState:
+    def load(self, folder: Path, execution: Execution) -> BobbState:
         """A library saved by `BobbState.save`, prepared. Raises LibraryError where it is damaged or gives another
         hash."""
-        return relearn(BobbSettings, folder, threads, BobbSettings.prepare)
+        return relearn(BobbSettings, folder, execution, BobbSettings.prepare)
 
 
 @numba.njit(cache=True, nogil=True)

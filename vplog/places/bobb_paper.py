@@ -7,7 +7,6 @@ I boxes: each where the features of one window of the image are found again (sec
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Self
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
+    from vplog.execution.execution import Execution
 
 
 _WHOLE_IMAGE = np.array([0.0, 0.0, 1.0, 1.0])
@@ -68,16 +68,15 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
             )
         return self
 
-    def learn(self, references: Iterable[Reference], threads: int) -> PaperBobbState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> PaperBobbState:
         """Index the references and partition them. Raises LibraryError where they are too few or have no features."""
-        library = lib.build_library(references, self, threads)
+        library = lib.build_library(references, self, execution)
         if len(library) < self.references:
             raise LibraryError(
                 f"The library has {len(library)} reference images, but places.references is {self.references}. "
                 "Add images, or set places.references lower."
             )
-        with ThreadPoolExecutor(threads) as pool:
-            patterns = list(pool.map(lambda row: _prepare(library, row, self), range(len(library))))
+        patterns = list(execution.map(lambda row: _prepare(library, row, self), range(len(library))))
         return PaperBobbState(self, library, patterns)
 
 

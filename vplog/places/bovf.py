@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Bytes, Features, Float32s, Ranking, Reference
+    from vplog.execution.execution import Execution
 
 _WORD_BYTES, _PLACE_BYTES = 3, 4
 """In a table: a word's number in two bytes and its count in one; where a place's list begins in four."""
@@ -57,7 +58,7 @@ class BovfSettings(RelearnedSettings):
     seed: int = Field(default=0, ge=0)
     """Seed of the first centres of k-means."""
 
-    def learn(self, references: Iterable[Reference], threads: int) -> BovfState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> BovfState:
         """Words and their idf from the references. Raises LibraryError where they are fewer than two or featureless."""
         kept = keep_references(references, self.features)
         if len(kept) < 2:
@@ -65,7 +66,7 @@ class BovfSettings(RelearnedSettings):
                 "bovf weighs a word by how few of the references have it, so it needs at least two; one was given."
             )
         descriptors = np.concatenate([reference.features.descriptors for reference in kept])
-        vocabulary = learn_vocabulary(descriptors, self.words, self.seed, threads)
+        vocabulary = learn_vocabulary(descriptors, self.words, self.seed, execution)
         holders = np.zeros(len(vocabulary), np.int64)
         for reference in kept:
             holders[np.unique(vocabulary.quantise(reference.features.descriptors))] += 1

@@ -7,12 +7,10 @@ record of a run only matches that keep their arrangement count, less the most th
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-import faiss
 import numba
 import numpy as np
 
@@ -22,7 +20,8 @@ from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySetting
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Keyframes
+    from vplog.execution.execution import Execution
     from vplog.places.library import Library, Words
 
 STRONGEST = 200
@@ -78,7 +77,7 @@ class Explanations:
 
 
 def choose_by_coverage(
-    count: int, descriptors_of: Callable[[int], Bytes], settings: LibrarySettings, threads: int
+    count: int, descriptors_of: Callable[[int], Bytes], settings: LibrarySettings, execution: Execution
 ) -> Ints:
     """Rows, increasing, of the frames among `count` that explain all frames best.
 
@@ -91,7 +90,7 @@ def choose_by_coverage(
     frames = evenly(count, frames_needed(settings.size))
     candidates = evenly(len(frames), _candidates(settings.size))
     strong = [np.array(descriptors_of(int(row))[:STRONGEST]) for row in frames]
-    found = explanations(strong, candidates, threads)
+    found = explanations(strong, candidates, execution)
     most, least = (PAPER_SIZE, LEAST_SIZE) if settings.size is None else (settings.size, settings.size)
     chosen = greedy_cover(found, min(most, len(candidates)))
     if settings.size is None:
@@ -110,7 +109,7 @@ def _candidates(size: int | None) -> int:
     return max(_LEAST_CANDIDATES, _CANDIDATES_A_REFERENCE * (size or 0))
 
 
-def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -> Explanations:
+def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Execution) -> Explanations:
     """The candidates, rows of `descriptors` (F of (M, 128) each), that explain each of the rows."""
     owners = np.repeat(np.arange(len(candidates)), [len(descriptors[row]) for row in candidates])
     pool = np.concatenate([descriptors[row] for row in candidates])
@@ -126,7 +125,6 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -
         found = descriptors[row]
         if len(found) == 0:
             return np.zeros(0, np.int64), np.zeros(0, np.float32)
-        faiss.omp_set_num_threads(1)
         near = index.search(found.astype(np.float32), _NEIGHBOURS)[1]
         same = (l1_distance(found, pool, near) < _MAX_L1) & (near >= 0)
         of = np.where(same, owners[near], -1)
@@ -136,8 +134,7 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, threads: int) -
         who, times = np.unique(of[first & (of >= 0)], return_counts=True)
         return who, (times / len(found)).astype(np.float32)
 
-    with ThreadPoolExecutor(threads) as workers:
-        rows = list(workers.map(explained_by, range(len(descriptors))))
+    rows = list(execution.map(explained_by, range(len(descriptors))))
     start = np.concatenate([[0], np.cumsum([len(who) for who, _ in rows])])
     return Explanations(
         start,
@@ -222,27 +219,26 @@ class Coverage:
 
 
 def measure_coverage(
-    count: int, features_of: Callable[[int], Features], stamp_ns: Ints, drive: str, library: Library, threads: int
+    keyframes: Keyframes, features_of: Callable[[int], Features], library: Library, execution: Execution
 ) -> Coverage:
-    """How far the library explains a drive of `count` frames: 48 of them, evenly, or 200 where that leaves it open
+    """How far the library explains the keyframes of a drive: 48 of them, evenly, or 200 where that leaves it open
     whether the library is poor. Own images do not count."""
-    itself = {reference.stamp_ns: row for row, reference in enumerate(library.references) if reference.drive == drive}
+    own = [(row, one) for row, one in enumerate(library.references) if one.drive == keyframes.drive]
+    itself, stamp_ns = {one.stamp_ns: row for row, one in own}, keyframes.stamp_ns
 
     def share(row: int) -> float:
-        faiss.omp_set_num_threads(1)
         features = features_of(row)
         words = library.translate(features.descriptors[:_MEASURED])
         size = features.width, features.height
         return explained_share(words, features.points[:_MEASURED], size, library, itself.get(int(stamp_ns[row]), -1))
 
-    rows = evenly(count, _SHOWN)
+    rows = evenly(len(stamp_ns), _SHOWN)
     first = evenly(len(rows), _FIRST)
-    with ThreadPoolExecutor(threads) as workers:
-        shares = np.array(list(workers.map(share, rows[first].tolist())))
-        doubt = 3.0 * np.sqrt(POOR * (1.0 - POOR) / max(len(first), 1))
-        if abs(float((shares >= EXPLAINED).mean()) - POOR) < doubt:
-            others = np.array(list(workers.map(share, np.delete(rows, first).tolist())))
-            shares = np.concatenate([shares, others])
+    shares = np.array(list(execution.map(share, rows[first].tolist())))
+    doubt = 3.0 * np.sqrt(POOR * (1.0 - POOR) / max(len(first), 1))
+    if abs(float((shares >= EXPLAINED).mean()) - POOR) < doubt:
+        others = np.array(list(execution.map(share, np.delete(rows, first).tolist())))
+        shares = np.concatenate([shares, others])
     return Coverage(float((shares >= EXPLAINED).mean()), float(np.median(shares)), len(shares))
 
 

@@ -10,7 +10,6 @@ through a Chow-Liu tree, z_p being the parent of z_q.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Self
 
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Bools, Features, Float32s, Floats, Reference
+    from vplog.execution.execution import Execution
 
     Words = NDArray[np.uint16]
 
@@ -80,7 +80,7 @@ class FabmapSettings(RelearnedSettings):
             )
         return self
 
-    def learn(self, references: Iterable[Reference], threads: int) -> FabmapState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> FabmapState:
         """Words and their tree from the references. Raises LibraryError where too few or featureless."""
         kept = keep_references(references, self.features)
         if len(kept) < 2:
@@ -88,9 +88,8 @@ class FabmapSettings(RelearnedSettings):
                 "fabmap learns which words occur together, so it needs at least two references; one was given."
             )
         descriptors = [reference.features.descriptors for reference in kept]
-        vocabulary = learn_vocabulary(np.concatenate(descriptors), self.words, self.seed, threads)
-        with ThreadPoolExecutor(threads) as pool:
-            images = list(pool.map(lambda rows: _words(vocabulary, rows), descriptors))
+        vocabulary = learn_vocabulary(np.concatenate(descriptors), self.words, self.seed, execution)
+        images = list(execution.map(lambda rows: _words(vocabulary, rows), descriptors))
         tree = learn_tree(images, len(vocabulary), self.independence)
         model = Model(tree, log_likelihood_table(tree, self.seen_if_there, self.seen_if_absent))
         drawn = np.sort(np.random.default_rng(self.seed).permutation(len(images))[: self.samples])

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Bytes, Features, Float32s, Reference
+    from vplog.execution.execution import Execution
 
 _PREFILTER_PAD, _PREFILTER_CYCLES, _LEAST_CONTRAST = 5, 4, 0.2
 """px mirrored around the image, cycles an image where the low-pass falls to half, and what is added to the contrast."""
@@ -46,7 +47,7 @@ class GistSettings(RelearnedSettings):
     blocks: Literal[1, 2, 4, 8] = 4
     """Blocks along each side of the image in which a filter's energy is averaged."""
 
-    def learn(self, references: Iterable[Reference], threads: int) -> GistState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> GistState:
         """Nothing to learn. Raises LibraryError where there is no reference."""
         return GistState(self, keep_references(references))
 

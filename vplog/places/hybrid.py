@@ -7,11 +7,9 @@ representation, ACM MM 2013) of keypoints and patches, with the position in the 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-import faiss
 import numba
 import numpy as np
 import pyarrow as pa
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
+    from vplog.execution.execution import Execution
     from vplog.places.bobb import BobbState, Place
     from vplog.places.code_search import CodeIndex
 
@@ -74,15 +73,14 @@ class HybridSettings(RelearnedSettings):
     seed: int = Field(default=0, ge=0)
     """Seed of the first centres and of the directions' rotation."""
 
-    def learn(self, references: Iterable[Reference], threads: int) -> HybridState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> HybridState:
         """Index the references, learn words, and how scores vary. Raises LibraryError where there are no features."""
         kept = list(references)
-        bobb = self.bobb.learn(kept, threads)
+        bobb = self.bobb.learn(kept, execution)
         words = learn_words([_described(r.features, self) for r in kept], self)
         state = HybridState(self, kept, bobb, words, self.share)
         rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MOST_REFERENCES)).astype(np.int64)).tolist()
-        with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
-            places = list(pool.map(lambda row: state.describe(kept[row].features), rows))
+        places = list(execution.map(lambda row: state.describe(kept[row].features), rows))
         return HybridState(self, kept, bobb, words, _balance(state.index(places), places, self.share))
 
 

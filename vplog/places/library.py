@@ -6,7 +6,6 @@ that are its near neighbours and close enough: several words per feature (sectio
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
+    from vplog.execution.execution import Execution
 
 
 class WordSettings(Settings):
@@ -78,7 +78,9 @@ class Library:
         return _translate(self.index, self.descriptors, descriptors, self.settings, own=False)
 
 
-def build_library(references: Iterable[Reference], settings: WordSettings, threads: int, own: bool = True) -> Library:
+def build_library(
+    references: Iterable[Reference], settings: WordSettings, execution: Execution, own: bool = True
+) -> Library:
     """Index the references' strongest features; without `own`, who only translates, these get no words themselves.
 
     Raises LibraryError where there is no feature.
@@ -92,7 +94,7 @@ def build_library(references: Iterable[Reference], settings: WordSettings, threa
     breadth = max(settings.hnsw_ef_search, settings.neighbours)
     index = hnsw(descriptors.astype(np.float32), settings.hnsw_links, settings.hnsw_ef_construction, breadth)
     nothing = Words(np.zeros(1, np.int32), np.zeros(0, np.int32))
-    words = _own_words(index, descriptors, settings, threads) if own else nothing
+    words = _own_words(index, descriptors, settings, execution) if own else nothing
     return Library(kept, start, descriptors, points, settings, words, index)
 
 
@@ -115,14 +117,12 @@ def hnsw(values: Float32s, links: int, ef_construction: int, ef_search: int) -> 
     return index
 
 
-def _own_words(index: Any, descriptors: Bytes, settings: WordSettings, threads: int) -> Words:
+def _own_words(index: Any, descriptors: Bytes, settings: WordSettings, execution: Execution) -> Words:
     def part(rows: slice) -> Words:
-        faiss.omp_set_num_threads(1)
         return _translate(index, descriptors, descriptors[rows], settings, own=True, first=rows.start)
 
     parts = [slice(at, at + 1000) for at in range(0, len(descriptors), 1000)]
-    with ThreadPoolExecutor(threads) as pool:
-        done = list(pool.map(part, parts))
+    done = list(execution.map(part, parts))
     counts = np.concatenate([np.diff(words.start) for words in done])
     start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     return Words(start, np.concatenate([words.values for words in done]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ import pyarrow as pa
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
@@ -164,7 +164,7 @@ def read_sources(folder: Path) -> set[tuple[str, int]]:
         raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}.") from None
 
 
-def load_references(folder: Path, threads: int = 1) -> list[Reference]:
+def load_references(folder: Path, execution: Execution = Execution()) -> list[Reference]:
     """The references of a saved library, in their order. Raises LibraryError where the files do not fit together,
     ResultError where something in the folder is not its own file."""
     check_regular(folder, "library.json")
@@ -206,8 +206,7 @@ def load_references(folder: Path, threads: int = 1) -> list[Reference]:
         found = Features(points[part], sizes[part], descriptors[part], nothing, width, height, thumbnail)
         return Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"])
 
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(reference, range(len(entries))))
+    return list(execution.map(reference, range(len(entries))))
 
 
 def _table(path: Path, schema: pa.Schema) -> pa.Table:

@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Reference
+    from vplog.execution.execution import Execution
 
 
 class RelearnedSettings(Settings):
     """Settings of a recogniser that is saved as its references."""
 
-    def load(self, folder: Path, threads: int) -> Any:
+    def load(self, folder: Path, execution: Execution) -> Any:
         """A library saved by its state. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(type(self), folder, threads)
+        return relearn(type(self), folder, execution)
 
 
 class ReferencesState:
@@ -50,15 +51,15 @@ def keep_references(references: Iterable[Reference], features: int | None = None
     return kept
 
 
-def relearn(settings: Any, folder: Path, threads: int, learn: Callable[..., Any] | None = None) -> Any:
-    """State of a folder written by `save_references`, whose own settings count; `settings` is their class, and
+def relearn(settings: Any, folder: Path, execution: Execution, learn: Callable[..., Any] | None = None) -> Any:
+    """State of a folder written by `stored.save_references`, whose own settings count; `settings` is their class, and
     `learn` of its methods the one that makes the state.
 
     Raises LibraryError where the folder is damaged or gives another hash.
     """
     record = library_files.read_library_record(folder)
     made = settings.read(record["settings"], f"{folder}/library.json")
-    state = (learn or settings.learn)(made, library_files.load_references(folder, threads), threads)
+    state = (learn or settings.learn)(made, library_files.load_references(folder, execution), execution)
     if state.hash != record["hash"]:
         raise LibraryError(
             f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from vplog.data import Float32s, Int32s, Ints, Ranking
+    from vplog.execution.execution import Execution
     from vplog.stages import PlaceIndex
 
     Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
@@ -111,7 +112,7 @@ def sequence_rows(
 
 
 def rank_places(
-    index: PlaceIndex, descriptors: Sequence[object], stops: Ints, k: int, settings: SequenceSettings, threads: int = 1
+    index: PlaceIndex, descriptors: Sequence[Any], stops: Ints, k: int, settings: SequenceSettings, execution: Execution
 ) -> Iterator[tuple[Ranking, Int32s]]:
     """For each query in order: its k best rows below its stop, and their support, 0 where the length is 1.
 
@@ -119,17 +120,14 @@ def rank_places(
     """
     if settings.length > 1:
         rows = sequence_rows(
-            lambda query: index.scores(descriptors[query], int(stops[query])), stops, settings, threads
+            lambda query: index.scores(descriptors[query], int(stops[query])), stops, settings, execution.threads
         )
         for score, support in rows:
             best = best_rows(np.maximum(score, 0.0), k)
             yield best, support[best.rows]
         return
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for first in range(0, len(stops), _BLOCK):
-            block = range(first, min(first + _BLOCK, len(stops)))
-            for ranking in pool.map(lambda query: index.query(descriptors[query], k, int(stops[query])), block):
-                yield ranking, np.zeros(len(ranking.rows), np.int32)
+    for ranking in execution.map(lambda at: index.query(descriptors[at], k, int(stops[at])), range(len(stops))):
+        yield ranking, np.zeros(len(ranking.rows), np.int32)
 
 
 @contextmanager

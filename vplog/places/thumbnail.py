@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from vplog.data import Bytes, Features, Reference
+    from vplog.execution.execution import Execution
 
 _WIDTH, _HEIGHT, _PATCH = 64, 32, 8
 """px, the paper's table I."""
@@ -35,7 +36,7 @@ class ThumbnailSettings(RelearnedSettings):
     kind: Literal["thumbnail"] = "thumbnail"
     """Name of the recogniser."""
 
-    def learn(self, references: Iterable[Reference], threads: int) -> ThumbnailState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> ThumbnailState:
         """Nothing to learn. Raises LibraryError where there is no reference."""
         return ThumbnailState(self, keep_references(references))
 

@@ -6,7 +6,6 @@ Chum, Negative evidences and co-occurrences in image retrieval, ECCV 2012).
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Features, Float32s, Reference
+    from vplog.execution.execution import Execution
 
 _MAX_PCA_REFERENCES = 2000
 """Images that the PCA looks at, spread evenly over the references: its time grows with their cube, 1 s for these."""
@@ -48,19 +48,18 @@ class VladSettings(RelearnedSettings):
     seed: int = Field(default=0, ge=0)
     """Seed of the first centres of k-means."""
 
-    def learn(self, references: Iterable[Reference], threads: int) -> VladState:
+    def learn(self, references: Iterable[Reference], execution: Execution) -> VladState:
         """Centres and PCA from the references. Raises LibraryError where they are fewer than two or featureless."""
         kept = keep_references(references, self.features)
         if len(kept) < 2:
             raise LibraryError("vlad learns in what its references differ, so it needs at least two; one was given.")
         descriptors = np.concatenate([reference.features.descriptors for reference in kept])
-        vocabulary = learn_vocabulary(descriptors, self.centres, self.seed, threads)
+        vocabulary = learn_vocabulary(descriptors, self.centres, self.seed, execution)
         if self.dimensions is None:
             return VladState(self, kept, vocabulary, None)
         rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MAX_PCA_REFERENCES)).astype(np.int64))
-        with ThreadPoolExecutor(threads) as pool:
-            raw = np.array(list(pool.map(lambda row: aggregate(kept[row].features, self.features, vocabulary), rows)))
-        return VladState(self, kept, vocabulary, Whitening.learn(raw, self.dimensions, self.shrinkage))
+        raw = list(execution.map(lambda row: aggregate(kept[row].features, self.features, vocabulary), rows))
+        return VladState(self, kept, vocabulary, Whitening.learn(np.array(raw), self.dimensions, self.shrinkage))
 
 
 @dataclass(frozen=True, eq=False)

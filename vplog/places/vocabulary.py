@@ -6,7 +6,6 @@ centre is the same whatever the order of the sum, the number of threads or the m
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ from vplog.places.library import hnsw
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Float32s, Int32s
+    from vplog.execution.execution import Execution
 
 ROOT_STEPS = np.float32(512)
 """Steps of 1 that roots of descriptors are whole multiples of: a byte of them reaches 0.498, and SIFT's own cut at 0.2
@@ -68,7 +68,7 @@ class Vocabulary:
         return _nearest(self._index, root_sift_steps(descriptors))
 
 
-def learn_vocabulary(descriptors: Bytes, words: int, seed: int, threads: int) -> Vocabulary:
+def learn_vocabulary(descriptors: Bytes, words: int, seed: int, execution: Execution) -> Vocabulary:
     """At most `words` k-means centres of (F, 128) uint8 descriptors, fewer where there are too few features.
 
     The same for any number of threads. Raises LibraryError where there is no feature.
@@ -83,18 +83,17 @@ def learn_vocabulary(descriptors: Bytes, words: int, seed: int, threads: int) ->
     steps = root_sift_steps(descriptors)
     centres = steps[np.sort(rng.choice(len(steps), count, replace=False))]
     parts = [steps[at : at + _CHUNK] for at in range(0, len(steps), _CHUNK)]
-    with ThreadPoolExecutor(threads, initializer=faiss.omp_set_num_threads, initargs=(1,)) as pool:
-        for _ in range(_ITERATIONS):
-            index = _index(centres, _EF_LEARN)
-            nearest = np.concatenate(list(pool.map(lambda part, index=index: _nearest(index, part), parts)))
-            order = np.argsort(nearest, kind="stable")
-            first = np.flatnonzero(np.diff(nearest[order], prepend=-1))  # centres without a feature are dropped
-            members = np.diff(first, append=len(order))
-            sums = np.add.reduceat(steps[order].astype(np.int32), first)  # whole numbers: no order of summation
-            moved = np.rint(sums / members[:, None]).astype(np.float32)
-            if np.array_equal(moved, centres):
-                break
-            centres = moved
+    for _ in range(_ITERATIONS):
+        index = _index(centres, _EF_LEARN)
+        nearest = np.concatenate(list(execution.map(lambda part, index=index: _nearest(index, part), parts)))
+        order = np.argsort(nearest, kind="stable")
+        first = np.flatnonzero(np.diff(nearest[order], prepend=-1))  # centres without a feature are dropped
+        members = np.diff(first, append=len(order))
+        sums = np.add.reduceat(steps[order].astype(np.int32), first)  # whole numbers: no order of summation
+        moved = np.rint(sums / members[:, None]).astype(np.float32)
+        if np.array_equal(moved, centres):
+            break
+        centres = moved
     return Vocabulary(centres / ROOT_STEPS)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from vplog.cache.steps import step
 from vplog.data import EdgeKind, Verdict
-from vplog.execution.cores import limited
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.cross_check import cross_checked
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
-    from vplog.execution.execution import Execution
     from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.gps_factors import Fixes, GpsSettings
     from vplog.graph.noise import NoiseSettings
@@ -71,18 +69,9 @@ class Solved:
 
 
 @step("solve")
-def solve(
-    odometry: Odometry,
-    keyframes: Keyframes,
-    closures: Closures,
-    gps: Gps | None,
-    settings: BackEnd,
-    *,
-    execution: Execution,
-) -> Solved:
+def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
     """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
-    with limited(execution.threads):
-        solved = _solve(odometry, keyframes, closures, gps, settings)
+    solved = _solve(odometry, keyframes, closures, gps, settings)
     for warning in solved.warnings:
         _log.warning(warning)
     return solved

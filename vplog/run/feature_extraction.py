@@ -28,6 +28,7 @@ from vplog.cache.stage_cache import StageCache, finished_parts, inputs_of, key_o
 from vplog.cache.steps import step
 from vplog.data import Keyframes
 from vplog.errors import LogError, ResultError
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.results.previews import preview
 from vplog.run.keyframes import select_keyframes
@@ -36,13 +37,12 @@ from vplog.storage.scratch import replacing
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from vplog.cache.stage_cache import Inputs
     from vplog.cache.steps import Steps
     from vplog.data import Camera, Features, Frame, Odometry
-    from vplog.execution.execution import Execution
     from vplog.features.sift import SiftSettings
     from vplog.features.stereo_depth import StereoSettings
     from vplog.results.previews import PictureSettings
@@ -126,8 +126,8 @@ def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
     return [part for part in parts if not held(part)]
 
 
-def compute_part(part: Part, threads: int = 1) -> bytes:
-    """Decode and describe a part's keyframes: the bytes of its file. The same on any machine and any `threads`.
+def compute_part(part: Part, execution: Execution = Execution()) -> bytes:
+    """Decode and describe a part's keyframes: the bytes of its file. The same on any machine.
 
     Raises LogError where the log cannot be read, or is another one than `parts_of` saw.
     """
@@ -135,7 +135,7 @@ def compute_part(part: Part, threads: int = 1) -> bytes:
     log = logs.open_drive(paths, part.topics)
     if inputs_of(paths, None).lengths != part.lengths:
         raise LogError(f"{paths[0]} changed during the run. Run again when it is written or copied to its end.")
-    return sealed(part.key, _content(log, part, _frames(log, [part], threads)))
+    return sealed(part.key, _content(log, part, _frames(log, [part], execution)))
 
 
 def put_part(cache: Path, part: Part, data: bytes) -> None:
@@ -248,8 +248,8 @@ def extract(
     total = sum(len(part.stamp_ns) for part in parts)
     done = total - sum(len(part.stamp_ns) for part in missing)
     # one stream over all that is missing: workers do not wait at the end of a part
-    frames = _frames(log, missing, execution.threads) if missing else ()
-    counted = _counted(frames, lambda count: execution.progress("extract", done + count, total))
+    frames = _frames(log, missing, execution) if missing else ()
+    counted = execution.part(done, total).counted("extract", frames, total)
     for part in missing:
         cache.put(part.file, sealed(part.key, _content(log, part, counted)))
     found = Extracted()
@@ -310,14 +310,8 @@ def _count(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:
             account.add("undecodable_image", {topic: 1}, (topic, at), [(at, at)])
 
 
-def _frames(log: Log, parts: Sequence[Part], threads: int) -> Iterator[Decoded]:
+def _frames(log: Log, parts: Sequence[Part], execution: Execution) -> Iterator[Decoded]:
     """The keyframes of some parts of a drive, decoded, with their features, in order."""
     stamp_ns = np.array([stamp_ns for part in parts for stamp_ns in part.stamp_ns], np.int64)
     settings = parts[0].pipeline
-    return extract_frames(log.frames(stamp_ns), settings.features, threads, settings.stereo)
-
-
-def _counted(frames: Iterable[Decoded], tell: Callable[[int], None]) -> Iterator[Decoded]:
-    for count, frame in enumerate(frames, start=1):
-        tell(count)
-        yield frame
+    return extract_frames(log.frames(stamp_ns), settings.features, execution, settings.stereo)

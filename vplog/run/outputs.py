@@ -91,9 +91,9 @@ def write(
     previews, gps = run.features.pictures, log.gps()
     inputs = ClosureInputs(previews.image, run.features.__getitem__, run.camera, run.state, run.places)
     shown = finished_picture(
-        inputs, previews, run.closures, run.references, pipeline.verify, pipeline.pictures, execution.threads, gps=gps,
+        inputs, previews, run.closures, run.references, pipeline.verify, pipeline.pictures, gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
-        about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
+        about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
     )  # fmt: skip
     column = [run.state.to_arrow(run.places)]
     tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, run.state.arrow_type, header)

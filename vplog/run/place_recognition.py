@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vplog.cache.codecs import columns_codec, descriptors_codec
 from vplog.cache.steps import step
-from vplog.features.extraction import map_in_order, one_thread_each
 from vplog.loops.propose import Proposals, candidate_stops, propose
 from vplog.places.sequence import rank_places
 from vplog.stages import BoxState
@@ -31,13 +29,9 @@ if TYPE_CHECKING:
 )
 def describe(state: PlaceState, features: Extracted, *, execution: Execution) -> Sequence[Any]:
     """A descriptor for every keyframe, in order."""
-    result, threads = [], execution.threads
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        work = map_in_order(pool, lambda row: state.describe(features[row]), range(len(features)), ahead=4 * threads)
-        for descriptor in work:
-            result.append(descriptor)
-            execution.progress("describe", len(result), len(features))
-    return result
+    count = len(features)
+    described = execution.map(lambda row: state.describe(features[row]), range(count))
+    return list(execution.counted("describe", described, count))
 
 
 @step("propose", lambda *_: columns_codec(Proposals), items=lambda state, descriptors, *_: len(descriptors))
@@ -52,7 +46,7 @@ def find_candidates(
 ) -> Proposals:
     """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
     index, stops = state.index(descriptors), candidate_stops(keyframes, settings)
-    return propose(rank_places(index, descriptors, stops, settings.ranked, sequence, execution.threads), settings)
+    return propose(rank_places(index, descriptors, stops, settings.ranked, sequence, execution), settings)
 
 
 def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:

@@ -13,6 +13,7 @@ from vplog.cache.codecs import images_codec, json_codec
 from vplog.cache.steps import step
 from vplog.data import Reference
 from vplog.errors import LibraryError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.places.coverage import (
     STRONGEST,
@@ -36,13 +37,10 @@ if TYPE_CHECKING:
     from vplog.cache.codecs import Codec
     from vplog.cache.feature_shards import Extracted
     from vplog.data import Bytes, Ints, Keyframes
-    from vplog.execution.execution import Execution
     from vplog.features.sift import SiftSettings
     from vplog.places import PlaceSettings
     from vplog.places.reference_choice import LibrarySettings
     from vplog.stages import Log, PlaceState
-
-    Progress = Callable[[str, int, int], None]
 
 
 _log = logging.getLogger(__name__)
@@ -88,7 +86,7 @@ def own_images(
     `keyframes` are those of the `selected` that decode.
     """
     if settings.choose == "coverage":
-        rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, execution.threads)
+        rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, execution)
     else:
         chosen_ns = selected.stamp_ns[choose(selected.stamp_ns, settings)]
         rows = np.flatnonzero(np.isin(keyframes.stamp_ns, chosen_ns))
@@ -105,7 +103,7 @@ def own_references(keyframes: Keyframes, features: Extracted, images: Sequence[t
 @step("choose")
 def given_references(library: Path, *, execution: Execution) -> list[Reference]:
     """The references of a library in a folder. Raises LibraryError."""
-    return load_references(library, execution.threads)
+    return load_references(library, execution)
 
 
 @step("learn", items=lambda places, references, library: len(references))
@@ -114,8 +112,8 @@ def learn(
 ) -> PlaceState:
     """The recogniser with its library: the folder given, or one of these references."""
     if library is not None:
-        return places.load(library, execution.threads)
-    return places.learn(references, execution.threads)
+        return places.load(library, execution)
+    return places.learn(references, execution)
 
 
 @step("cover", lambda *_: coverage_codec())
@@ -126,10 +124,8 @@ def cover(
     has no features that could tell (`places.features: 0`)."""
     if not any(len(one.features) for one in references):
         return Coverage(0.0, 0.0, 0)
-    library = index_words(references, WordSettings(), execution.threads, own=False)
-    coverage = measure_coverage(
-        len(features), features.__getitem__, keyframes.stamp_ns, keyframes.drive, library, execution.threads
-    )
+    library = index_words(references, WordSettings(), execution, own=False)
+    coverage = measure_coverage(keyframes, features.__getitem__, library, execution)
     if doubt := coverage_warning(coverage, len(features), given, len(library)):
         _log.warning(doubt)
     return coverage
@@ -147,8 +143,7 @@ def build_library(
     out: Path,
     pipeline: Describing,
     topics: logs.TopicChoice | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    execution: Execution = Execution(),
     warn: Callable[[str], object] = lambda _: None,
     *,
     force: bool = True,
@@ -163,17 +158,15 @@ def build_library(
     opened = [logs.open(path, topics) for path in paths]
     by_coverage = pipeline.library.choose == "coverage"
     with staged(out, lambda: _library_in(out, None if force else opened)) as made:
-        wanted = _stamps_by_coverage(opened, pipeline, threads, progress) if by_coverage else _shares(opened, pipeline)
+        wanted = _stamps_by_coverage(opened, pipeline, execution) if by_coverage else _shares(opened, pipeline)
         for log, stamps in zip(opened, wanted, strict=True):
-            for done, (stamp_ns, frame, features, _) in enumerate(
-                extract_frames(log.frames(stamps), pipeline.features, threads)
-            ):
-                progress(f"extract {log.name}", done + 1, len(stamps))
+            frames = extract_frames(log.frames(stamps), pipeline.features, execution)
+            for stamp_ns, frame, features, _ in execution.counted(f"extract {log.name}", frames, len(stamps)):
                 if frame is not None and features is not None:
                     references.append(Reference(frame.image, features, log.name, stamp_ns))
         for line in dict.fromkeys(line for log in opened for line in log.warnings):
             warn(line)
-        state = pipeline.places.learn(references, threads)
+        state = pipeline.places.learn(references, execution)
         state.save(made)
     return state
 
@@ -214,19 +207,18 @@ def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
     return result
 
 
-def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, threads: int, progress: Progress) -> list[Ints]:
+def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, execution: Execution) -> list[Ints]:
     """Stamps of the references of each log that explain the frames of all best; equally many of each are seen."""
     each = -(-frames_needed(pipeline.library.size) // len(opened))
     descriptors, owners, seen_ns = [], [], []
     for number, log in enumerate(opened):
         stamps = log.stamps()[evenly(len(log.stamps()), each)]
-        frames = extract_frames(log.frames(stamps), pipeline.features, threads)
-        for done, (stamp_ns, _, features, _) in enumerate(frames):
-            progress(f"look at {log.name}", done + 1, len(stamps))
+        frames = extract_frames(log.frames(stamps), pipeline.features, execution)
+        for stamp_ns, _, features, _ in execution.counted(f"compare frames of {log.name}", frames, len(stamps)):
             if features is not None:
                 descriptors.append(features.descriptors[:STRONGEST].copy())
                 owners.append(number)
                 seen_ns.append(stamp_ns)
-    rows = choose_by_coverage(len(descriptors), descriptors.__getitem__, pipeline.library, threads)
+    rows = choose_by_coverage(len(descriptors), descriptors.__getitem__, pipeline.library, execution)
     owner, stamp = np.array(owners, np.int64)[rows], np.array(seen_ns, np.int64)[rows]
     return [stamp[owner == number] for number in range(len(opened))]

@@ -10,8 +10,7 @@ import numpy as np
 from vplog.cache.codecs import closures_codec, json_codec
 from vplog.cache.steps import step
 from vplog.data import Closures
-from vplog.execution.execution import Execution
-from vplog.loops.verify import calibration_share, drive_of, verify_between
+from vplog.loops.verify import calibration_share, drive_of, no_closures, verify_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from vplog.cache.feature_shards import Extracted
     from vplog.cache.steps import Steps
     from vplog.data import Camera, Ints, Keyframes
+    from vplog.execution.execution import Execution
     from vplog.loops.propose import Proposals
     from vplog.loops.verify import Drive, VerifySettings
 
@@ -43,11 +43,9 @@ def verify(
     drive = keyframes, camera, features, settings
     places = _parts(proposals.match)
     if not places:
-        return verify_part.function(proposals, 0.0, 0, 0, *drive, execution=Execution())
+        return no_closures()
     share = 0.0 if camera.matrix is None else steps.part(calibrate, *drive)
-    total, before = len(proposals.query), np.cumsum([0, *map(len, places)]).tolist()
-    parts = [(proposals.rows(rows), share, done, total, *drive) for rows, done in zip(places, before, strict=False)]
-    return merged(steps.in_parts(verify_part, parts), places)
+    return merged(steps.in_parts(verify_part, [(proposals.rows(rows), share, *drive) for rows in places]), places)
 
 
 @step("calibrate", lambda *_: json_codec(float, float))
@@ -55,15 +53,13 @@ def calibrate(
     keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings, *, execution: Execution
 ) -> float:
     """By what share of a rotation the calibration is wrong at most."""
-    return calibration_share(_drive(keyframes, camera, features, settings), execution.threads)
+    return calibration_share(_drive(keyframes, camera, features, settings), execution)
 
 
-@step("verify", lambda *_: closures_codec(), without=("done", "total"))
+@step("verify", lambda *_: closures_codec(), items=lambda proposals, *_: len(proposals.query))
 def verify_part(
     proposals: Proposals,
     share: float,
-    done: int,
-    total: int,
     keyframes: Keyframes,
     camera: Camera,
     features: Extracted,
@@ -71,12 +67,9 @@ def verify_part(
     *,
     execution: Execution,
 ) -> Closures:
-    """The ledger of some candidates; `done` of the `total` were checked before them."""
+    """The ledger of some candidates."""
     drive = _drive(keyframes, camera, features, settings)
-    tell = execution.progress
-    return verify_between(
-        proposals, drive, drive, execution.threads, lambda count, _: tell("verify", done + count, total), share
-    )
+    return verify_between(proposals, drive, drive, execution, share)
 
 
 def _drive(keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings) -> Drive:

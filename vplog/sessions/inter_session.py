@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vplog.data import Closures, SharedReferences, Verdict
-from vplog.features.extraction import map_in_order
+from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import verify_between
 from vplog.places.sequence import rank_places
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
     from vplog.loops.verify import Drive
     from vplog.pipeline import Pipeline
     from vplog.stages import PlaceState
-
-    Progress = Callable[[int, int], None]
 
 _NO_POSE = (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.TOO_FEW_INLIERS)
 """Verdicts of views that geometry does not show to be of one place."""
@@ -54,12 +51,12 @@ def no_candidates() -> Candidates:
 
 
 def proposed_in(
-    later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, threads: int = 1
+    later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, execution: Execution
 ) -> Proposals:
     """The candidates of the places `later` among those of one drive."""
     stops = np.full(len(later), len(earlier), np.int64)
     index = index_of_part(state, earlier)
-    ranked = rank_places(index, later, stops, pipeline.propose.ranked, pipeline.sequence, threads)
+    ranked = rank_places(index, later, stops, pipeline.propose.ranked, pipeline.sequence, execution)
     return propose(ranked, pipeline.propose)
 
 
@@ -88,18 +85,18 @@ def candidates_among(
     searched: Mapping[int, Container[int]],
     state: PlaceState,
     pipeline: Pipeline,
-    threads: int = 1,
-    progress: Callable[[int], None] = lambda _: None,
+    execution: Execution,
 ) -> dict[int, Candidates]:
     """The best candidates of the places of each drive of `later`, by number, in those drives of lower numbers that it
     is `searched` in.
 
     `earlier` gives the places of the drives that are not among `later`; it is called from any thread. A thread has a
     drive to itself where there are enough of them: a drive of a few hundred views is done too soon to share.
-    `progress` gets the number of pairs of drives that were compared.
+    Progress counts the pairs of drives that were compared.
     """
     found = {number: no_candidates() for number in later}
-    inside = -(-threads // max(later))
+    inside = Execution(-(-execution.threads // max(later)))
+    total, done = sum(number in searched[one] for one in later for number in range(max(later))), 0
 
     def compare(number: int) -> list[tuple[int, Proposals]]:
         queries = [one for one in later if number in searched[one]]
@@ -108,11 +105,11 @@ def candidates_among(
         known = later[number] if number in later else earlier(number)
         return [(one, proposed_in(later[one], known, state, pipeline, inside)) for one in queries]
 
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for number, proposed in enumerate(map_in_order(pool, compare, range(max(later)), ahead=2 * threads)):
-            for one, more in proposed:
-                found[one] = with_proposals(found[one], number, more, pipeline)
-            progress(len(proposed))
+    for number, proposed in enumerate(execution.map(compare, range(max(later)), ahead=2)):
+        for one, more in proposed:
+            found[one] = with_proposals(found[one], number, more, pipeline)
+        done += len(proposed)
+        execution.progress("compare drives", done, total)
     return found
 
 
@@ -156,8 +153,7 @@ def closures_between(
     earlier: Drive,
     settings: JoinSettings,
     share: float,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    execution: Execution,
     fetch: Callable[[Int32s, Int32s], None] = lambda *_: None,
 ) -> Closures:
     """The ledger of the candidates of one drive's keyframes (queries) in another (matches) that are worth a look.
@@ -165,7 +161,7 @@ def closures_between(
     First come the bests of the queries that score highest. Where geometry shows none of them to be of the same place
     the drives do not meet; else the best of each other query follows, and then all candidates of the queries around
     those of the same place: they are for the graph, and left out where no calibration gives them metres. `share` is the
-    larger `calibration_share` of the two drives; `fetch` gets queries and matches before they are verified. `progress`
+    larger `calibration_share` of the two drives; `fetch` gets queries and matches before they are verified. Progress
     counts the candidates of each look.
     """
     _, best = np.unique(proposals.query, return_index=True)
@@ -175,7 +171,7 @@ def closures_between(
 
     def look(rows: Ints) -> None:
         fetch(np.unique(proposals.query[rows]), np.unique(proposals.match[rows]))
-        ledger = verify_between(proposals.rows(rows), later, earlier, threads, progress, share)
+        ledger = verify_between(proposals.rows(rows), later, earlier, execution, share)
         looks.append((rows, ledger))
 
     def confirmed() -> Int32s:

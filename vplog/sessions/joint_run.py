@@ -26,7 +26,7 @@ from vplog.sessions.inter_session import candidates_among, closures_between, lik
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from vplog.data import Closures
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline, Run
     from vplog.sessions.joint_graph import Ledgers
     from vplog.stages import PlaceState
-
-    Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +54,12 @@ def run_joint(
     pipeline: Pipeline,
     library: Path | None = None,
     topics: logs.TopicChoice | None = None,
-    execution: Execution | None = None,
-    use_cache: bool = True,
-    force: bool = False,
+    execution: Execution = Execution(),
+    cache: CacheOptions = CacheOptions(),
 ) -> dict[str, Any]:
     """Run each drive into a folder of its own in `out`, join them, and return the record in its run.json.
 
-    What `out` holds stays until all is done; a run that has another log is replaced with `force` only. All drives
+    What `out` holds stays until all is done; a run that has another log is replaced with `cache.force` only. All drives
     share one library, the one given or one of an equal share of each. Raises VplogError with one line.
     """
     if pipeline.gps.use:
@@ -72,19 +69,28 @@ def run_joint(
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
         odometry_of(log)
-    execution, watch = execution or Execution(), Watch()
-    threads, progress = execution.threads, execution.progress
+    watch = Watch()
     with ExitStack() as stack:
         made = stack.enter_context(
-            begun(out, pipeline, paths[0], threads, library, topics, drives_at, resumable=use_cache, force=force)
+            begun(
+                out,
+                pipeline,
+                paths[0],
+                execution.threads,
+                library,
+                topics,
+                drives_at,
+                resumable=cache.use,
+                force=cache.force,
+            )
         )
-        caches = out / CACHE if use_cache else made / CACHE
-        if not use_cache:
+        caches = out / CACHE if cache.use else made / CACHE
+        if not cache.use:
             stack.callback(shutil.rmtree, caches, ignore_errors=True)
         if library is None:
             library = made / "library"
             with watch.stage("library"):
-                build_library(paths, library, pipeline, topics, threads, progress)
+                build_library(paths, library, pipeline, topics, execution)
         drives = []
         for name, path in drives_at.items():
             with watch.stage(name):
@@ -93,16 +99,16 @@ def run_joint(
                 )
                 drives.append(_alone(name, done, pipeline))
         with watch.stage("between"):
-            state = pipeline.places.load(library, threads)
-            ledgers = _ledgers(drives, state, pipeline, threads, progress)
-        with watch.stage("join"), limited(threads):
+            state = pipeline.places.load(library, execution)
+            ledgers = _ledgers(drives, state, pipeline, execution)
+        with watch.stage("join"), limited(execution.threads):
             joined, ledgers = solve_drives([alone.solved for alone in drives], ledgers, pipeline)
         with watch.stage("write"):
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
             write_ledgers(made / "joins.parquet", [alone.solved for alone in drives], ledgers, header)
             _write_maps(made, drives, joined, header)
         account = {
-            **provenance.head(pipeline, paths[0], threads),
+            **provenance.head(pipeline, paths[0], execution.threads),
             **provenance.logs_of(paths),
             "finished": True,
             "library": {"hash": state.hash, "from": provenance.library_of(library)},
@@ -122,25 +128,26 @@ def _alone(name: str, run: Run, pipeline: Pipeline) -> Alone:
     return Alone(name, run, drive, SolvedDrive(keyframes, own, lambda: run.odometry))
 
 
-def _ledgers(
-    drives: Sequence[Alone], state: PlaceState, pipeline: Pipeline, threads: int, progress: Progress
-) -> Ledgers:
+def _ledgers(drives: Sequence[Alone], state: PlaceState, pipeline: Pipeline, execution: Execution) -> Ledgers:
     """The ledger of every pair of drives; empty where it is not likely that they meet."""
     places = [alone.run.places for alone in drives]
-    share = [0.0 if alone.drive.camera.matrix is None else calibration_share(alone.drive, threads) for alone in drives]
+    calibrated = [alone.drive.camera.matrix is not None for alone in drives]
+    share = [
+        calibration_share(alone.drive, execution) if known else 0.0
+        for alone, known in zip(drives, calibrated, strict=True)
+    ]
     later = {number: places[number] for number in range(1, len(drives))}
     searched = {number: range(number) for number in later}
-    found = candidates_among(later, places.__getitem__, searched, state, pipeline, threads)
+    found = candidates_among(later, places.__getitem__, searched, state, pipeline, execution)
     likely = {(one.later, one.earlier): one for one in likely_pairs(found, places.__getitem__, state, pipeline.join)}
 
     def verified(later: int, earlier: int) -> Closures:
         pair = likely.get((later, earlier))
         if pair is None:
             return no_closures()
-        name = f"{drives[later].name} in {drives[earlier].name}"
         ledger = closures_between(
             pair.proposals, drives[later].drive, drives[earlier].drive, pipeline.join,
-            max(share[later], share[earlier]), threads, lambda done, total: progress(name, done, total),
+            max(share[later], share[earlier]), execution.within(f"{drives[later].name} in {drives[earlier].name}"),
         )  # fmt: skip
         return with_shared(ledger, pair.proposals, pair.shared)
 

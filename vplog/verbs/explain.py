@@ -9,6 +9,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.results import run_record, tables
@@ -104,7 +105,7 @@ def _show(
     if not np.isin(stamps, log.stamps()).all():
         raise ResultError(f"{log.name} has no frames of these stamps: is it the log of {folder}? Name it with --log.")
     sides = []
-    for _, frame, features, why in extract_frames(log.frames(stamps), pipeline.features, 1):
+    for _, frame, features, why in extract_frames(log.frames(stamps), pipeline.features, Execution()):
         if frame is None or features is None:
             raise ResultError(why)
         sides.append(Side(frame.image, features))
@@ -129,7 +130,7 @@ def _boxes(
     if not row["shared_references"]:
         return [], f"{pipeline.places.kind} names no reference that both views share"
     try:
-        state, column = recorded_places(folder, record, pipeline, 1)
+        state, column = recorded_places(folder, record, pipeline, Execution())
         query, match = state.from_arrow(column.take([row["query"], row["match"]]))
     except (LibraryError, LogError) as error:
         return [], str(error).rstrip(".")

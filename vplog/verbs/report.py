@@ -10,6 +10,7 @@ import numpy as np
 from vplog import logs
 from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
 from vplog.evaluate.closures import in_words
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.figures.run_figures import ClosureInputs, choose_examples, draw_closures
 from vplog.geometry import se3
@@ -36,8 +37,8 @@ def report(
     truth: str | None = None,
     log: Path | None = None,
     topics: logs.TopicChoice | None = None,
-    threads: int = 1,
     options: TruthOptions | None = None,
+    execution: Execution = Execution(),
 ) -> dict[str, Any]:
     """Write report.html of the run in `folder`, to `path` where given; what was written.
 
@@ -54,7 +55,7 @@ def report(
     judged = judge(folder, record, truth, topics, options) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
-        pictures = pictures_from(log, folder, record, threads)
+        pictures = pictures_from(log, folder, record, execution)
     written = write_report(folder, record, path, judged, pictures)
     return {"report": str(written), "bytes": written.stat().st_size, "truth": truth and shown(truth)}
 
@@ -85,12 +86,12 @@ def judge(
     )
 
 
-def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int) -> dict[int, bytes]:
+def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Execution) -> dict[int, bytes]:
     """Pictures of closures drawn from the log itself. Raises LogError or ResultError."""
     pipeline = recorded_pipeline(folder, record)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
-    state, column = recorded_places(folder, record, pipeline, threads)
+    state, column = recorded_places(folder, record, pipeline, execution)
     opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
     settings = pipeline.pictures.model_copy(update={"megapixels": pipeline.pictures.megapixels or 0.15})
     rows = choose_examples(closures, settings.closures)
@@ -100,20 +101,22 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], threads: int)
         raise ResultError(f"{opened.name} has no frames of these stamps: is it the log of {folder}?")
     images: dict[int, Bytes] = {}
     features: dict[int, Features] = {}
-    frames = extract_frames(opened.frames(stamps), pipeline.features, threads)
+    frames = extract_frames(opened.frames(stamps), pipeline.features, execution)
     for node, (_, frame, found, why) in zip(nodes.tolist(), frames, strict=True):
         if frame is None or found is None:
             raise ResultError(why)
         images[node], features[node] = shrink(frame.image, settings.megapixels), found
     places = state.from_arrow(column)
     inputs = ClosureInputs(images.__getitem__, features.__getitem__, opened.camera(), state, places)
-    return draw_closures(rows, inputs, closures, pipeline.verify, settings.quality, threads)
+    return draw_closures(rows, inputs, closures, pipeline.verify, settings.quality, execution)
 
 
-def recorded_places(folder: Path, record: dict[str, Any], pipeline: Pipeline, threads: int) -> tuple[PlaceState, Array]:
+def recorded_places(
+    folder: Path, record: dict[str, Any], pipeline: Pipeline, execution: Execution
+) -> tuple[PlaceState, Array]:
     """The recogniser of a run and its descriptors. Raises LibraryError where its library is not there."""
     with library_at(folder, record) as library:
-        state = pipeline.places.load(library, threads)
+        state = pipeline.places.load(library, execution)
         column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
         if made_by != state.hash:
             raise LibraryError(

@@ -17,6 +17,7 @@ from vplog.cache.input_hashes import hash_inputs
 from vplog.data import Ranking
 from vplog.errors import ResultError
 from vplog.evaluate.truth import read_truth
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.joint import JoinSettings
 from vplog.maps.joining import candidate_drives as candidates
@@ -301,12 +302,12 @@ def test_candidates_are_bounded_over_all_drives() -> None:
         candidates = no_candidates()
         for number in order:
             state: Any = Likeness()
-            more = proposed_in(later, drives[number], state, settings)
+            more = proposed_in(later, drives[number], state, settings, Execution())
             candidates = with_proposals(candidates, number, more, settings)
         found.append(candidates)
     for threads in (1, 3):
         state, searched = Likeness(), {7: range(7)}
-        found.append(candidates_among({7: later}, drives.__getitem__, searched, state, settings, threads)[7])
+        found.append(candidates_among({7: later}, drives.__getitem__, searched, state, settings, Execution(threads))[7])
     for one in found:
         proposals = one.proposals
         assert np.array_equal(one.drive, found[0].drive)

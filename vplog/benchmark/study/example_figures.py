@@ -11,7 +11,7 @@ from vplog.benchmark.study.style import explain
 from vplog.figures.canvas import as_text, drawn
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ def references(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], lis
     images = 0
     total = sum(len(frames) for frames in bench.frames)
     for drive in range(len(bench.names)):
-        for place in _places(bench, state, drive, "references", images, total):
+        for place in bench.describe(state, drive, "references", images, total):
             found = state.boxes(place)
             count[found.references] += 1
             for reference, corners in zip(found.references.tolist(), found.corners, strict=True):
@@ -68,7 +68,7 @@ def examples(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
         name, state = _learned(bench, plan, other)
         places = {}
         for drive in sorted({query, other}):
-            places[drive] = _places(bench, state, drive, "examples", done, total)
+            places[drive] = bench.describe(state, drive, "examples", done, total)
             done += len(bench.frames[drive])
         ranks, truth, _ = bench.ask(state, query, other, places)
         for kind, right in (("found", True), ("missed", False)):
@@ -104,7 +104,7 @@ def sequence(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
     """Fig. 7: the boxes of consecutive frames of the first query, explained by the first map's library."""
     query, other = bench.pairs[0]
     name, state = _learned(bench, plan, other)
-    places = _places(bench, state, query, "sequence", 0, len(bench.frames[query]))
+    places = bench.describe(state, query, "sequence", 0, len(bench.frames[query]))
     found = [state.boxes(place) for place in places]
     length = min(_FRAMES, len(found))
     # the run whose frames agree most on three references: Fig. 7 is about what boxes tell where the numbers do not
@@ -141,10 +141,6 @@ def _learned(bench: Bench, plan: Plan, drive: int) -> tuple[str, BoxState]:
     name = boxed(bench, plan)[0]
     state: Any = bench.learn(name, plan.libraries(drive)[0])
     return name, state
-
-
-def _places(bench: Bench, state: BoxState, drive: int, stage: str, before: int, total: int) -> Sequence[Any]:
-    return bench.describe(state, drive, lambda at, _: bench.progress(stage, before + at, total))
 
 
 def _shared(state: BoxState, a: Any, b: Any) -> int:

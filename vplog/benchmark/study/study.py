@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from glob import escape
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from vplog.cache.code_hash import code_of
 from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import TruthChoice, open_truth
-from vplog.execution.execution import logged_warnings
+from vplog.execution.execution import Execution, logged_warnings
 from vplog.places.reference_choice import PAPER_SIZE
 from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
 from vplog.results.staging import staged
@@ -38,7 +38,6 @@ from vplog.storage.urls import shown
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from vplog.benchmark.traversals import Progress
     from vplog.pipeline import Pipeline
 
 METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
@@ -60,29 +59,39 @@ _SCORES = ("vplog.benchmark.study.trial_store", "vplog.benchmark.recogniser_spec
 """Modules that the scores of a trial depend on, with all that these import."""
 
 
+@dataclass(frozen=True)
+class StudyOptions:
+    """Which experiments are done, and on what."""
+
+    methods: Sequence[str] = METHODS
+    sizes: Sequence[int] = SIZES
+    """Library sizes of the experiment about them."""
+    seeds: int = SEEDS
+    library_size: int = PAPER_SIZE
+    """References of all other experiments."""
+    min_gap: int | None = None
+    """Frames that a match is older, at least, where a single drive is searched for in its own past."""
+    only: Sequence[str] | None = None
+    """Names of the experiments; None for all."""
+    topics: logs.TopicChoice | None = None
+
+
 def study(
     drives: Sequence[Path],
     truth: TruthChoice,
     pipeline: Pipeline,
     out: Path,
-    methods: Sequence[str] = METHODS,
-    sizes: Sequence[int] = SIZES,
-    seeds: int = SEEDS,
-    library_size: int = PAPER_SIZE,
-    min_gap: int | None = None,
-    only: Sequence[str] | None = None,
-    topics: logs.TopicChoice | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    options: StudyOptions = StudyOptions(),
+    execution: Execution = Execution(),
 ) -> dict[str, Any]:
-    """Every experiment (those of `only`) on drives of one route, each query and map in turn; what study.json says.
+    """Experiments on drives of one route, each query and map in turn; what study.json says.
 
-    A single drive is looked for in its own past, frames at least `min_gap` older. Raises VplogError with one line
-    where that cannot be.
+    Raises VplogError with one line where that cannot be.
     """
-    chosen = _choose(only, len(drives))
-    plan = Plan(tuple(methods), library_size, tuple(sorted(set(sizes))), seeds, pipeline)
-    recognisers = read_methods(methods, pipeline)
+    min_gap, topics, seeds, library_size = options.min_gap, options.topics, options.seeds, options.library_size
+    chosen = _choose(options.only, len(drives))
+    plan = Plan(tuple(options.methods), library_size, tuple(sorted(set(options.sizes))), seeds, pipeline)
+    recognisers = read_methods(options.methods, pipeline)
     _check_drives(drives, min_gap)
     warnings: list[str] = []
     with staged(out, lambda: _figures_in(out)) as made, ExitStack() as stack:
@@ -105,7 +114,7 @@ def study(
         }
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline.features, min_gap,
-            {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, stack, threads, progress,
+            {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, stack, execution,
         )  # fmt: skip
         account = {
             "vplog": vplog.__version__,

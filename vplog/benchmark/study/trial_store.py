@@ -22,15 +22,16 @@ from vplog.places.reference_choice import LibrarySettings, choose
 from vplog.results.run_record import canonical_json, write_run_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
     from contextlib import ExitStack
     from pathlib import Path
 
-    from vplog.benchmark.traversals import Progress, Walk
+    from vplog.benchmark.traversals import Walk
     from vplog.data import Bytes, Ints
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.place_truth import PlaceTruth
     from vplog.evaluate.retrieval import Ranks
+    from vplog.execution.execution import Execution
     from vplog.stages import Extractor, Log, PlaceState
 
 SCORES = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100")
@@ -81,8 +82,7 @@ class Bench:
     scratch: Path
     stack: ExitStack
     """Closes the feature stores."""
-    threads: int
-    progress: Progress
+    execution: Execution
     warnings: list[str] = field(default_factory=list)
     _walks: dict[int, Walk] = field(default_factory=dict)
     _done: dict[str, dict[str, Any]] | None = None
@@ -97,9 +97,8 @@ class Bench:
         """The drive's frames as features."""
         if drive not in self._walks:
             store = self.stack.enter_context(FeatureStore(self.scratch / f"{drive}.features"))
-            walk = extract_walk(
-                self.logs[drive], self.extractor, store, self.frames[drive], None, self.threads, self.progress
-            )
+            frames = self.frames[drive]
+            walk = extract_walk(self.logs[drive], self.extractor, store, frames, execution=self.execution)
             self.warnings += walk.warnings
             self._walks[drive] = walk
         return self._walks[drive]
@@ -131,7 +130,7 @@ class Bench:
         methods."""
         if self._learned[0] != library:
             self._learned = library, self.references(library)
-        return self.methods[method].learn(self._learned[1], self.threads)
+        return self.methods[method].learn(self._learned[1], self.execution)
 
     def ask(
         self, state: PlaceState, query: int, other: int, places: dict[int, Sequence[Any]]
@@ -142,7 +141,7 @@ class Bench:
         truth = self.truth[query, other].pairs(walks[0].frames, walks[1].frames).below(stops)
         index = state.index(places[other])
         scores = score_table(len(walks[0]), len(walks[1]), self.scratch, "scores")
-        score_rows(index, places[query], stops, scores, self.threads)
+        score_rows(index, places[query], stops, scores, self.execution)
         return retrieval.rank_queries(scores, truth, stops), truth, stops
 
     def run(self, stage: str, trials: Iterable[Trial]) -> list[dict[str, Any]]:
@@ -161,10 +160,7 @@ class Bench:
             state = self.learn(method, library)
             places = {}
             for drive in used[library, method]:
-                before = described
-                places[drive] = self.describe(
-                    state, drive, lambda at, _, before=before: self.progress(stage, before + at, total)
-                )
+                places[drive] = self.describe(state, drive, stage, described, total)
                 described += len(self.frames[drive])
             for trial in some:
                 ranks, _, _ = self.ask(state, trial.query, trial.map, places)
@@ -177,9 +173,9 @@ class Bench:
             write_run_json(self.remembered, dict(sorted(done.items())))
         return [done[keys[trial]] for trial in wanted]
 
-    def describe(self, state: PlaceState, drive: int, progress: Callable[[int, int], None]) -> Sequence[Any]:
-        """Places of a walk as a table would give them back."""
-        places, _ = describe_walk(state, self.walk(drive), self.threads, progress)
+    def describe(self, state: PlaceState, drive: int, stage: str, before: int, total: int) -> Sequence[Any]:
+        """Places of a walk as a table would give them back; `before` frames of the stage's `total` are done."""
+        places, _ = describe_walk(state, self.walk(drive), stage, self.execution.part(before, total))
         return state.from_arrow(state.to_arrow(places))
 
     @staticmethod

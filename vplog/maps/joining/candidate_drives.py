@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.execution.execution import Execution
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import as_described, update_index
 from vplog.maps.search.sequences import PLACES_A_VIEW, credits_of
@@ -47,18 +48,13 @@ def candidates_of(
 ) -> dict[int, Candidates]:  # fmt: skip
     """For each new drive, by number, its best candidates in the drives of a lower number that are worth a search."""
     found: dict[int, Candidates] = {}
-    done, total = 0, sum(min(number, most_searched(pipeline)) for number in new)
-
-    def tell(count: int) -> None:
-        nonlocal done
-        done += count
-        progress("search the map", done, total)
-
+    counts = [min(number, most_searched(pipeline)) for number in new]
     for first in range(0, len(new), _AT_ONCE):
         block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
         searched = worth_a_search(store, members, block, state, pipeline, threads)
+        execution = Execution(threads, progress).part(sum(counts[:first]), sum(counts))
         found |= candidates_among(
-            block, lambda number: places_of(store, members[number], state), searched, state, pipeline, threads, tell
+            block, lambda number: places_of(store, members[number], state), searched, state, pipeline, execution
         )
     return found
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from vplog.data import Camera
 from vplog.errors import LogError, ResultError
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
@@ -60,7 +61,7 @@ def camera_trust(member: Member, verify: VerifySettings, threads: int = 1) -> Ca
         near = pairs[:, :1] + np.arange(-around, around + 1)
         rows = np.concatenate([near.ravel(), pairs[:, 1]])
         fetch(np.unique(rows[(rows >= 0) & (rows < len(drive.keyframes.stamp_ns))]))
-        return CameraTrust(plain_camera(camera), calibration_share(drive, threads))
+        return CameraTrust(plain_camera(camera), calibration_share(drive, Execution(threads)))
 
 
 def keep_features(member: Member, verify: VerifySettings) -> bool:
@@ -142,7 +143,7 @@ class ReextractedFeatures:
             if not missing:
                 return
             pipeline, frames = self._member.pipeline, self._log.frames(self._stamp_ns[missing])
-            found = extract_frames(frames, pipeline.features, self._threads, pipeline.stereo)
+            found = extract_frames(frames, pipeline.features, Execution(self._threads), pipeline.stereo)
             for row, (stamp_ns, _, features, why) in zip(missing, found, strict=False):
                 if features is None or stamp_ns != self._stamp_ns[row]:
                     raise LogError(

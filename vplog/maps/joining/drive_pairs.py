@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.cache.code_hash import code_of
 from vplog.data import Verdict
 from vplog.errors import ResultError
+from vplog.execution.execution import Execution
 from vplog.maps.joining.drive_features import CameraTrust, camera_trust, keep_features, opened_drive
 from vplog.maps.storage.drive_ids import key_of
 from vplog.maps.storage.layout import folder_name, quoted
@@ -92,7 +93,7 @@ def compute_pair(task: PairTask) -> bytes:
 
         share = max(task.later_camera.rotation_share, task.earlier_camera.rotation_share)
         ledger = closures_between(
-            task.proposals, later, earlier, task.pipeline.join, share, threads, fetch=fetch
+            task.proposals, later, earlier, task.pipeline.join, share, Execution(threads), fetch
         )  # fmt: skip
         ledger = with_shared(ledger, task.proposals, task.shared)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)

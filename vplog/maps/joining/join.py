@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from vplog.execution.cores import limited
+from vplog.execution.execution import Execution
 from vplog.execution.tasks import each_done
 from vplog.execution.timing import Watch
 from vplog.maps.joining import drive_pairs
@@ -48,7 +49,7 @@ def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceSta
     """
     drive_pairs.depends(pipeline)
     drive_pairs.search_code()
-    return cast("PlaceState", pipeline.places.load(library, threads))
+    return cast("PlaceState", pipeline.places.load(library, Execution(threads)))
 
 
 def join(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,8 @@ import numpy as np
 
 from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError
-from vplog.features.extraction import extract_frames, map_in_order, one_thread_each
+from vplog.execution.execution import Execution
+from vplog.features.extraction import extract_frames
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import update_index
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
@@ -138,7 +138,7 @@ def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pip
             f"{store} has lost its library {library}. Copy it back to {folder}, or describe the map again: vplog "
             f"map redescribe {store} --library LIB -o MAP"
         )
-    return drives, pipeline, pipeline.places.load(folder, threads)
+    return drives, pipeline, pipeline.places.load(folder, Execution(threads))
 
 
 def describe_log(
@@ -154,21 +154,20 @@ def describe_log(
         stamps = keyframes.stamp_ns
     else:
         warnings.append(f"{log.name} has no odometry, so every frame is a query.")
-    frames = extract_frames(log.frames(stamps), pipeline.features, threads, pipeline.stereo)
+    execution = Execution(threads, progress)
+    frames = extract_frames(log.frames(stamps), pipeline.features, execution, pipeline.stereo)
 
     def describe(found: Any) -> tuple[int, Any, str]:
         stamp_ns, _, features, why = found
         return stamp_ns, None if features is None else state.describe(features), why
 
     seen, descriptors, lost = [], [], []
-    with ThreadPoolExecutor(threads, initializer=one_thread_each) as pool:
-        for stamp_ns, descriptor, why in map_in_order(pool, describe, frames, ahead=4 * threads):
-            if descriptor is None:
-                lost.append(why)
-            else:
-                seen.append(stamp_ns)
-                descriptors.append(descriptor)
-            progress("describe", len(seen) + len(lost), len(stamps))
+    for stamp_ns, descriptor, why in execution.counted("describe", execution.map(describe, frames), len(stamps)):
+        if descriptor is None:
+            lost.append(why)
+        else:
+            seen.append(stamp_ns)
+            descriptors.append(descriptor)
     if not seen:
         raise LogError(f"{log.name}: none of {len(stamps)} frames could be decoded. {' '.join(lost[:1])}")
     if lost:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.maps.search.index import as_described
 from vplog.maps.search.top_k import NONE, Answers, answers_of, merge, no_answers
 from vplog.maps.storage.damage import reading_drive
@@ -66,7 +67,7 @@ def best_lines(
                 raise LibraryError(other_library(store, drive, made_by, library))
             index = index_of_part(state, state.from_arrow(as_described(store, drive, column, state)))
         stops = np.full(len(descriptors), len(column), np.int64)
-        rankings = rank_places(index, descriptors, stops, top, settings, threads)
+        rankings = rank_places(index, descriptors, stops, top, settings, Execution(threads))
         best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)
         progress("search", done + 1, len(drives))
     return best
