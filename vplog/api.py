@@ -355,7 +355,7 @@ def batch(
 
 @contextmanager
 def drive_processes(engine: str, jobs: int | None, drives: int | None = None) -> Iterator[OwnProcesses | None]:
-    """The processes of the drives of a batch, which load while this one does; None where another engine computes."""
+    """The processes of the drives of a batch; None where another engine computes."""
     if engine != "local":
         yield None
         return
@@ -363,8 +363,7 @@ def drive_processes(engine: str, jobs: int | None, drives: int | None = None) ->
 
     count = (jobs or 1) + 1
     with OwnProcesses(count if drives is None else min(count, drives)) as processes:
-        processes.begin()
-        yield processes
+        yield processes  # begun by the first drive: what is refused before starts none
 
 
 def open_map(map: Place) -> Map:

@@ -256,12 +256,12 @@ def test_size_that_the_data_do_not_justify_is_refused_before_it_is_allocated() -
 def test_cut_files_are_no_half_images() -> None:
     data = cv2.imencode(".jpg", RNG.integers(0, 256, (40, 50)).astype(np.uint8))[1].tobytes()
     assert image_size(data + bytes(100)) == (50, 40)  # cameras pad their buffers
-    with pytest.raises(BadMessageError, match="are not a whole JPEG, PNG|its JPEG is damaged"):
+    with pytest.raises(BadMessageError, match=r"are not a whole JPEG, PNG|its JPEG is damaged"):
         grey(ImageMessage(0, "", "jpeg", data[:-50], True))
     data = cv2.imencode(".png", RNG.integers(0, 256, (40, 50)).astype(np.uint8))[1].tobytes()
     claim = data[:33] + b"\xff" + data[34:]  # the length of the first chunk behind the header
     for bad in (data[:-20], data[: len(data) // 2], claim):
-        with pytest.raises(BadMessageError, match="are not a whole JPEG, PNG|its JPEG is damaged"):
+        with pytest.raises(BadMessageError, match=r"are not a whole JPEG, PNG|its JPEG is damaged"):
             grey(ImageMessage(0, "", "png", bad, True))
 
 
