@@ -52,7 +52,16 @@ class _Process(SpawnProcess):
 
 
 class _Spawn(SpawnContext):
+    """Its locks keep their names as long as the pool: pebble lets them go before it ends processes that look for them."""
+
     Process = _Process
+
+    def __init__(self) -> None:
+        self._locks: list[Any] = []
+
+    def RLock(self) -> Any:  # noqa: N802 (multiprocessing's name)
+        self._locks.append(super().RLock())
+        return self._locks[-1]
 
 
 class OwnProcesses:
