@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from vplog.demo import DemoSettings, route
-from vplog.demo.render import render
-from vplog.demo.scene import FIRST_LIGHT, LATER_LIGHT, Scene, make_scene, take_picture
+from vplog.demo.scene import FIRST_LIGHT, LATER_LIGHT, Scene, make_scene, render, take_picture
 from vplog.demo.world import traffic
 from vplog.geometry.se3 import angle, between, inverse, pose, so3_exp, transform
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -13,18 +12,21 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
+from vplog.data import Trajectory
 from vplog.demo import route
 from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
+from vplog.demo.settings import DemoSettings
 from vplog.errors import ResultError
+from vplog.execution.cores import allowed
+from vplog.execution.execution import Execution
 from vplog.geometry.se3 import quaternion
+from vplog.geometry.tum import write_tum
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from vplog.data import Bytes, Camera, Float32s, Floats, Ints
-    from vplog.demo.settings import DemoSettings
-    from vplog.execution.execution import Execution
 
 IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"
@@ -50,7 +52,6 @@ _DELAY_NS = (2_000_000, 30_000_000)
 """A message is logged this long after its stamp: drivers and transport take their time."""
 _CHUNK_BYTES = 1 << 20
 """Uncompressed size of a chunk; about ten frames."""
-_TRUTH_HEAD = "# timestamp tx ty tz qx qy qz qw (world_from_body)"
 _MARKED_BYTES = 100
 """A demo's file says within so much that it is one: the log behind 8 bytes of magic, 17 of a header, and `ros2`."""
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -70,16 +71,21 @@ class Drive:
     """(F, 4, 4) truth at the frames."""
 
 
-def record_drive(folder: Path, settings: DemoSettings, execution: Execution) -> Drive:
-    """Render and write the whole drive; see `vplog.demo.make_drive`."""
+def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Execution | None = None) -> Drive:
+    """Write `folder`/drive.mcap and `folder`/truth.tum and say what is in them.
+
+    Frames are rendered on all cores where `execution` is None. Raises ResultError where the folder cannot be written.
+    """
+    settings = settings or DemoSettings()
     scene = make_scene(settings)
     log, truth = folder / "drive.mcap", folder / "truth.tum"
+    stamp_ns = np.union1d(route.odometry_stamps(settings), scene.stamp_ns)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _check_own(log, b"vplog demo")
-        _check_own(truth, _TRUTH_HEAD.encode())
-        _write_truth(truth, settings, scene)
-        _write_log(log, settings, scene, execution)
+        _check_own(truth, b"(world_from_body)")
+        write_tum(truth, Trajectory(stamp_ns, route.world_from_body(settings, stamp_ns)))
+        _write_log(log, settings, scene, execution or Execution(allowed()))
     except OSError as error:
         raise ResultError(f"Cannot write the demo drive to {folder}: {error}. Choose another folder.") from None
     return Drive(log, truth, scene.camera, scene.stamp_ns, scene.world_from_body)
@@ -94,16 +100,6 @@ def _check_own(path: Path, mark: bytes) -> None:
             raise ResultError(f"{path} is not of a demo. Choose another folder with -o.")
 
 
-def _write_truth(path: Path, settings: DemoSettings, scene: Scene) -> None:
-    stamp_ns = np.union1d(route.odometry_stamps(settings), scene.stamp_ns)
-    poses = route.world_from_body(settings, stamp_ns)
-    lines = [_TRUTH_HEAD]
-    for stamp, point, turn in zip(stamp_ns.tolist(), poses[:, :3, 3], quaternion(poses[:, :3, :3]), strict=True):
-        numbers = " ".join(f"{x:.9f}" for x in (*point, *turn))
-        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
 def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Execution) -> None:
     """All messages in the order in which they reach the recorder."""
     messages = [*_mounting(scene.camera), *_odometry(settings), *_fixes(settings), *_frames(scene, execution)]
@@ -114,18 +110,16 @@ def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Exec
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="vplog demo")
-        channels: dict[str, int] = {}
-        schemas: dict[str, int] = {}
-        sequence: dict[str, int] = {}
-        for topic in dict.fromkeys(topic for topic, _, _ in messages):
-            name = TYPES[topic]
-            if name not in schemas:
-                text, _ = _TYPES.generate_msgdef(name, ros_version=2)
-                schemas[name] = writer.register_schema(name=name, encoding="ros2msg", data=text.encode())
-            channels[topic] = writer.register_channel(topic=topic, message_encoding="cdr", schema_id=schemas[name])
+        topics = dict.fromkeys(topic for topic, _, _ in messages)
+        schemas = {
+            name: writer.register_schema(name, "ros2msg", _TYPES.generate_msgdef(name, ros_version=2)[0].encode())
+            for name in dict.fromkeys(TYPES[topic] for topic in topics)
+        }
+        channels = {topic: writer.register_channel(topic, "cdr", schemas[TYPES[topic]]) for topic in topics}
+        sequence = dict.fromkeys(topics, 0)
         for log_time, i in logged:
             topic, stamp, message = messages[i]
-            sequence[topic] = sequence.get(topic, 0) + 1
+            sequence[topic] += 1
             data = bytes(_TYPES.serialize_cdr(message, TYPES[topic]))
             writer.add_message(channels[topic], log_time, data, stamp, sequence[topic])
         writer.finish()
@@ -133,19 +127,16 @@ def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Exec
 
 def _message(name: str, **fields: Any) -> Any:
     """A message of a type with these fields, nested ones as dicts; the others are 0 or empty."""
-    return _TYPES.types[name](**{
-        field: _value(kind, about, fields.get(field)) for field, (kind, about) in _TYPES.fielddefs[name][1]
-    })  # fmt: skip
 
+    def value(kind: Nodetype, about: Any, given: Any) -> Any:
+        if kind == Nodetype.NAME:
+            return _message(about, **(given or {}))
+        if given is not None:
+            return given
+        return np.zeros(about[1]) if kind != Nodetype.BASE else "" if about[0] == "string" else 0
 
-def _value(kind: Nodetype, about: Any, value: Any) -> Any:
-    if kind == Nodetype.NAME:
-        return _message(about, **(value or {}))
-    if value is not None:
-        return value
-    if kind == Nodetype.BASE:
-        return "" if about[0] == "string" else 0
-    return np.zeros(about[1])  # an array of numbers
+    types = {field: value(*kind, fields.get(field)) for field, kind in _TYPES.fielddefs[name][1]}
+    return _TYPES.types[name](**types)
 
 
 def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
@@ -158,12 +149,9 @@ def _pose(world_from_frame: Floats, translation: str, rotation: str) -> dict[str
 
 
 def _mounting(camera: Camera) -> Iterator[tuple[str, int, Any]]:
-    stamped = _message(
-        "geometry_msgs/msg/TransformStamped",
-        header=_header(route.START_NS, BODY_FRAME),
-        child_frame_id=CAMERA_FRAME,
-        transform=_pose(camera.body_from_camera, "translation", "rotation"),
-    )
+    at = _pose(camera.body_from_camera, "translation", "rotation")
+    fields = {"header": _header(route.START_NS, BODY_FRAME), "child_frame_id": CAMERA_FRAME, "transform": at}
+    stamped = _message("geometry_msgs/msg/TransformStamped", **fields)
     yield TF_STATIC, route.START_NS, _message(TYPES[TF_STATIC], transforms=[stamped])
 
 
@@ -184,17 +172,11 @@ def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
     stamp_ns = route.stamps(settings, settings.gps_rate_hz)
     fixes = route.gps(settings, stamp_ns, np.random.default_rng([settings.seed, 7]))
     variance = np.diag(np.array([1.0, 1.0, 4.0]) * settings.gps_sigma_m**2).ravel()
+    known = {"status": {"status": 0, "service": 1}, "position_covariance": variance, "position_covariance_type": 2}
+    # a fix, by GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
     for stamp, fix in zip(stamp_ns.tolist(), fixes.tolist(), strict=True):
         fields = dict(zip(("latitude", "longitude", "altitude"), fix, strict=True))
-        message = _message(
-            TYPES[GPS],
-            header=_header(stamp, BODY_FRAME),
-            status={"status": 0, "service": 1},  # a fix, by GPS
-            position_covariance=variance,
-            position_covariance_type=2,  # COVARIANCE_TYPE_DIAGONAL_KNOWN
-            **fields,
-        )
-        yield GPS, stamp, message
+        yield GPS, stamp, _message(TYPES[GPS], header=_header(stamp, BODY_FRAME), **known, **fields)
 
 
 def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]]:
@@ -228,28 +210,21 @@ def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]
 
 
 def _compressed_depth(depth: Float32s) -> Bytes:
-    """The 12 bytes of ROS's compressed_depth_image_transport (int32 format, two float32, unused), then a 16-bit PNG.
+    """The 12 bytes of ROS's compressed_depth_image_transport (unused), then a 16-bit PNG.
 
     Depth is in mm; 0 is unknown: sky, or beyond what 16 bits hold.
     """
     mm = np.nan_to_num(depth * 1000, nan=0.0)
     mm = np.where(mm > 65534, 0, np.round(mm)).astype(np.uint16)  # 65535 means invalid to some readers
-    _, png = cv2.imencode(".png", mm)
-    header = np.frombuffer(struct.pack("<iff", 0, 0.0, 0.0), np.uint8)
-    return np.concatenate([header, png.ravel()])
+    return np.concatenate([np.zeros(12, np.uint8), cv2.imencode(".png", mm)[1].ravel()])
 
 
 def _calibration(header: dict[str, Any], camera: Camera, right_m: float = 0.0) -> Any:
     """The CameraInfo of the camera, or of its twin so far to the right: the fourth column of P holds the baseline."""
-    assert camera.matrix is not None  # noqa: S101 - the demo's camera is calibrated
+    matrix: Floats = camera.matrix  # type: ignore[assignment]
+    p = np.hstack([matrix, [[-matrix[0, 0] * right_m], [0.0], [0.0]]])
     return _message(
-        _CALIBRATION_TYPE,
-        header=header,
-        height=camera.height,
-        width=camera.width,
-        distortion_model=camera.distortion_model,
-        d=camera.distortion,
-        k=camera.matrix.ravel(),
-        r=np.eye(3).ravel(),
-        p=np.hstack([camera.matrix, [[-camera.matrix[0, 0] * right_m], [0.0], [0.0]]]).ravel(),
-    )
+        _CALIBRATION_TYPE, header=header, height=camera.height, width=camera.width,
+        distortion_model=camera.distortion_model, d=camera.distortion, k=matrix.ravel(), r=np.eye(3).ravel(),
+        p=p.ravel(),
+    )  # fmt: skip

@@ -6,6 +6,7 @@ the street, counter-clockwise from the middle of the southern side; lateral is m
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,21 +63,12 @@ def second_lap_share(settings: DemoSettings, distance_m: Floats) -> Floats:
     return x * x * (3 - 2 * x)
 
 
-def lateral(settings: DemoSettings, distance_m: Floats) -> Floats:
-    """(T,) m left of the axis: none in the first lap, then 0.4 to 1 times the offset, meandering every 31 m."""
-    meander = 0.7 + 0.3 * np.sin(2 * np.pi * distance_m / 31.0)
-    return settings.lateral_offset_m * second_lap_share(settings, distance_m) * meander
-
-
 def track_point(settings: DemoSettings, distance_m: Floats) -> Floats:
-    """(T, 2) of the car."""
+    """(T, 2) of the car: on the axis in the first lap, then 0.4 to 1 times the offset left of it, meandering."""
     point, heading = axis_point(settings, distance_m)
-    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
-    return point + left * lateral(settings, distance_m)[..., None]
-
-
-def duration_s(settings: DemoSettings) -> float:
-    return settings.laps * lap_length(settings) / settings.speed_m_s
+    left_m = settings.lateral_offset_m * second_lap_share(settings, distance_m)
+    left_m = left_m * (0.7 + 0.3 * np.sin(2 * np.pi * distance_m / 31.0))
+    return point + left_m[..., None] * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
 
 
 def world_from_body(settings: DemoSettings, stamp_ns: Ints) -> Floats:
@@ -85,19 +77,23 @@ def world_from_body(settings: DemoSettings, stamp_ns: Ints) -> Floats:
     distance_m = settings.speed_m_s * time_s
     step_m = 0.05  # short against every bend, long against rounding
     forward = track_point(settings, distance_m + step_m) - track_point(settings, distance_m - step_m)
-    zero = np.zeros_like(time_s)
-    yaw = so3_exp(np.stack([zero, zero, np.arctan2(forward[:, 1], forward[:, 0])], axis=-1))
+    yaw = np.arctan2(forward[:, 1], forward[:, 0])[:, None] * [0, 0, 1]
     # Sway: 0.4 and 0.3 degrees, 1.5 cm, at periods of the order of a second that share no multiple.
-    roll, pitch = 0.007 * np.sin(time_s * 2.9), 0.005 * np.sin(time_s * 4.3 + 1.0)
-    rotation = yaw @ so3_exp(np.stack([roll, pitch, zero], axis=-1))
-    height = 0.015 * np.sin(time_s * 5.1 + 2.0)
-    return pose(rotation, np.concatenate([track_point(settings, distance_m), height[:, None]], axis=-1))
+    roll, pitch, height = (
+        size * np.sin(time_s * rate + phase)
+        for size, rate, phase in ((0.007, 2.9, 0), (0.005, 4.3, 1), (0.015, 5.1, 2))
+    )
+    rotation = so3_exp(yaw) @ so3_exp(np.stack([roll, pitch, np.zeros_like(roll)], axis=-1))
+    return pose(rotation, np.column_stack([track_point(settings, distance_m), height]))
 
 
 def stamps(settings: DemoSettings, rate_hz: float, first_ns: int = 0) -> Ints:
     """Stamps of a sensor in ns, from first_ns after the start to the end of the drive."""
-    count = int((duration_s(settings) - first_ns * 1e-9) * rate_hz) + 1 if rate_hz else 0
-    return START_NS + first_ns + np.round(np.arange(count) * (1e9 / rate_hz if rate_hz else 0)).astype(np.int64)
+    if not rate_hz:
+        return np.zeros(0, np.int64)
+    duration_s = settings.laps * lap_length(settings) / settings.speed_m_s
+    count = int((duration_s - first_ns * 1e-9) * rate_hz) + 1
+    return START_NS + first_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def frame_stamps(settings: DemoSettings) -> Ints:
@@ -115,14 +111,11 @@ def odometry(settings: DemoSettings, rng: np.random.Generator) -> Floats:
     """(T, 4, 4) odom_from_body that drifts: the true steps with a scale error, a yaw bias and white noise."""
     truth = world_from_body(settings, odometry_stamps(settings))
     step = log(between(truth[:-1], truth[1:]))
-    step[:, 3:] = step[:, 3:] * (1 + settings.odometry_scale_error)
+    step[:, 3:] *= 1 + settings.odometry_scale_error
     step[:, 2] += settings.odometry_yaw_bias_rad_s / settings.odometry_rate_hz
     step[:, :3] += rng.normal(size=(len(step), 3)) * settings.odometry_turn_noise_rad
     step[:, 3:] += rng.normal(size=(len(step), 3)) * settings.odometry_step_noise_m
-    result = [np.eye(4)]
-    for motion in exp(step):
-        result.append(result[-1] @ motion)
-    return np.stack(result)
+    return np.stack([*accumulate(exp(step), np.matmul, initial=np.eye(4))])
 
 
 def gps(settings: DemoSettings, stamp_ns: Ints, rng: np.random.Generator) -> Floats:
