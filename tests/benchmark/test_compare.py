@@ -343,7 +343,7 @@ def test_an_interrupted_comparison_leaves_the_one_before(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    for last in ("vplog.benchmark.compare._write_scores", "vplog.benchmark.compare_figures.draw_curves"):
+    for last in ("vplog.benchmark.compare._write_scores", "vplog.benchmark.compare.draw_curves"):
         with monkeypatch.context() as patch:
             patch.setattr(last, interrupted)
             assert verb(*arguments, "--library-size", 5).code == 130

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vplog.errors import TruthError
-from vplog.evaluate.calibration import reliability
+from vplog.evaluate.retrieval import reliability
 
 ANSWERS = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60)
 

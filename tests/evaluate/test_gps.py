@@ -12,8 +12,7 @@ from scipy.integrate import quad
 from tests.evaluate.data import data
 from vplog.data import Gps, Trajectory
 from vplog.errors import TruthError
-from vplog.evaluate.gps import ate_to_gps, local_enu
-from vplog.evaluate.truth import read_truth
+from vplog.evaluate.truth import ate_to_gps, local_enu, read_truth
 from vplog.geometry import se3
 
 if TYPE_CHECKING:

@@ -46,6 +46,6 @@ def test_numbers_are_for_reading() -> None:
 
 
 def test_jinja_is_loaded_when_a_page_is_written() -> None:
-    code = "import sys, vplog.verbs.info_page, vplog.run.report; print('jinja2' in sys.modules)"
+    code = "import sys, vplog.verbs.info, vplog.run.report; print('jinja2' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -21,8 +21,7 @@ from vplog.cli import main, options
 from vplog.logs import TopicChoice
 from vplog.results.run_record import plain
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
-from vplog.verbs.info import command, in_words, preflight
-from vplog.verbs.info_page import page
+from vplog.verbs.info import command, in_words, page, preflight
 
 if TYPE_CHECKING:
     from pathlib import Path

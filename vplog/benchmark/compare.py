@@ -17,14 +17,15 @@ import numpy as np
 
 import vplog
 from vplog import logs
-from vplog.benchmark import compare_figures
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.traversals import Walk, candidate_stops, extract_walk
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
+from vplog.evaluate.retrieval import average_precision, precision_recall, recall_at
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.features.store import FeatureStore
+from vplog.figures.canvas import as_text, drawn
 from vplog.places.library_files import load_references, references_hash
 from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
 from vplog.places.sequence import SequenceSettings
@@ -36,10 +37,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from vplog.data import Float32s, Ints, Reference
-    from vplog.evaluate.calibration import Reliability
-    from vplog.evaluate.retrieval import Ranks
+    from vplog.evaluate.retrieval import Ranks, Reliability
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
+
+
+_DEEPEST_RANK = 25
+"""Last rank of the curves, as usual for recall@N in place recognition (Arandjelovic et al., NetVLAD, CVPR 2016)."""
+_LINES = ("-", "--", "-.", ":")
+"""One kind each time the ten colours have gone round, so that forty methods are told apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +89,11 @@ def compare(
     Raises VplogError with one line where that cannot be.
     """
     other = query if other is None else other
-    library, min_gap, sequence, out, topics = (
-        options.library, options.min_gap, options.sequence, options.out, options.topics
-    )  # fmt: skip
-    recognisers = read_methods(methods, pipeline)
-    sequences = None
-    if sequence is not None:
-        sequences = SequenceSettings.read({**pipeline.sequence.model_dump(), "length": sequence}, "--sequence")
+    library, min_gap, out, topics = options.library, options.min_gap, options.out, options.topics
+    recognisers, sequences = read_methods(methods, pipeline), None
+    if options.sequence is not None:
+        tree = {**pipeline.sequence.model_dump(), "length": options.sequence}
+        sequences = SequenceSettings.read(tree, "--sequence")
     itself = same_drive(query, other)
     _check_gap(query, itself, min_gap)
     warnings: list[str] = []
@@ -101,7 +105,7 @@ def compare(
         map_log = query_log if itself else logs.open(other, topics)
         known = open_truth(truth, query_log, map_log)
         warnings += check_truth(known, query_log, map_log, min_gap)  # before the long part
-        if library is None or same_drive(library, other):
+        if library is not None and same_drive(library, other):
             library = None
         wanted = LibrarySettings(choose="random", size=options.library_size, seed=options.library_seed)
 
@@ -144,14 +148,14 @@ def compare(
             if result.reliability is not None:
                 reliable[name] = result.reliability
             if result.sequence_ranks is not None:
-                ranks[f"{name}, L={sequence}"] = result.sequence_ranks
+                ranks[f"{name}, L={options.sequence}"] = result.sequence_ranks
             if made is not None:
                 result.figures["scores"] = _write_scores(made, number, name, result.scores, query_walk, map_walk)
         account["warnings"] = list(dict.fromkeys([*query_log.warnings, *map_log.warnings, *warnings]))
         if made is not None:
-            compare_figures.draw_curves(ranks, made)
+            draw_curves(ranks, made)
             if reliable:
-                compare_figures.draw_reliability(reliable, made)
+                draw_reliability(reliable, made)
             run_record.write_run_json(made / "compare.json", account)
     return Comparison(account, ranks)
 
@@ -236,11 +240,61 @@ def _write_scores(out: Path, number: int, name: str, scores: Float32s, query: Wa
     file = f"scores-{number:02d}-{re.sub(r'[^A-Za-z0-9.=+-]+', '_', Path(name).name)[:80]}.npz"
     with replacing(out / file) as stream:
         np.savez(
-            stream,
-            scores=scores,
-            query_frame=query.frames,
-            query_ns=query.stamp_ns,
-            map_frame=other.frames,
+            stream, scores=scores, query_frame=query.frames, query_ns=query.stamp_ns, map_frame=other.frames,
             map_ns=other.stamp_ns,
-        )
+        )  # fmt: skip
     return file
+
+
+def draw_curves(ranks: dict[str, Ranks], folder: Path) -> None:
+    """Write curves.png and curves.svg. The same ranks give the same bytes."""
+    with drawn(folder, "curves", 10, 4.5) as figure:
+        left, right = figure.subplots(1, 2)
+        for number, (plain_name, found) in enumerate(ranks.items()):
+            name = as_text(plain_name)
+            style = {"color": f"C{number % 10}", "linestyle": _LINES[number // 10 % len(_LINES)]}
+            curve = precision_recall(found)
+            left.step(
+                [0.0, *curve.recall], [*curve.precision[:1], *curve.precision], where="pre",
+                label=f"{name}  AP {average_precision(curve):.3f}", **style,
+            )  # fmt: skip
+            depth = range(1, _DEEPEST_RANK + 1)
+            right.plot(
+                depth, [recall_at(found, k) for k in depth], label=f"{name}  R@1 {recall_at(found, 1):.3f}", **style
+            )
+        left.set(xlabel="recall of the best answers", ylabel="precision", title="Precision over recall")
+        right.set(xlabel="rank N", ylabel="recall@N", title="A true match among the N best", xlim=(1, _DEEPEST_RANK))
+        right.set_xticks([1, *range(5, _DEEPEST_RANK + 1, 5)])
+        left.set_xlim(0, 1.02)
+        for axes in (left, right):
+            axes.set_ylim(0, 1.02)
+            axes.grid(alpha=0.3)
+            axes.legend(loc="lower left" if axes is left else "lower right", fontsize=8)
+
+
+def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
+    """Write reliability.png and reliability.svg: of answers given with a probability, how many are right.
+
+    Guo et al., On calibration of modern neural networks, ICML 2017, Fig. 1. Below the diagonal is over-confident. The
+    bars beneath say how many answers a point is of.
+    """
+    with drawn(folder, "reliability", 5.5, 5.5) as figure:
+        top, below = figure.subplots(2, 1, height_ratios=(4, 1), sharex=True)
+        top.plot([0, 1], [0, 1], color="0.6", linestyle=":", label="calibrated")
+        for number, (plain_name, one) in enumerate(found.items()):
+            filled, colour = one.count > 0, f"C{number % 10}"
+            top.plot(
+                one.confidence[filled], one.accuracy[filled], marker="o", color=colour,
+                label=f"{as_text(plain_name)}  ECE {one.expected_calibration_error:.3f}, "
+                f"over-confident by {one.overconfidence:+.3f}",
+            )  # fmt: skip
+            width = (one.edges[1] - one.edges[0]) / len(found)
+            below.bar(one.edges[:-1] + number * width, one.count, width, align="edge", color=colour)
+        top.set(ylabel="share of answers that are right", title="Reliability of the probabilities of answers")
+        below.set(xlabel="probability of the best answer", ylabel="answers", xlim=(0, 1.02))
+        below.set_yscale("log")  # of loop detection, most answers are improbable and few are certain
+        below.set_ylim(bottom=0.5)
+        top.set_ylim(0, 1.02)
+        for axes in (top, below):
+            axes.grid(alpha=0.3)
+        top.legend(loc="best", fontsize=8)

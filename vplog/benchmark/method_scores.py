@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
-from vplog.evaluate.calibration import reliability
+from vplog.evaluate.retrieval import reliability
 from vplog.execution.execution import Execution
 from vplog.places.sequence import sequence_rows
 from vplog.stages import ProbableIndex
@@ -26,12 +26,11 @@ if TYPE_CHECKING:
 
     from vplog.benchmark.traversals import Walk
     from vplog.data import Float32s, Floats, Ints, Reference
-    from vplog.evaluate.calibration import Reliability
     from vplog.evaluate.pairs import Pairs
-    from vplog.evaluate.retrieval import Ranks
+    from vplog.evaluate.retrieval import Ranks, Reliability
     from vplog.places import PlaceSettings
     from vplog.places.sequence import SequenceSettings
-    from vplog.stages import PlaceIndex, PlaceState, Recogniser
+    from vplog.stages import PlaceIndex, PlaceState
 
 RELIABILITY_BINS = 10
 """Of probability: with the 200 answers of a short walk a bin holds 20."""
@@ -43,7 +42,6 @@ ANSWERS = 10
 class MethodResult:
     """What one method made of one query walk and one map."""
 
-    state: PlaceState
     scores: Float32s
     """(Q, M), NaN for rows that are no candidates."""
     ranks: Ranks
@@ -78,7 +76,9 @@ def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Ex
     Raises TruthError without a true pair, and whatever the method raises.
     """
     map_walk, query_walk, truth, stops = inputs.map_walk, inputs.query_walk, inputs.truth, inputs.stops
-    state, learn_s = _learn(settings, inputs.references, execution)
+    began = time.process_time()
+    state: Any = settings.learn(inputs.references, execution)
+    learn_s = time.process_time() - began  # of all threads
     places, mining_ms = describe_walk(state, map_walk, "describe map", execution)
     column = state.to_arrow(places)
     places = state.from_arrow(column)
@@ -103,25 +103,17 @@ def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Ex
         "hash": state.hash,
         "settings": settings.model_dump(mode="json"),
     }
-    reliable = (
-        reliability_of(index, queries, stops, ranks, truth, execution) if isinstance(index, ProbableIndex) else None
-    )
+    reliable = by_sequence = None
+    if isinstance(index, ProbableIndex):
+        reliable = reliability_of(index, queries, stops, ranks, truth, execution)
     if reliable is not None:
         figures["calibration"] = reliable.as_json()
-    if (sequence := inputs.sequence) is None:
-        return MethodResult(state, scores, ranks, figures, reliability=reliable)
-    lines = score_table(len(queries), len(index), inputs.scratch, "sequences")
-    match_lines(scores, sequence, stops, lines, execution)
-    by_sequence = retrieval.rank_queries(lines, truth, stops)
-    figures["sequence"] = {**sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
-    return MethodResult(state, scores, ranks, figures, by_sequence, reliable)
-
-
-def _learn(recogniser: Recogniser, references: Sequence[Reference], execution: Execution) -> tuple[PlaceState, float]:
-    """What it learned, and the CPU s that all threads took."""
-    began = time.process_time()
-    state = recogniser.learn(references, execution)
-    return state, time.process_time() - began
+    if inputs.sequence is not None:
+        lines = score_table(len(queries), len(index), inputs.scratch, "sequences")
+        match_lines(scores, inputs.sequence, stops, lines, execution)
+        by_sequence = retrieval.rank_queries(lines, truth, stops)
+        figures["sequence"] = {**inputs.sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
+    return MethodResult(scores, ranks, figures, by_sequence, reliable)
 
 
 def describe_walk(state: PlaceState, walk: Walk, stage: str, execution: Execution) -> tuple[list[Any], Floats]:
@@ -136,31 +128,22 @@ def describe_walk(state: PlaceState, walk: Walk, stage: str, execution: Executio
     return _timed_map(work, len(walk), stage, execution)
 
 
-def search(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, execution: Execution) -> Floats:
+def search(
+    index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, execution: Execution, timed: bool = True
+) -> Floats:
     """Fill `scores` (Q, M), NaN beyond each query's stop; CPU ms (Q,) of a search for the best ANSWERS rows."""
 
     def work(row: int) -> tuple[None, float]:
         stop = int(stops[row])
         began = time.thread_time()
-        index.query(queries[row], ANSWERS, stop)
+        if timed:
+            index.query(queries[row], ANSWERS, stop)
         spent = time.thread_time() - began
         scores[row, :stop] = index.scores(queries[row], stop)
         scores[row, stop:] = np.nan
         return None, 1e3 * spent
 
     return _timed_map(work, len(queries), "search", execution)[1]
-
-
-def score_rows(index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, execution: Execution) -> None:
-    """Fill `scores` (Q, M), NaN beyond each query's stop, without timing a search."""
-
-    def work(row: int) -> None:
-        stop = int(stops[row])
-        scores[row, :stop] = index.scores(queries[row], stop)
-        scores[row, stop:] = np.nan
-
-    for _ in execution.map(work, range(len(queries))):
-        pass
 
 
 def reliability_of(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING
 
-from vplog.cli.options import at_least, at_least_one, local, pipeline_of, place, positive, topics_of
-from vplog.cli.printing import Progress, print_comparison, print_json, print_result, print_study
+from vplog.cli.options import at_least, at_least_one, local, option, pipeline_of, place, positive, topics_of
+from vplog.cli.printing import Progress, print_comparison, print_result, print_study
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def compare(arguments: argparse.Namespace) -> None:
 def study(arguments: argparse.Namespace) -> None:
     """Run the paper's experiments on two or more drives of one route, or on one that revisits places."""
     from vplog.benchmark.recogniser_specs import split_methods
-    from vplog.benchmark.study.study import METHODS, StudyOptions
+    from vplog.benchmark.study.experiments import METHODS, StudyOptions
     from vplog.benchmark.study.study import study as run_study
 
     with Progress(arguments) as progress:
@@ -55,10 +56,7 @@ def study(arguments: argparse.Namespace) -> None:
             ),
             Execution(arguments.threads, progress),
         )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print_study(arguments.output, found)
+    print_result(arguments, found, partial(print_study, arguments.output))
 
 
 def _truth(arguments: argparse.Namespace) -> TruthChoice:
@@ -80,48 +78,36 @@ def add_studies(
 
 def _truth_options() -> argparse.ArgumentParser:
     sub = argparse.ArgumentParser(add_help=False)
-    sub.add_argument(
-        "--truth",
-        required=True,
-        metavar="FILE.csv|index|FILE.tum[,MAPFILE.tum]|poses|gps",
-        help="pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS",
-    )
-    sub.add_argument("--tolerance", type=at_least(0), metavar="N", help="index: frames either side (default: 0)")
-    sub.add_argument("--distance-m", type=positive, metavar="M", help="poses, gps: same place within (default: 6)")
-    sub.add_argument("--heading-deg", type=positive, metavar="DEG", help="poses: and turned by at most (default: 45)")
-    sub.add_argument(
-        "--min-gap", type=at_least_one, metavar="N", help="a drive against itself: matches are N frames older or more"
-    )
-    sub.add_argument("--library-size", type=at_least_one, default=100, metavar="L", help="its images (default: 100)")
+    text = "pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS"
+    option(sub, "--truth", str, "FILE.csv|index|FILE.tum[,MAPFILE.tum]|poses|gps", text, required=True)
+    option(sub, "--tolerance", at_least(0), "N", "index: frames either side (default: 0)")
+    option(sub, "--distance-m", positive, "M", "poses, gps: same place within (default: 6)")
+    option(sub, "--heading-deg", positive, "DEG", "poses: and turned by at most (default: 45)")
+    option(sub, "--min-gap", at_least_one, "N", "a drive against itself: matches are N frames older or more")
+    option(sub, "--library-size", at_least_one, "L", "its images (default: 100)", default=100)
     return sub
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("query", type=place, metavar="QUERY", help="drive whose frames are recognised")
-    sub.add_argument("map", type=place, nargs="?", metavar="MAP", help="drive that is searched (default: QUERY)")
-    sub.add_argument(
-        "--methods", required=True, metavar="A,B", help="recognisers or pipelines, each with :setting=value as needed"
-    )
-    sub.add_argument("--sequence", type=at_least_one, metavar="L", help="also match sequences of L frames")
-    sub.add_argument("--library", type=place, metavar="LOG|LIB", help="reference images for all methods (default: MAP)")
-    sub.add_argument("--library-seed", type=at_least(0), default=0, metavar="S", help="of that choice (default: 0)")
-    sub.add_argument("-o", "--output", type=local, metavar="OUT", help="folder for compare.json, scores and curves")
+    option(sub, "query", place, "QUERY", "drive whose frames are recognised")
+    option(sub, "map", place, "MAP", "drive that is searched (default: QUERY)", nargs="?")
+    text = "recognisers or pipelines, each with :setting=value as needed"
+    option(sub, "--methods", str, "A,B", text, required=True)
+    option(sub, "--sequence", at_least_one, "L", "also match sequences of L frames")
+    option(sub, "--library", place, "LOG|LIB", "reference images for all methods (default: MAP)")
+    option(sub, "--library-seed", at_least(0), "S", "of that choice (default: 0)", default=0)
+    option(sub, "-o --output", local, "OUT", "folder for compare.json, scores and curves")
 
 
 def _add_study(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="drives, each query and map in turn")
-    sub.add_argument("--methods", metavar="A,B", help="recognisers as in compare (default: all those of the paper)")
-    sub.add_argument(
-        "--sizes", type=_counts, default=(10, 20, 50, 100), metavar="L,L", help="library sizes (default: 10,20,50,100)"
-    )
-    sub.add_argument("--seeds", type=at_least_one, default=3, metavar="N", help="libraries per figure (default: 3)")
-    sub.add_argument(
-        "--only", type=lambda text: text.split(","), metavar="E,E",
-        help="pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)",
-    )  # fmt: skip
-    sub.add_argument(
-        "-o", "--output", type=place, required=True, metavar="OUT", help="folder for study.json and the figures"
-    )
+    option(sub, "logs", place, "LOG", "drives, each query and map in turn", nargs="+")
+    option(sub, "--methods", str, "A,B", "recognisers as in compare (default: all those of the paper)")
+    sizes = (10, 20, 50, 100)
+    option(sub, "--sizes", _counts, "L,L", "library sizes (default: 10,20,50,100)", default=sizes)
+    option(sub, "--seeds", at_least_one, "N", "libraries per figure (default: 3)", default=3)
+    text = "pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)"
+    option(sub, "--only", lambda text: text.split(","), "E,E", text)
+    option(sub, "-o --output", place, "OUT", "folder for study.json and the figures", required=True)
 
 
 def _counts(text: str) -> tuple[int, ...]:

@@ -19,14 +19,16 @@ from vplog.cli.benchmark import add_studies
 from vplog.cli.maps import add_maps
 from vplog.cli.options import (
     at_least_one,
+    flag,
     local,
     local_file,
+    option,
     pipeline_of,
     place,
     settings_options,
     topic_options,
     topics_of,
-)
+)  # fmt: skip
 from vplog.cli.parser import Parser
 from vplog.cli.printing import (
     Progress,
@@ -35,10 +37,11 @@ from vplog.cli.printing import (
     print_joint,
     print_json,
     print_line,
+    print_result,
     print_run,
     say,
     warn,
-)
+)  # fmt: skip
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, was_interrupted
 from vplog.execution.cores import available, limited
@@ -163,7 +166,7 @@ def info(arguments: argparse.Namespace) -> None:
 
     found = preflight(arguments.log, topics_of(arguments))
     if arguments.html is not None:
-        from vplog.verbs.info_page import write_page
+        from vplog.verbs.info import write_page
 
         write_page(arguments.html, found)
     record = found.record
@@ -247,10 +250,7 @@ def config(arguments: argparse.Namespace) -> None:
     import yaml
 
     tree = pipeline_of(arguments).model_dump(mode="json")
-    if arguments.json:
-        print_json(tree)
-    else:
-        print(yaml.safe_dump(tree, sort_keys=False), end="")
+    print_result(arguments, tree, lambda tree: print(yaml.safe_dump(tree, sort_keys=False), end=""))
 
 
 def schemas(arguments: argparse.Namespace) -> None:
@@ -260,10 +260,7 @@ def schemas(arguments: argparse.Namespace) -> None:
 
     _folder(arguments.output)
     written = [str(path) for path in write_schemas(arguments.output, pipeline_schema())]
-    if arguments.json:
-        print_json({"written": written})
-    else:
-        print("\n".join(written))
+    print_result(arguments, {"written": written}, lambda found: print("\n".join(found["written"])))
 
 
 def _folder(path: Path) -> None:
@@ -300,13 +297,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="vplog", description=(vplog.__doc__ or "").splitlines()[0])
     parser.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--json", action="store_true", help="print one JSON object")
-    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    flag(common, "--json", "print one JSON object")
+    flag(common, "--debug", "show the traceback of an error")
     topics = topic_options()
     threads = argparse.ArgumentParser(add_help=False)
-    threads.add_argument(
-        "--threads", type=at_least_one, default=available(), metavar="N", help="threads (default: all cores)"
-    )
+    option(threads, "--threads", at_least_one, "N", "threads (default: all cores)", default=available())
     settings = settings_options("default", "default")
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
@@ -320,11 +315,11 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     def output(sub: argparse.ArgumentParser, text: str) -> None:
-        sub.add_argument("-o", "--output", type=place, required=True, metavar="OUT", help=text)
+        option(sub, "-o --output", place, "OUT", text, required=True)
 
     _add_info(add("info", info, topics))
     sub = add("library", library, topics, threads, settings)
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG")
+    option(sub, "logs", place, "LOG", nargs="+")
     output(sub, "folder of the library")
     _add_force(sub, "library")
     sub = add("run", run, topics, threads, settings)
@@ -337,9 +332,7 @@ def _parser() -> argparse.ArgumentParser:
     output(sub, "folder of the drive and the run")
     _add_force(sub)
     sub = add("schemas", schemas)
-    sub.add_argument(
-        "-o", "--output", type=local, default=Path("schemas"), metavar="OUT", help="folder (default: schemas)"
-    )
+    option(sub, "-o --output", local, "OUT", "folder (default: schemas)", default=Path("schemas"))
     add("config", config, settings)
     sub = group("help", "Show what a verb does, and all its options.")
     sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
@@ -348,25 +341,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_info(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("log", type=place, metavar="LOG")
-    text = "print one line; exit status 1 if a run would fail"
-    sub.add_argument("--check", action="store_true", help=text)
-    text = "also write an HTML page with pictures of the drive"
-    sub.add_argument("--html", type=local_file, metavar="FILE.html", help=text)
+    option(sub, "log", place, "LOG")
+    flag(sub, "--check", "print one line; exit status 1 if a run would fail")
+    option(sub, "--html", local_file, "FILE.html", "also write an HTML page with pictures of the drive")
 
 
 def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:
-    sub.add_argument("--force", action="store_true", help=f"replace the {what} of another log in OUT")
+    flag(sub, "--force", f"replace the {what} of another log in OUT")
 
 
 def _add_run(sub: argparse.ArgumentParser) -> None:
     sub.set_defaults(refuse=sub.error)
-    sub.add_argument("logs", type=place, nargs="*", metavar="LOG")
-    sub.add_argument("--library", type=place, metavar="LIB", help="reference library (default: made from the drive)")
-    sub.add_argument("--one-drive", action="store_true", help="the logs are the parts of one recording")
-    sub.add_argument("--gps", action="store_true", help="use the log's satellite fixes as constraints")
-    sub.add_argument("--resume", action="store_true", help="continue the interrupted run in OUT; needs no LOG")
+    option(sub, "logs", place, "LOG", nargs="*")
+    option(sub, "--library", place, "LIB", "reference library (default: made from the drive)")
+    flag(sub, "--one-drive", "the logs are the parts of one recording")
+    flag(sub, "--gps", "use the log's satellite fixes as constraints")
+    flag(sub, "--resume", "continue the interrupted run in OUT; needs no LOG")
     _add_force(sub)
-    sub.add_argument(
-        "--no-cache", dest="cache", action="store_false", help="do not cache results of stages in OUT for later runs"
-    )
+    flag(sub, "--no-cache", "do not cache results of stages in OUT for later runs", "cache")

@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog import api
+from vplog.cli import printing
 from vplog.cli.options import (
     at_least,
     at_least_one,
+    flag,
     local,
     local_file,
     not_negative,
+    option,
     place,
     settings_options,
     topics_of,
-)
-from vplog.cli.printing import (
-    Progress,
-    print_answers,
-    print_batch,
-    print_export,
-    print_joined,
-    print_json,
-    print_line,
-    print_map,
-    print_merge,
-    print_redescribed,
-    print_result,
-    warn,
-)
+)  # fmt: skip
+from vplog.cli.printing import Progress, print_result
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
+
+    Verb = Callable[[argparse.Namespace], None]
 
 
 def export_map(arguments: argparse.Namespace) -> None:
@@ -46,7 +37,7 @@ def export_map(arguments: argparse.Namespace) -> None:
         found = write_map(
             arguments.sources, arguments.output, arguments.drive, arguments.box, arguments.format, progress
         )
-    print_result(arguments, found, print_export)
+    print_result(arguments, found, printing.print_export)
 
 
 def merge_maps(arguments: argparse.Namespace) -> None:
@@ -55,7 +46,7 @@ def merge_maps(arguments: argparse.Namespace) -> None:
 
     with Progress(arguments) as progress:
         found = merge(arguments.maps, arguments.target, progress, arguments.drive)
-    print_result(arguments, found, print_merge)
+    print_result(arguments, found, printing.print_merge)
 
 
 def join_map(arguments: argparse.Namespace) -> None:
@@ -64,22 +55,14 @@ def join_map(arguments: argparse.Namespace) -> None:
 
     with Progress(arguments) as progress:
         found = join(arguments.map, arguments.threads, progress)
-    print_result(arguments, found, print_joined)
+    print_result(arguments, found, printing.print_joined)
 
 
 def remove_drives(arguments: argparse.Namespace) -> None:
     """Remove drives from a map."""
     from vplog.maps.remove import remove_drives as remove
 
-    found = remove(arguments.map, arguments.drives)
-    if arguments.json:
-        print_json(found)
-    else:
-        print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
-        if found["still_joined"]:
-            print_line("to solve", f"{', '.join(found['still_joined'])} were joined with what is removed")
-            print(f"next      vplog map join {shlex.quote(str(found['map']))}")
-        warn(found["warnings"])
+    print_result(arguments, remove(arguments.map, arguments.drives), printing.print_removed)
 
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
@@ -92,7 +75,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
             engine=arguments.engine, address=arguments.address, retries=arguments.retries, processes=processes,
         )  # fmt: skip
     wrong = f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}."
-    _end(arguments, found, print_redescribed, wrong)
+    _end(arguments, found, printing.print_redescribed, wrong)
 
 
 def batch(arguments: argparse.Namespace) -> None:
@@ -105,7 +88,7 @@ def batch(arguments: argparse.Namespace) -> None:
             progress=progress, tell=progress.tell_drive,
         )  # fmt: skip
     wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
-    _end(arguments, found, print_batch, wrong)
+    _end(arguments, found, printing.print_batch, wrong)
 
 
 def _end(
@@ -130,7 +113,7 @@ def info_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.info import describe_map
 
     found = describe_map(arguments.map, check=arguments.check)
-    print_result(arguments, found, print_map)
+    print_result(arguments, found, printing.print_map)
     if wrong := found["damaged_files"]:
         raise ResultError(
             f"{len(wrong)} damaged files in {arguments.map}: vplog batch LOG -o MAP computes drives again."
@@ -145,7 +128,7 @@ def query_map(arguments: argparse.Namespace) -> None:
             out=arguments.output, engine=arguments.engine, address=arguments.address, cache=arguments.cache,
             cache_gb=arguments.cache_gb, threads=arguments.threads, progress=progress,
         )  # fmt: skip
-    print_result(arguments, found.record, print_answers)
+    print_result(arguments, found.record, printing.print_answers)
 
 
 def index_map(arguments: argparse.Namespace) -> None:
@@ -156,14 +139,7 @@ def index_map(arguments: argparse.Namespace) -> None:
     cache = None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)
     with Progress(arguments) as progress:
         found = update(arguments.map, arguments.threads, progress, cache)
-    if arguments.json:
-        print_json(found)
-    else:
-        print(
-            f"{found['map']}: {found['places']} places of {len(found['drives'])} drives in {len(found['segments'])} "
-            f"files, {found['bytes'] / 1e6:.1f} MB"
-        )
-        warn(found["warnings"])
+    print_result(arguments, found, printing.print_index)
 
 
 def add_maps(
@@ -174,76 +150,57 @@ def add_maps(
     _add_batch(add("batch", batch, topics, threads, settings_options(None, "that of the map, else default")))
     text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
-    sub = maps.add_parser("info", help="what a map holds", description=info_map.__doc__, parents=[common])
-    sub.set_defaults(verb=info_map)
-    sub.add_argument("map", type=place, metavar="MAP")
-    text = "check every file against its sha256; a line for each damaged one, and exit status 1"
-    sub.add_argument("--check", action="store_true", help=text)
-    text = "find where a log's views are in a map"
-    sub = maps.add_parser("query", help=text, description=query_map.__doc__, parents=[common, topics, threads])
-    sub.set_defaults(verb=query_map)
-    sub.add_argument("map", type=place, metavar="MAP")
-    sub.add_argument("log", type=place, metavar="LOG")
-    sub.add_argument("--top", type=at_least_one, default=10, metavar="K", help="places for each view (default: 10)")
-    sub.add_argument(
-        "--sequence", type=at_least_one, metavar="L", help="views in a window, odd; 1: none (default: as the map's)"
-    )
-    sub.add_argument("-o", "--output", type=local_file, metavar="FILE.parquet", help="write the answers")
+
+    def verb(name: str, run: Verb, text: str, *parents: argparse.ArgumentParser, of_map: bool = True) -> Any:
+        sub = maps.add_parser(name, help=text, description=run.__doc__, parents=[common, *parents])
+        sub.set_defaults(verb=run)
+        if of_map:
+            option(sub, "map", place, "MAP")
+        return sub
+
+    sub = verb("info", info_map, "what a map holds")
+    flag(sub, "--check", "check every file against its sha256; a line for each damaged one, and exit status 1")
+    _add_query(verb("query", query_map, "find where a log's views are in a map", topics, threads))
+    _add_cache(verb("index", index_map, "build the index that queries search", threads))
+    _add_export(verb("export", export_map, "the places of a map or of runs, in one file", of_map=False))
+    sub = verb("merge", merge_maps, "copy drives of maps into another map", of_map=False)
+    option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
+    option(sub, "--drive", str, "ID", "only this drive; repeatable", action="append", default=[])
+    option(sub, "-o --target", place, "MAP", "target map", required=True)
+    verb("join", join_map, "find closures between the drives of a map and solve them together", threads)
+    sub = verb("remove", remove_drives, "remove drives")
+    option(sub, "drives", str, "DRIVE", "as `map info` names them", nargs="+")
+    sub = verb("redescribe", redescribe_map, "describe the drives of a map with another library", threads)
+    option(sub, "--library", place, "LIB|LOG", "the library, or a log to make one from", required=True)
+    option(sub, "-o --target", place, "MAP2", "the new map", required=True)
+    _add_workers(sub)
+
+
+def _add_query(sub: argparse.ArgumentParser) -> None:
+    option(sub, "log", place, "LOG")
+    option(sub, "--top", at_least_one, "K", "places for each view (default: 10)", default=10)
+    option(sub, "--sequence", at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
+    option(sub, "-o --output", local_file, "FILE.parquet", "write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
-    sub.add_argument("--address", metavar="HOST:PORT", help="Ray cluster (default: one of this machine's cores)")
+    option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
     _add_cache(sub)
-    text = "build the index that queries search"
-    sub = maps.add_parser("index", help=text, description=index_map.__doc__, parents=[common, threads])
-    sub.set_defaults(verb=index_map)
-    sub.add_argument("map", type=place, metavar="MAP")
-    _add_cache(sub)
-    _add_export(maps, common)
-    text = "copy drives of maps into another map"
-    sub = maps.add_parser("merge", help=text, description=merge_maps.__doc__, parents=[common])
-    sub.set_defaults(verb=merge_maps)
-    sub.add_argument(
-        "maps", type=place, nargs="+", metavar="MAP|FILE.parquet", help="maps, or places that `map export` wrote"
-    )
-    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="only this drive; repeatable")
-    sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP", help="target map")
-    text = "find closures between the drives of a map and solve them together"
-    sub = maps.add_parser("join", help=text, description=join_map.__doc__, parents=[common, threads])
-    sub.set_defaults(verb=join_map)
-    sub.add_argument("map", type=place, metavar="MAP")
-    sub = maps.add_parser("remove", help="remove drives", description=remove_drives.__doc__, parents=[common])
-    sub.set_defaults(verb=remove_drives)
-    sub.add_argument("map", type=place, metavar="MAP")
-    sub.add_argument("drives", nargs="+", metavar="DRIVE", help="as `map info` names them")
-    text = "describe the drives of a map with another library"
-    sub = maps.add_parser("redescribe", help=text, description=redescribe_map.__doc__, parents=[common, threads])
-    sub.set_defaults(verb=redescribe_map)
-    sub.add_argument("map", type=place, metavar="MAP")
-    text = "the library, or a log to make one from"
-    sub.add_argument("--library", type=place, required=True, metavar="LIB|LOG", help=text)
-    sub.add_argument("-o", "--target", type=place, required=True, metavar="MAP2", help="the new map")
-    _add_workers(sub)
 
 
 def _add_cache(sub: argparse.ArgumentParser) -> None:
     text = "folder that caches what is read of a map by URL (default: $VPLOG_CACHE, else ~/.cache/vplog)"
-    sub.add_argument("--cache", type=local, metavar="DIR", help=text)
+    option(sub, "--cache", local, "DIR", text)
     text = "largest size of the cache in GB; least recently used files go first, 0 keeps none (default: 20)"
-    sub.add_argument("--cache-gb", type=not_negative, metavar="GB", help=text)
+    option(sub, "--cache-gb", not_negative, "GB", text)
 
 
-def _add_export(maps: argparse._SubParsersAction[argparse.ArgumentParser], common: argparse.ArgumentParser) -> None:
-    text = "the places of a map or of runs, in one file"
-    sub = maps.add_parser("export", help=text, description=export_map.__doc__, parents=[common])
-    sub.set_defaults(verb=export_map)
-    sub.add_argument("sources", type=place, nargs="+", metavar="MAP|RUN")
-    sub.add_argument("--drive", action="append", default=[], metavar="ID", help="only this drive; repeatable")
-    sub.add_argument(
-        "--box", type=_box, metavar="LAT0,LON0,LAT1,LON1",
-        help="only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)",
-    )  # fmt: skip
+def _add_export(sub: argparse.ArgumentParser) -> None:
+    option(sub, "sources", place, "MAP|RUN", nargs="+")
+    option(sub, "--drive", str, "ID", "only this drive; repeatable", action="append", default=[])
+    text = "only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)"
+    option(sub, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
-    sub.add_argument("-o", "--output", type=local_file, required=True, metavar="FILE.parquet", help="file to write")
+    option(sub, "-o --output", local_file, "FILE.parquet", "file to write", required=True)
 
 
 def _box(text: str) -> tuple[float, float, float, float]:
@@ -261,22 +218,20 @@ def _box(text: str) -> tuple[float, float, float, float]:
 def _add_workers(sub: argparse.ArgumentParser) -> None:
     """Who computes drives."""
     text = "drives at once (default: 1; over Ray as many as the cluster has cores for)"
-    sub.add_argument("--jobs", type=at_least_one, metavar="N", help=text)
+    option(sub, "--jobs", at_least_one, "N", text)
     text = "processes of this machine, or tasks of a Ray cluster (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     text = "HOST:PORT of a Ray cluster, or auto (default: one on this machine for the time of the batch)"
-    sub.add_argument("--address", metavar="HOST:PORT", help=text)
+    option(sub, "--address", str, "HOST:PORT", text)
     text = "retries of a drive whose worker was killed or had an I/O error (default: 2)"
-    sub.add_argument("--retries", type=at_least(0), default=2, metavar="N", help=text)
+    option(sub, "--retries", at_least(0), "N", text, default=2)
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("logs", type=place, nargs="+", metavar="LOG", help="one drive each")
-    sub.add_argument("-o", "--map", type=place, required=True, metavar="MAP", help="folder, s3:// or gs:// of the map")
+    option(sub, "logs", place, "LOG", "one drive each", nargs="+")
+    option(sub, "-o --map", place, "MAP", "folder, s3:// or gs:// of the map", required=True)
     _add_workers(sub)
-    text = "do not look for closures between the drives at the end"
-    sub.add_argument("--no-join", dest="join", action="store_false", help=text)
+    flag(sub, "--no-join", "do not look for closures between the drives at the end", "join")
     text = "cache results of stages, 0.35 MB a keyframe, so that other settings read no images; local maps only"
-    sub.add_argument("--keep-cache", action="store_true", help=text)
-    text = "reference library (default: the map's, else one of the first logs)"
-    sub.add_argument("--library", type=place, metavar="LIB", help=text)
+    flag(sub, "--keep-cache", text)
+    option(sub, "--library", place, "LIB", "reference library (default: the map's, else one of the first logs)")

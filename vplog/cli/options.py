@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vplog.errors import VplogError
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
 STDOUT = Path("-")
+_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps")
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -57,6 +58,25 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
+def option(
+    sub: argparse.ArgumentParser,
+    names: str,
+    kind: Callable[[str], Any],
+    metavar: str,
+    text: str | None = None,
+    **more: Any,
+) -> None:
+    """An option, or an argument, that takes a value."""
+    sub.add_argument(*names.split(), type=kind, metavar=metavar, help=text, **more)
+
+
+def flag(sub: argparse.ArgumentParser, name: str, text: str, dest: str | None = None) -> None:
+    """An option without a value; with `dest` it switches that off."""
+    sub.add_argument(
+        name, action="store_false" if dest else "store_true", dest=dest or name[2:].replace("-", "_"), help=text
+    )
+
+
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     from vplog.pipeline import load_pipeline
 
@@ -66,36 +86,25 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
 def topics_of(arguments: argparse.Namespace) -> TopicChoice:
     from vplog.logs import TopicChoice
 
-    return TopicChoice(
-        image=arguments.image_topic,
-        depth=arguments.depth_topic,
-        right=arguments.right_topic,
-        camera_info=arguments.camera_info_topic,
-        odometry=arguments.odometry_topic,
-        gps=arguments.gps_topic,
-        odometry_file=arguments.odometry_file,
-        calibration_file=arguments.calibration_file,
-    )
+    chosen = {role.replace("-", "_"): getattr(arguments, f"{role.replace('-', '_')}_topic") for role in _ROLES}
+    return TopicChoice(**chosen, odometry_file=arguments.odometry_file, calibration_file=arguments.calibration_file)
 
 
 def topic_options() -> argparse.ArgumentParser:
     topics = argparse.ArgumentParser(add_help=False)
-    for role in ("image", "depth", "right", "camera-info", "odometry", "gps"):
-        topics.add_argument(f"--{role}-topic", metavar="TOPIC", help=f"use this {role} topic")
-    topics.add_argument("--odometry-file", type=resolved, metavar="FILE.tum", help="use these poses as the odometry")
-    topics.add_argument(
-        "--calibration", type=resolved, metavar="FILE.yaml", dest="calibration_file",
-        help="camera_info YAML, Kalibr camchain or EuRoC sensor.yaml",
-    )  # fmt: skip
+    for role in _ROLES:
+        option(topics, f"--{role}-topic", str, "TOPIC", f"use this {role} topic")
+    option(topics, "--odometry-file", resolved, "FILE.tum", "use these poses as the odometry")
+    text = "camera_info YAML, Kalibr camchain or EuRoC sensor.yaml"
+    option(topics, "--calibration", resolved, "FILE.yaml", text, dest="calibration_file")
     return topics
 
 
 def settings_options(unless_given: str | None, called: str) -> argparse.ArgumentParser:
     """`--pipeline`, with what it is unless given, and what help calls that; and `--set`."""
     settings = argparse.ArgumentParser(add_help=False)
-    text = f"shipped name or .yaml file (default: {called})"
-    settings.add_argument("--pipeline", default=unless_given, metavar="P", help=text)
-    settings.add_argument("--set", action="append", default=[], metavar="A.B=C", help="change one setting; repeatable")
+    option(settings, "--pipeline", str, "P", f"shipped name or .yaml file (default: {called})", default=unless_given)
+    option(settings, "--set", str, "A.B=C", "change one setting; repeatable", action="append", default=[])
     return settings
 
 

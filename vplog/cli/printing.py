@@ -225,14 +225,8 @@ def _print_lines(label: str, lines: list[str]) -> None:
 
 def print_explanation(told: dict[str, Any]) -> None:
     print(f"closure {told['closure']} of {told['run']}")
-    for name, text in (
-        ("verdict", told["verdict"]),
-        ("proposed", told["proposed"]),
-        ("geometry", told["geometry"]),
-        ("solver", told["solver"]),
-        ("to change", told["change"]),
-    ):
-        print_line(name, text)
+    for name in ("verdict", "proposed", "geometry", "solver", "change"):
+        print_line("to change" if name == "change" else name, told[name])
     if told["picture"]:
         print(f"{'picture':10}{told['picture']['file']}")
 
@@ -334,6 +328,20 @@ def print_merge(found: dict[str, Any]) -> None:
     print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
     if any(one["state"] == "taken" for one in found["drives"]):
         print(f"next      vplog map join {shlex.quote(str(found['map']))}")
+
+
+def print_removed(found: dict[str, Any]) -> None:
+    print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
+    if found["still_joined"]:
+        print_line("to solve", f"{', '.join(found['still_joined'])} were joined with what is removed")
+        print(f"next      vplog map join {shlex.quote(str(found['map']))}")
+    warn(found["warnings"])
+
+
+def print_index(found: dict[str, Any]) -> None:
+    places = f"{found['places']} places of {len(found['drives'])} drives in {len(found['segments'])} files"
+    print(f"{found['map']}: {places}, {found['bytes'] / 1e6:.1f} MB")
+    warn(found["warnings"])
 
 
 def print_redescribed(found: dict[str, Any]) -> None:

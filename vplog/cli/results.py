@@ -6,9 +6,9 @@ import argparse
 import re
 import sys
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vplog.cli.options import STDOUT, local_file, local_file_or_stdout, place, positive, topics_of
+from vplog.cli.options import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
 from vplog.cli.printing import print_evaluation, print_explanation, print_json, print_optimised, print_result
 from vplog.execution.execution import Execution
 
@@ -92,12 +92,10 @@ def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
 
 
 def _add_truth_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--distance-m", type=positive, metavar="M", help="largest distance within one place (default: 6)")
-    sub.add_argument(
-        "--heading-deg", type=positive, metavar="DEG", help="largest angle between optical axes (default: 45)"
-    )
+    option(sub, "--distance-m", positive, "M", "largest distance within one place (default: 6)")
+    option(sub, "--heading-deg", positive, "DEG", "largest angle between optical axes (default: 45)")
     sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
-    sub.add_argument("--truth-offset-s", type=_seconds, metavar="S", help="add to the truth's stamps (default: 0)")
+    option(sub, "--truth-offset-s", _seconds, "S", "add to the truth's stamps (default: 0)")
 
 
 @contextmanager
@@ -123,41 +121,35 @@ def add_results(
     add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
 ) -> None:
     sub = add("evaluate", evaluate, topics)
-    sub.add_argument("run", type=place, metavar="RUN")
-    sub.add_argument("--truth", required=True, metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    option(sub, "run", place, "RUN")
+    option(sub, "--truth", str, "FILE.tum|gps", "TUM file, or the log's own GPS", required=True)
     _add_truth_options(sub)
     _add_explain(add("explain", explain))
     sub = add("report", report, topics, threads)
-    sub.add_argument("run", type=place, metavar="RUN")
-    sub.add_argument("--truth", metavar="FILE.tum|gps", help="TUM file, or the log's own GPS")
+    option(sub, "run", place, "RUN")
+    option(sub, "--truth", str, "FILE.tum|gps", "TUM file, or the log's own GPS")
     _add_truth_options(sub)
-    sub.add_argument("--log", type=place, metavar="LOG", help="log of the run, for pictures that result.mcap lacks")
-    sub.add_argument("-o", "--output", type=local_file, metavar="FILE.html", help="page (default: RUN/report.html)")
+    option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
+    option(sub, "-o --output", local_file, "FILE.html", "page (default: RUN/report.html)")
     sub = add("export", export)
-    sub.add_argument("run", type=place, metavar="RUN")
+    option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    text = "file to write; - is stdout"
-    sub.add_argument("-o", "--output", type=local_file_or_stdout, required=True, metavar="FILE", help=text)
+    option(sub, "-o --output", local_file_or_stdout, "FILE", "file to write; - is stdout", required=True)
     sub = add("optimize", optimize)
-    sub.add_argument("graph", type=local_file, metavar="GRAPH.g2o")
-    sub.add_argument(
-        "-o", "--output", type=place, required=True, metavar="OUT", help="the graph at its solved poses, as g2o"
-    )
+    option(sub, "graph", local_file, "GRAPH.g2o")
+    option(sub, "-o --output", place, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
 
 
 def _add_explain(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("run", type=place, metavar="RUN")
-    which = sub.add_mutually_exclusive_group(required=True)
-    which.add_argument(
-        "--closure", type=_closure, metavar="K|QUERY:MATCH",
-        help="row of closures.parquet, or its two keyframes, by row or by stamp in ns",
-    )  # fmt: skip
-    which.add_argument("--worst", action="store_true", help="the closure that the solved trajectory is furthest from")
-    text = "picture, .png or .svg (default: RUN/closure-K.png)"
-    sub.add_argument("-o", "--output", type=local_file, metavar="PICTURE.png", help=text)
-    sub.add_argument("--log", type=place, metavar="LOG", help="the run's log, where it has moved since")
-    sub.add_argument("--no-picture", action="store_true", help="no picture; the log is not needed")
+    option(sub, "run", place, "RUN")
+    which: Any = sub.add_mutually_exclusive_group(required=True)
+    text = "row of closures.parquet, or its two keyframes, by row or by stamp in ns"
+    option(which, "--closure", _closure, "K|QUERY:MATCH", text)
+    flag(which, "--worst", "the closure that the solved trajectory is furthest from")
+    option(sub, "-o --output", local_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
+    option(sub, "--log", place, "LOG", "the run's log, where it has moved since")
+    flag(sub, "--no-picture", "no picture; the log is not needed")
 
 
 def _seconds(text: str) -> float:

@@ -16,6 +16,7 @@ from vplog.errors import TruthError
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
+from vplog.evaluate.retrieval import Curve, average_precision, recall_at_full_precision
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
@@ -130,10 +131,9 @@ def judge_closures(
     axes = [
         optical_axis(camera, at.world_from_body[at.known]) for camera, at in zip(cameras, (query, match), strict=True)
     ]
-    heading = _heading_deg(here, there, *axes) if oriented else np.zeros(len(rows))
-    at_place, opposite = np.zeros(len(closures), bool), np.zeros(len(closures), bool)
-    at_place[rows] = (distance <= place.distance_m) & (heading <= place.heading_deg)
-    opposite[rows] = (distance <= place.distance_m) & (heading > _OPPOSITE_DEG)
+    heading, near = _heading_deg(here, there, *axes) * oriented, distance <= place.distance_m
+    at_place, opposite = np.zeros((2, len(closures)), bool)
+    at_place[rows], opposite[rows] = near & (heading <= place.heading_deg), near & (heading > _OPPOSITE_DEG)
     posed, right, wrong, overconfident = np.array(pose_errors(closures, query, match, bounds, cameras)) & oriented
     by_place = known & ~posed
     right, wrong = right | by_place & at_place, wrong | by_place & ~at_place
@@ -189,7 +189,7 @@ def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion)
         "same_place": int((accepted & judged.at_place).sum()),
         "place_precision": _share((accepted & judged.at_place).sum(), here.sum()),
         "opposite": int((accepted & judged.opposite).sum()),
-        "criterion": {**asdict(judged.bounds), **asdict(place)},
+        "criterion": asdict(judged.bounds) | {"distance_m": place.distance_m, "heading_deg": place.heading_deg},
     }
 
 
@@ -233,19 +233,12 @@ def _score(
     found = found[revisit[found]]
     by_score, by_inliers = (_area(judged.curves.get(name), bool(revisit.any())) for name in ("score", "inliers"))
     return ClosureScore(
-        keyframes=int(covered.sum()),
-        outside=int((~covered).sum()),
-        **count_closures(closures, judged, place),
-        revisits=int(revisit.sum()),
-        revisits_found=len(found),
-        recall=_share(len(found), revisit.sum()),
-        directions=int(direction.sum()),
-        directions_true=int((direction & judged.right).sum()),
-        average_precision=by_score[0],
-        recall_at_full_precision=by_score[1],
-        average_precision_by_inliers=by_inliers[0],
-        recall_at_full_precision_by_inliers=by_inliers[1],
-    )
+        keyframes=int(covered.sum()), outside=int((~covered).sum()), **count_closures(closures, judged, place),
+        revisits=int(revisit.sum()), revisits_found=len(found), recall=_share(len(found), revisit.sum()),
+        directions=int(direction.sum()), directions_true=int((direction & judged.right).sum()),
+        average_precision=by_score[0], recall_at_full_precision=by_score[1],
+        average_precision_by_inliers=by_inliers[0], recall_at_full_precision_by_inliers=by_inliers[1],
+    )  # fmt: skip
 
 
 def _heading_deg(a: Floats, b: Floats, a_axis: Floats | None, b_axis: Floats | None) -> Floats:
@@ -283,9 +276,9 @@ def _area(curve: Floats | None, revisits: bool) -> tuple[float | None, float | N
     """Average precision and the highest recall at precision 1; None without revisits, 0 without candidates."""
     if curve is None:
         return (0.0, 0.0) if revisits else (None, None)
-    recall, precision, _ = curve.T
-    full = recall[precision == 1.0]
-    return float((np.diff(recall, prepend=0.0) * precision).sum()), float(full.max()) if len(full) else 0.0
+    recall, precision, threshold = curve.T
+    whole = Curve(threshold, precision, recall)
+    return average_precision(whole), recall_at_full_precision(whole)
 
 
 def _share(part: Any, whole: Any) -> float | None:

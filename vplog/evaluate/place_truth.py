@@ -11,8 +11,7 @@ import numpy as np
 from vplog.data import Gps, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate import pairs
-from vplog.evaluate.gps import local_enu
-from vplog.evaluate.truth import read_truth
+from vplog.evaluate.truth import local_enu, read_truth
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:

@@ -9,11 +9,10 @@ import numpy as np
 
 from vplog.data import Trajectory
 from vplog.errors import ResultError, TruthError
-from vplog.evaluate import closures, gps, residuals, trajectory
+from vplog.evaluate import closures, residuals, trajectory
 from vplog.evaluate.body_truth import body_truth
 from vplog.evaluate.closure_pose import pose_bounds
-from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
-from vplog.evaluate.truth import read_truth
+from vplog.evaluate.truth import ate_to_gps, read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, run_record, tables
 from vplog.run.provenance import reopened
@@ -29,21 +28,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TruthOptions:
+class TruthOptions(closures.PlaceCriterion):
     """How a run is compared with the truth."""
 
-    distance_m: float = DISTANCE_M
-    """m between frames of one place."""
-    heading_deg: float = HEADING_DEG
-    """Degrees between their optical axes."""
     align: str = "se3"
     """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`."""
     truth_offset_s: float = 0.0
     """s added to the stamps of the truth, as evo's --t_offset."""
-
-    @property
-    def place(self) -> closures.PlaceCriterion:
-        return closures.PlaceCriterion(self.distance_m, self.heading_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +79,7 @@ def evaluate_poses(
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
     camera = _camera(folder)
     of_body = body_truth(known, before, camera)
-    score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options.place, camera)
+    score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, camera)
     found = {
         "truth": shown(truth),
         "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
@@ -155,7 +146,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
             maps.append({"drives": own, "ate_after": asdict(ate)})
     if not drives:
         raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
-    joins = _joins(folder, drives, options.place)
+    joins = _joins(folder, drives, options)
     return {"truth": shown(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
 
 
@@ -190,6 +181,6 @@ def _against_gps(
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     return {
-        "ate_before": asdict(gps.ate_to_gps(before, fixes, options.align)),
-        "ate_after": asdict(gps.ate_to_gps(after, fixes, options.align)),
+        "ate_before": asdict(ate_to_gps(before, fixes, options.align)),
+        "ate_after": asdict(ate_to_gps(after, fixes, options.align)),
     }

@@ -10,14 +10,13 @@ import numpy as np
 from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
-from vplog.features.extraction import extract_frames
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.results import run_record, tables
 from vplog.run.provenance import reopened
 from vplog.stages import BoxState
 from vplog.verbs import explain_text
-from vplog.verbs.explain_figure import Side, View, draw
-from vplog.verbs.report import recorded_pipeline, recorded_places
+from vplog.verbs.explain_figure import View, draw
+from vplog.verbs.report import frames_at, recorded_pipeline, recorded_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,17 +101,10 @@ def _show(
 ) -> dict[str, Any]:  # fmt: skip
     """Read both frames again, look for what they share, and draw it."""
     stamps = np.array([row["match_stamp_ns"], row["query_stamp_ns"]], np.int64)
-    if not np.isin(stamps, log.stamps()).all():
-        raise ResultError(f"{log.name} has no frames of these stamps: is it the log of {folder}? Name it with --log.")
-    sides = []
-    for _, frame, features, why in extract_frames(log.frames(stamps), pipeline.features, Execution()):
-        if frame is None or features is None:
-            raise ResultError(why)
-        sides.append(Side(frame.image, features))
-    match, query = sides
-    agreement = find_agreement(query.features, match.features, row, log.camera(), pipeline.verify)
+    match, query = frames_at(log, stamps, pipeline, f"is it the log of {folder}? Name it with --log.")
+    agreement = find_agreement(query[1], match[1], row, log.camera(), pipeline.verify)
     boxes, missing = _boxes(row, folder, record, pipeline)
-    draw(picture, View(number, row, words, query, match, agreement, boxes, missing))
+    draw(picture, View(number, row, words, query[0], match[0], agreement, boxes, missing))
     return {
         "file": str(picture),
         "matches": len(agreement.agrees),

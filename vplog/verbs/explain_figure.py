@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from vplog.data import Bytes, Features, Floats
+    from vplog.data import Bytes, Floats
     from vplog.figures.closure_view import Agreement, SharedBoxes
     from vplog.verbs.explain_text import Words
 
@@ -36,22 +36,15 @@ _GAP = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
-    """One of the two frames."""
-
-    image: Bytes
-    features: Features
-
-
-@dataclass(frozen=True, eq=False)
 class View:
     """All that the picture shows."""
 
     number: int
     row: dict[str, Any]
     words: Words
-    query: Side
-    match: Side
+    query: Bytes
+    """(H, W) grey."""
+    match: Bytes
     agreement: Agreement
     boxes: list[SharedBoxes]
     missing: str
@@ -60,7 +53,7 @@ class View:
 
 def draw(path: Path, view: View) -> None:
     """Write the picture, a .png or .svg by its name: the same bytes for the same closure."""
-    height, width = view.query.image.shape
+    height, width = view.query.shape
     stacked = width > _WIDE * height
     frames_in = _WIDTH_IN * height / width * (2.0 if stacked else 0.5)
     boxes_in = 0.35 + max((_WIDTH_IN / 4 * b.image.shape[0] / b.image.shape[1] for b in view.boxes), default=-0.35)
@@ -108,16 +101,16 @@ def _caption(view: View) -> str:
 
 def _frames(axes: Axes, view: View, stacked: bool) -> None:
     """Both frames in one coordinate frame, the query's px, so that lines may cross from one to the other."""
-    height, width = view.query.image.shape
-    other_height, other_width = view.match.image.shape
+    height, width = view.query.shape
+    other_height, other_width = view.match.shape
     gap = _GAP * width
     offset = np.array([0.0, height + gap]) if stacked else np.array([width + gap, 0.0])
     whole = offset + np.array([other_width, other_height])
     axes.set_axis_off()
     for side, at, name in ((view.query, np.zeros(2), "query"), (view.match, offset, "match")):
-        high, wide = side.image.shape
+        high, wide = side.shape
         axes.imshow(
-            side.image, cmap="gray", vmin=0, vmax=255, interpolation="antialiased",
+            side, cmap="gray", vmin=0, vmax=255, interpolation="antialiased",
             extent=(at[0], at[0] + wide, at[1] + high, at[1]),
         )  # fmt: skip
         row = view.row
@@ -129,7 +122,7 @@ def _frames(axes: Axes, view: View, stacked: bool) -> None:
     for number, boxes in enumerate(view.boxes):
         # each a little smaller than the one before, so that equal windows are all seen
         for window, side, at in ((boxes.query_window, view.query, 0.0), (boxes.match_window, view.match, offset)):
-            low = _rectangle(axes, window, side.image, at, _COLOURS[number], inset=0.006 * (number + 1))
+            low = _rectangle(axes, window, side, at, _COLOURS[number], inset=0.006 * (number + 1))
             axes.text(low[0] + 0.03 * number * width, low[1], str(boxes.reference), va="bottom", fontsize=8,
                       bbox={"facecolor": _COLOURS[number], "pad": 1.0, "linewidth": 0})  # fmt: skip
 

@@ -11,11 +11,14 @@ import cv2
 import numpy as np
 
 from vplog import logs
-from vplog.errors import LogError
+from vplog.errors import LogError, ResultError
 from vplog.logs.odometry_sources import in_words as evidence_in_words
 from vplog.logs.stamps import rate_hz
+from vplog.results.html import render
+from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.storage.remote_path import address
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,6 +32,8 @@ _SAMPLES = 8
 """Frames that are decoded: enough to see what the drive looks like and whether its images decode throughout."""
 PICTURE_PX = 480
 """px across a picture that is kept: a phone's width, and half of a column on a screen."""
+_QUALITY = 75
+"""JPEG quality: pictures to recognise a place by, of some 20 kB each."""
 _GAP_S = 1.0
 """s without a message that count as a gap, where they are also _GAP_PERIODS of the topic's own."""
 _GAP_PERIODS = 10
@@ -338,3 +343,20 @@ def in_words(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if found["skew_ms"]:
         skews = ", ".join(f"{topic} {skew:.1f}" for topic, skew in found["skew_ms"].items())
         yield "skew", f"log time less header stamp, ms: {skews}"
+
+
+def write_page(path: Path, found: Preflight) -> None:
+    """Raises ResultError where the file cannot be written."""
+    try:
+        with replacing(path) as stream:
+            stream.write(page(found).encode())
+    except OSError as error:
+        raise ResultError(f"Cannot write {path}: {error.strerror}. Choose another with --html.") from None
+
+
+def page(found: Preflight) -> str:
+    """One file, no network, readable on a phone; whatever comes from the log is escaped."""
+    record, start_ns = found.record, found.record["start_ns"]
+    pictures = [(f"{(stamp_ns - start_ns) / 1e9:.1f} s", jpeg(image, _QUALITY)) for stamp_ns, image in found.pictures]
+    name, seconds = record["path"].rstrip("/").rsplit("/", 1)[-1], max(record["end_ns"] - start_ns, 0) / 1e9
+    return render("info.html", record=record, name=name, seconds=seconds, facts=in_words(record), pictures=pictures)

@@ -25,10 +25,12 @@ from vplog.storage.urls import shown
 from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from pyarrow import Array
 
-    from vplog.data import Bytes, Features
-    from vplog.stages import PlaceState
+    from vplog.data import Bytes, Features, Ints
+    from vplog.stages import Log, PlaceState
 
 
 def report(
@@ -97,18 +99,26 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Ex
     rows = choose_examples(closures, settings.closures)
     nodes = np.unique(np.concatenate([closures.query[rows], closures.match[rows]])) if rows else np.zeros(0, np.int32)
     stamps = keyframes.stamp_ns[nodes]
-    if not np.isin(stamps, opened.stamps()).all():
-        raise ResultError(f"{opened.name} has no frames of these stamps: is it the log of {folder}?")
     images: dict[int, Bytes] = {}
     features: dict[int, Features] = {}
-    frames = extract_frames(opened.frames(stamps), pipeline.features, execution)
-    for node, (_, frame, found, why) in zip(nodes.tolist(), frames, strict=True):
-        if frame is None or found is None:
-            raise ResultError(why)
-        images[node], features[node] = shrink(frame.image, settings.megapixels), found
+    found = frames_at(opened, stamps, pipeline, f"is it the log of {folder}?", execution)
+    for node, (image, features[node]) in zip(nodes.tolist(), found, strict=True):
+        images[node] = shrink(image, settings.megapixels)
     places = state.from_arrow(column)
     inputs = ClosureInputs(images.__getitem__, features.__getitem__, opened.camera(), state, places)
     return draw_closures(rows, inputs, closures, pipeline.verify, settings.quality, execution)
+
+
+def frames_at(
+    log: Log, stamps: Ints, pipeline: Pipeline, otherwise: str, execution: Execution = Execution()
+) -> Iterator[tuple[Bytes, Features]]:
+    """Images and features of the frames with these stamps. Raises ResultError where the log lacks one."""
+    if not np.isin(stamps, log.stamps()).all():
+        raise ResultError(f"{log.name} has no frames of these stamps: {otherwise}")
+    for _, frame, features, why in extract_frames(log.frames(stamps), pipeline.features, execution):
+        if frame is None or features is None:
+            raise ResultError(why)
+        yield frame.image, features
 
 
 def recorded_places(

@@ -12,7 +12,7 @@ import pytest
 from vplog import logs
 from vplog.benchmark.recogniser_specs import read_method
 from vplog.benchmark.study import study
-from vplog.benchmark.study.ablations import DEPARTURES, Departure
+from vplog.benchmark.study.experiments import DEPARTURES, Departure
 from vplog.benchmark.study.study import EXPERIMENTS, short_names, truth_of_pair
 from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.benchmark.study.style import colour_of, colour_of_drive, explain, pair_label
 from vplog.figures.canvas import as_text, drawn
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     Found = dict[str, Any]
 
@@ -21,28 +23,38 @@ _MOST_COLUMNS = 6
 """Pairs of drives that fit beside each other; of more only the mean is drawn."""
 _MOST_BARS = 12
 """Pairs of drives in one chart of bars."""
+_METHODS = {
+    "bobb": "#d62728",
+    "bobb_paper": "#ff9d4d",
+    "hybrid": "#8c1a1a",
+    "bovf": "#1f77b4",
+    "fabmap": "#7b4fb5",
+    "vlad": "#2ca02c",
+    "gist": "#8c6d4f",
+    "thumbnail": "#7f7f7f",
+}
+"""Warm where boxes are mined, cold where words are counted, dull where whole images are compared."""
+_OTHERS = ("#e377c2", "#17becf", "#bcbd22", "#393b79", "#637939", "#843c39")
+_DRIVES = ("#4c9f70", "#e0a43a", "#3d5a80", "#b56576", "#6d597a", "#84a59d", "#bc6c25", "#264653")
+_CAPTION_PT = 8
+_CHARACTERS_AN_INCH = 15.5
+"""Characters of a caption line at that size."""
 
 
 def draw_pairs(found: Found, folder: Path) -> None:
     """Fig. 5."""
     rows = found["rows"]
-    methods, labels = _unique(rows, "method"), list(dict.fromkeys(pair_label(row) for row in rows))[:_MOST_BARS]
+    methods, labels = _unique(rows, "method"), _pair_labels(rows)[:_MOST_BARS]
     with drawn(folder, "pairs", max(7.0, 1.3 + 1.6 * len(labels)), 7.6) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
         wide = 0.82 / len(methods)
         for number, method in enumerate(methods):
             at = np.arange(len(labels)) + (number - (len(methods) - 1) / 2) * wide
-            mine = [next(r for r in rows if (pair_label(r), r["method"]) == (label, method)) for label in labels]
-            colour = colour_of(method, methods)
+            mine = _at_pairs(rows, labels, method=method)
             for axes, score in ((upper, "r_at_1"), (lower, "anr")):
-                mean = np.array([row[score] for row in mine])
-                worst = np.array([row[f"{score}_worst"] for row in mine])
-                axes.bar(at, mean, 0.92 * wide, color=colour, label=as_text(method))
-                axes.vlines(at, mean, worst, color="black", linewidth=1.0)
-                if axes is upper:
-                    for x, value in zip(at, mean, strict=True):
-                        axes.annotate(f"{value:.2f}".removeprefix("0"), (x, value), (0, 1), ha="center", fontsize=6,
-                                      textcoords="offset points", color="#333333")  # fmt: skip
+                _bars(axes, at, mine, score, 0.92 * wide, color=colour_of(method, methods), label=as_text(method))
+            marks = [f"{row['r_at_1']:.2f}".removeprefix("0") for row in mine]
+            _annotate(upper, at, mine, marks, 1, 6)
         upper.set(ylabel=_SHARE, ylim=(0, 1.06), xlim=(-0.55, len(labels) - 0.45))
         _rank_axis(lower, [row["anr"] for row in rows], from_zero=True)
         lower.set_xticks(range(len(labels)), [as_text(label) for label in labels])
@@ -60,7 +72,7 @@ def draw_sizes(found: Found, folder: Path) -> None:
     """Fig. 6."""
     rows = found["rows"]
     methods, sizes = _unique(rows, "method"), sorted(set(_unique(rows, "size")))
-    labels = list(dict.fromkeys(pair_label(row) for row in rows))
+    labels = _pair_labels(rows)
     shown = labels if len(labels) <= _MOST_COLUMNS else []
     columns = [*shown, "mean of all pairs"]
     with drawn(folder, "sizes", max(6.0, 1.2 + 1.55 * len(columns)), 5.4) as figure:
@@ -97,26 +109,19 @@ def draw_library(found: Found, folder: Path) -> None:
     rows = found["rows"]
     methods, drives = _unique(rows, "method"), _unique(rows, "library")
     drives.sort(key=[row["map"] for row in rows].index)
-    labels = list(dict.fromkeys(pair_label(row) for row in rows))[:_MOST_BARS]
+    labels = _pair_labels(rows)[:_MOST_BARS]
     wide = 0.8 / len(drives)
     with drawn(folder, "library", max(7.0, 1.3 + 1.35 * len(labels)), 1.2 + 2.9 * len(methods)) as figure:
         grid = figure.subplots(2 * len(methods), 1, sharex=True, squeeze=False)[:, 0]
         for pair_of_axes, method in zip(grid.reshape(-1, 2), methods, strict=True):
             for axes, score in zip(pair_of_axes, ("r_at_1", "anr"), strict=True):
                 for number, drive in enumerate(drives):
-                    mine = [
-                        next(r for r in rows if (pair_label(r), r["method"], r["library"]) == (label, method, drive))
-                        for label in labels
-                    ]
                     at = np.arange(len(labels)) + (number - (len(drives) - 1) / 2) * wide
-                    mean = np.array([row[score] for row in mine])
-                    axes.bar(at, mean, 0.92 * wide, color=colour_of_drive(number), label=as_text(f"from {drive}"))
-                    axes.vlines(at, mean, [row[f"{score}_worst"] for row in mine], color="black", linewidth=1.0)
+                    mine, colour = _at_pairs(rows, labels, method=method, library=drive), _DRIVES[number % len(_DRIVES)]
+                    _bars(axes, at, mine, score, 0.92 * wide, color=colour, label=as_text(f"from {drive}"))
                     if score == "r_at_1":
-                        for x, row in zip(at, mine, strict=True):
-                            mark = {"map": "M", "query": "Q"}.get(row["from"], "–")
-                            axes.annotate(mark, (x, row[score]), (0, 2), textcoords="offset points", ha="center",
-                                          fontsize=7, color="#333333")  # fmt: skip
+                        marks = [{"map": "M", "query": "Q"}.get(row["from"], "–") for row in mine]
+                        _annotate(axes, at, mine, marks, 2, 7)
             pair_of_axes[0].set(ylabel=f"{as_text(method)}\nR@1", ylim=(0, 1.0))
             _rank_axis(pair_of_axes[1], [row["anr"] for row in rows], from_zero=True)
             pair_of_axes[1].set_ylabel(f"{as_text(method)}\nANR in %")
@@ -250,6 +255,29 @@ def _unique(rows: list[Found], name: str) -> list[Any]:
     return list(dict.fromkeys(row[name] for row in rows))
 
 
+def _pair_labels(rows: list[Found]) -> list[str]:
+    return list(dict.fromkeys(pair_label(row) for row in rows))
+
+
+def _at_pairs(rows: list[Found], labels: list[str], **wanted: str) -> list[Found]:
+    """The row of each pair of drives that has these values."""
+    some = [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+    return [next(row for row in some if pair_label(row) == label) for label in labels]
+
+
+def _bars(axes: Axes, at: Any, rows: list[Found], score: str, width: float, **style: Any) -> None:
+    """The mean over seeds of each row, with a line to the worst."""
+    mean = np.array([row[score] for row in rows])
+    axes.bar(at, mean, width, **style)
+    axes.vlines(at, mean, [row[f"{score}_worst"] for row in rows], color="black", linewidth=1.0)
+
+
+def _annotate(axes: Axes, at: Any, rows: list[Found], marks: list[str], above: int, size: float) -> None:
+    for x, row, mark in zip(at, rows, marks, strict=True):
+        axes.annotate(mark, (x, row["r_at_1"]), (0, above), textcoords="offset points", ha="center", fontsize=size,
+                      color="#333333")  # fmt: skip
+
+
 def _rank_axis(axes: Axes, values: list[float], from_zero: bool = False) -> None:
     """A logarithmic axis of ANR that begins and ends at a round number; bars begin at zero."""
     from matplotlib.ticker import NullLocator
@@ -280,3 +308,22 @@ def _label_points(axes: Axes, rows: list[Found], score: str) -> None:
         axes.annotate(
             as_text(row["method"]), (row["stored_bits"], row[score]), textcoords="offset points", fontsize=9, **place
         )
+
+
+def colour_of(method: str, methods: Sequence[str]) -> str:
+    """A recogniser's own colour; methods with settings get one by their place in the list."""
+    if method in _METHODS:
+        return _METHODS[method]
+    return _OTHERS[[name for name in methods if name not in _METHODS].index(method) % len(_OTHERS)]
+
+
+def pair_label(row: dict[str, Any]) -> str:
+    """`query in map`, on two lines."""
+    return f"{row['query']}\nin {row['map']}" if row["query"] != row["map"] else f"{row['query']}\nin its past"
+
+
+def explain(figure: Figure, title: str, caption: str) -> None:
+    """A title above, and below it all what is seen."""
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+    lines = textwrap.fill(caption, int(figure.get_figwidth() * _CHARACTERS_AN_INCH))
+    figure.supxlabel(lines, x=0.01, ha="left", fontsize=_CAPTION_PT, color="#444444")

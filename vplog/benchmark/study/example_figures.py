@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.benchmark.study.charts import explain
 from vplog.benchmark.study.experiments import boxed
-from vplog.benchmark.study.style import explain
 from vplog.figures.canvas import as_text, drawn
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from vplog.benchmark.study.experiments import Plan
+    from vplog.benchmark.study.experiments import StudyOptions
     from vplog.benchmark.study.trial_store import Bench
     from vplog.data import Boxes, Bytes, Floats
     from vplog.stages import BoxState
@@ -31,9 +31,9 @@ _CLOSE_UP = 10
 """References in the close-up of Fig. 7, as in the paper."""
 
 
-def references(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[str]]:
+def references(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, Any], list[str]]:
     """Fig. 9: how often each reference of the first drive explains a frame of any drive."""
-    name, state = _learned(bench, plan, 0)
+    name, state = _learned(bench, options, 0)
     count = np.zeros(len(state.references), np.int64)
     on: list[list[Floats]] = [[] for _ in count]
     images = 0
@@ -59,18 +59,18 @@ def references(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], lis
     return about, ["references"]
 
 
-def examples(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[str]]:
+def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, Any], list[str]]:
     """Fig. 4: a frame that is found and one that is missed of every pair, each with the true frame of the map."""
     rows, files = [], []
     shown = bench.pairs[:_MOST_EXAMPLES]
     done, total = 0, sum(len(bench.frames[query]) + len(bench.frames[other]) for query, other in shown)
     for query, other in shown:
-        name, state = _learned(bench, plan, other)
+        name, state = _learned(bench, options, other)
         places = {}
         for drive in sorted({query, other}):
             places[drive] = bench.describe(state, drive, "examples", done, total)
             done += len(bench.frames[drive])
-        ranks, truth, _ = bench.ask(state, query, other, places)
+        ranks, truth = bench.ask(state, query, other, places)
         for kind, right in (("found", True), ("missed", False)):
             among = np.flatnonzero(ranks.positive & ((ranks.top_true == 1.0) if right else (ranks.better > 0)))
             if not len(among):
@@ -100,10 +100,10 @@ def examples(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
     return {"rows": rows}, files
 
 
-def sequence(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[str]]:
+def sequence(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, Any], list[str]]:
     """Fig. 7: the boxes of consecutive frames of the first query, explained by the first map's library."""
     query, other = bench.pairs[0]
-    name, state = _learned(bench, plan, other)
+    name, state = _learned(bench, options, other)
     places = bench.describe(state, query, "sequence", 0, len(bench.frames[query]))
     found = [state.boxes(place) for place in places]
     length = min(_FRAMES, len(found))
@@ -128,7 +128,7 @@ def sequence(bench: Bench, plan: Plan, out: Path) -> tuple[dict[str, Any], list[
     return about, ["sequence"]
 
 
-PICTURES: dict[str, Callable[[Bench, Plan, Path], tuple[dict[str, Any], list[str]]]] = {
+PICTURES: dict[str, Callable[[Bench, StudyOptions, Path], tuple[dict[str, Any], list[str]]]] = {
     "references": references,
     "examples": examples,
     "sequence": sequence,
@@ -136,10 +136,10 @@ PICTURES: dict[str, Callable[[Bench, Plan, Path], tuple[dict[str, Any], list[str
 """Experiments by name: what study.json says of each, and the names of its figures."""
 
 
-def _learned(bench: Bench, plan: Plan, drive: int) -> tuple[str, BoxState]:
+def _learned(bench: Bench, options: StudyOptions, drive: int) -> tuple[str, BoxState]:
     """The first method that makes boxes, with the drive's first library."""
-    name = boxed(bench, plan)[0]
-    state: Any = bench.learn(name, plan.libraries(drive)[0])
+    name = boxed(bench, options)[0]
+    state: Any = bench.learn(name, options.libraries(drive)[0])
     return name, state
 
 

@@ -10,61 +10,120 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from vplog.benchmark.recogniser_specs import read_method
-from vplog.benchmark.study.ablations import BASE, DEPARTURES
 from vplog.benchmark.study.trial_store import LESS_IS_BETTER, SCORES, Library, Trial
 from vplog.errors import SettingsError
+from vplog.places.reference_choice import PAPER_SIZE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from vplog.benchmark.study.trial_store import Bench
-    from vplog.pipeline import Pipeline
+    from vplog.logs import TopicChoice
 
     Row = dict[str, Any]
 
+METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
+"""Compared where the user names none."""
 KINDS_OF_BOXES = ("bobb", "bobb_paper")
 """Recognisers that explain images by boxes on references: those that the size and the origin of a library matter to
 most, and that pictures can be drawn of."""
+BASE = "bobb"
+"""The recogniser that the departures are of."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a user asks of a study."""
+class Departure:
+    """One idea, on its own."""
 
-    methods: tuple[str, ...]
-    """Names, as the bench has them."""
-    library_size: int
-    sizes: tuple[int, ...]
-    """Increasing."""
-    seeds: int
-    """Libraries drawn for every figure."""
-    pipeline: Pipeline
+    name: str
+    """What is there without it, in a few words."""
+    undone_by: tuple[str, ...]
+    """Assignments of settings, as `--methods bobb:setting=value` takes them."""
+    why: str
+    """What the idea is for, in one sentence."""
+
+    @property
+    def method(self) -> str:
+        """The recogniser without it, as `--methods` takes it."""
+        return ":".join((BASE, *self.undone_by))
+
+
+DEPARTURES = (
+    Departure(
+        "plain SIFT", ("root_sift=false",), "Roots of descriptors keep a few large values from ruling the distance."
+    ),
+    Departure("grain too", ("least_size=0",), "The smallest features are grain that another camera or light lacks."),
+    Departure("keypoints alone", ("patch_weight=0",), "Patches need no detector, which fails in the dark."),
+    Departure("patches alone", ("features=0",), "Keypoints are found again where the view turns or comes nearer."),
+    Departure("800 keypoints", ("features=800",), "More describe blurred views, and cost twice the time."),
+    Departure("own image left out", ("own=false",), "A later visit is explained by the image of the first one."),
+    Departure("weights not rooted", ("share_power=1",), "The root lets more than the first reference decide."),
+    Departure(
+        "boxes of a tenth",
+        ("box_columns=6", "box_rows=3"),
+        "Boxes of half the sides measure how far apart they are; smaller ones miss each other at once.",
+    ),
+    Departure("10 neighbours", ("neighbours=10",), "The scale of distances is read off a far neighbour, not a match."),
+    Departure("all matches weigh alike", ("reach=100",), "Distances change with light, so a match counts relatively."),
+    Departure(
+        "no agreement", ("agreement_floor=1",), "Matches of one place move alike from view to view; chance ones do not."
+    ),
+    Departure("popular ones count fully", ("popularity=0",), "What explains every view distinguishes none."),
+    Departure("J = 4", ("references=4",), "More references explain more of a view, at twelve bytes each."),
+    Departure("2 x 2 windows", ("windows_along=2",), "Nine windows say where in the view a box comes from."),
+    Departure("windows of a quarter", ("window_share=0.25",), "A window must hold enough features to be found again."),
+    Departure("best window only", ("pairing=best",), "Eq. (1); the same window says that the view is the same."),
+    Departure("same window only", ("pairing=same",), "The best window also finds a view from nearer or aside."),
+)
+"""One row of the study each."""
+
+
+_CHANGED = ("r_at_1", "anr", "ap")
+"""Scores whose change without a departure is told."""
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Which experiments are done, and on what."""
+
+    methods: Sequence[str] = METHODS
+    sizes: Sequence[int] = (10, 20, 50, 100)
+    """Library sizes of the experiment about them, those of Fig. 6."""
+    seeds: int = 3
+    """Libraries drawn for every figure: enough to see where one draw was lucky."""
+    library_size: int = PAPER_SIZE
+    """References of all other experiments."""
+    min_gap: int | None = None
+    """Frames that a match is older, at least, where a single drive is searched for in its own past."""
+    only: Sequence[str] | None = None
+    """Names of the experiments; None for all."""
+    topics: TopicChoice | None = None
 
     def libraries(self, drive: int, size: int | None = None) -> list[Library]:
         """One for each seed."""
         return [Library(drive, self.library_size if size is None else size, seed) for seed in range(self.seeds)]
 
 
-def boxed(bench: Bench, plan: Plan) -> list[str]:
+def boxed(bench: Bench, options: StudyOptions) -> list[str]:
     """Those of the methods that make boxes. Raises SettingsError where none does."""
-    found = [name for name in plan.methods if bench.methods[name].kind in KINDS_OF_BOXES]
+    found = [name for name in options.methods if bench.methods[name].kind in KINDS_OF_BOXES]
     if not found:
         raise SettingsError(
-            f"--methods {','.join(plan.methods)}: none of them makes boxes, which this experiment is about. "
+            f"--methods {','.join(options.methods)}: none of them makes boxes, which this experiment is about. "
             f"Add {' or '.join(KINDS_OF_BOXES)}, or leave the experiment out with --only."
         )
     return found
 
 
-def pairs(bench: Bench, plan: Plan) -> dict[str, Any]:
+def pairs(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 5: every method on every pair of drives, with a library from the map."""
-    rows = _rows(bench, "pairs", _every(bench, plan.methods, plan.libraries))
+    rows = _rows(bench, "pairs", _every(bench, options.methods, options.libraries))
     return {"rows": rows, "mean": _mean(rows, ("method",))}
 
 
-def conditions(bench: Bench, plan: Plan) -> dict[str, Any]:
+def conditions(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 10: the same trials, seen as a table of query against map condition."""
-    rows = pairs(bench, plan)["rows"]
+    rows = pairs(bench, options)["rows"]
     names = bench.names
     table = {
         method: {
@@ -74,29 +133,29 @@ def conditions(bench: Bench, plan: Plan) -> dict[str, Any]:
             ]
             for score in ("r_at_1", "anr")
         }
-        for method in plan.methods
+        for method in options.methods
     }  # fmt: skip
     return {"drives": names, "query_by_map": table}
 
 
-def bits(bench: Bench, plan: Plan) -> dict[str, Any]:
+def bits(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Section IV on spatial cost: the same trials, seen as what a place takes against how well it is found."""
-    rows = _mean(pairs(bench, plan)["rows"], ("method",))
+    rows = _mean(pairs(bench, options)["rows"], ("method",))
     for row in rows:
         row["stored_bits"] = round(8 * row["bytes_per_image"])
         row["packed_bits"] = min(row.pop("bits"), row["stored_bits"])
     return {"rows": rows}
 
 
-def sizes(bench: Bench, plan: Plan) -> dict[str, Any]:
+def sizes(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 6: libraries of several sizes from the map."""
-    names = boxed(bench, plan)
+    names = boxed(bench, options)
     least = min(len(frames) for frames in bench.frames)
-    fitting = [size for size in plan.sizes if size <= least]
-    left_out = [size for size in plan.sizes if size > least]
+    sizes = sorted(set(options.sizes))
+    fitting, left_out = [size for size in sizes if size <= least], [size for size in sizes if size > least]
     if not fitting:
-        raise SettingsError(f"--sizes {','.join(map(str, plan.sizes))}: the shortest drive has only {least} frames.")
-    trials = (_every(bench, names, lambda drive, size=size: plan.libraries(drive, size)) for size in fitting)
+        raise SettingsError(f"--sizes {','.join(map(str, sizes))}: the shortest drive has only {least} frames.")
+    trials = (_every(bench, names, lambda drive, size=size: options.libraries(drive, size)) for size in fitting)
     rows = _rows(bench, "sizes", chain.from_iterable(trials))
     found: dict[str, Any] = {"rows": rows, "mean": _mean(rows, ("method", "size"))}
     if left_out:
@@ -104,56 +163,43 @@ def sizes(bench: Bench, plan: Plan) -> dict[str, Any]:
     return found
 
 
-def library(bench: Bench, plan: Plan) -> dict[str, Any]:
+def library(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 8: libraries from every drive, for every pair."""
-    drawn = [library for drive in range(len(bench.names)) for library in plan.libraries(drive)]
-    rows = _rows(bench, "library", _every(bench, boxed(bench, plan), lambda _: drawn))
+    drawn = [library for drive in range(len(bench.names)) for library in options.libraries(drive)]
+    rows = _rows(bench, "library", _every(bench, boxed(bench, options), lambda _: drawn))
     for row in rows:
         row["from"] = {row["query"]: "query", row["map"]: "map"}.get(row["library"], "other")
     return {"rows": rows, "mean": _mean(rows, ("method", "from"))}
 
 
-def ablations(bench: Bench, plan: Plan) -> dict[str, Any]:
+def ablations(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Every departure from the paper taken back on its own. Raises SettingsError where a setting is no more."""
     names = [BASE, *(departure.method for departure in DEPARTURES)]
     for name in names:
-        bench.methods[name] = read_method(name, plan.pipeline)
-    rows = _rows(bench, "ablations", _every(bench, names, plan.libraries))
+        bench.methods[name] = read_method(name, bench.pipeline)
+    rows = _rows(bench, "ablations", _every(bench, names, options.libraries))
     found = {(row["method"], row["query"], row["map"]): row for row in rows}
-    base = {row["method"]: row for row in _mean(rows, ("method",))}
-    table = []
+    mean = {row["method"]: row for row in _mean(rows, ("method",))}
+    named = [(bench.names[query], bench.names[other]) for query, other in bench.pairs]
+    table: list[Row] = []
     for departure in DEPARTURES:
-        changes = [
-            {
-                "query": bench.names[query],
-                "map": bench.names[other],
-                **{
-                    score: _rounded(
-                        found[departure.method, bench.names[query], bench.names[other]][score]
-                        - found[BASE, bench.names[query], bench.names[other]][score]
-                    )
-                    for score in ("r_at_1", "anr", "ap")
-                },
-            }
-            for query, other in bench.pairs
+        without = mean[departure.method]
+        row: Row = {"name": departure.name, "setting": " ".join(departure.undone_by), "why": departure.why}
+        row |= {score: without[score] for score in (*_CHANGED, "bytes_per_image")}
+        row |= {f"{score}_change": change for score, change in _changes(without, mean[BASE]).items()}
+        row["changes"] = [
+            {"query": pair[0], "map": pair[1], **_changes(found[departure.method, *pair], found[BASE, *pair])}
+            for pair in named
         ]
-        table.append(
-            {
-                "name": departure.name,
-                "setting": " ".join(departure.undone_by),
-                "why": departure.why,
-                **{score: base[departure.method][score] for score in ("r_at_1", "anr", "ap", "bytes_per_image")},
-                **{
-                    f"{score}_change": _rounded(base[departure.method][score] - base[BASE][score])
-                    for score in ("r_at_1", "anr", "ap")
-                },
-                "changes": changes,
-            }
-        )
-    return {"base": base[BASE], "rows": table}
+        table.append(row)
+    return {"base": mean[BASE], "rows": table}
 
 
-NUMBERS: dict[str, Callable[[Bench, Plan], dict[str, Any]]] = {
+def _changes(row: Row, base: Row) -> dict[str, float]:
+    return {score: _rounded(row[score] - base[score]) for score in _CHANGED}
+
+
+NUMBERS: dict[str, Callable[[Bench, StudyOptions], dict[str, Any]]] = {
     "pairs": pairs,
     "sizes": sizes,
     "library": library,
@@ -179,26 +225,13 @@ def _rows(bench: Bench, stage: str, trials: Iterable[Trial]) -> list[Row]:
     trials = list(dict.fromkeys(trials))
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for trial, figures in zip(trials, bench.run(stage, trials), strict=True):
-        key = (trial.method, trial.library.drive, trial.library.size, trial.query, trial.map)
-        groups.setdefault(key, []).append(figures)
-    rows = []
-    for (method, drive, size, query, other), some in groups.items():
-        row: Row = {
-            "method": method,
-            "query": bench.names[query],
-            "map": bench.names[other],
-            "library": bench.names[drive],
-            "size": size,
-        }
-        for score in SCORES:
-            values = [one[score] for one in some]
-            row[score] = _rounded(sum(values) / len(values))
-            row[f"{score}_worst"] = _rounded(max(values) if score in LESS_IS_BETTER else min(values))
-        row["bytes_per_image"] = round(sum(one["bytes_per_image"] for one in some) / len(some), 1)
-        row["bits"] = max(one["bits"] for one in some)
-        row["library_hashes"] = [one["library_hash"][:12] for one in some]
-        rows.append(row)
-    return rows
+        names = (bench.names[drive] for drive in (trial.query, trial.map, trial.library.drive))
+        groups.setdefault((trial.method, *names, trial.library.size), []).append(figures)
+    by = ("method", "query", "map", "library", "size")
+    return [
+        {**_together(by, key, some), "library_hashes": [one["library_hash"][:12] for one in some]}
+        for key, some in groups.items()
+    ]
 
 
 def _mean(rows: list[Row], by: tuple[str, ...]) -> list[Row]:
@@ -206,17 +239,19 @@ def _mean(rows: list[Row], by: tuple[str, ...]) -> list[Row]:
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in by), []).append(row)
-    result = []
-    for key, some in groups.items():
-        mean: Row = dict(zip(by, key, strict=True))
-        for score in SCORES:
-            mean[score] = _rounded(sum(row[score] for row in some) / len(some))
-            worst = [row[f"{score}_worst"] for row in some]
-            mean[f"{score}_worst"] = max(worst) if score in LESS_IS_BETTER else min(worst)
-        mean["bytes_per_image"] = round(sum(row["bytes_per_image"] for row in some) / len(some), 1)
-        mean["bits"] = max(row["bits"] for row in some)
-        result.append(mean)
-    return result
+    return [_together(by, key, some) for key, some in groups.items()]
+
+
+def _together(by: tuple[str, ...], key: tuple[Any, ...], some: list[Row]) -> Row:
+    """One row of several: mean of every score and the worst, which rows of several trials have already."""
+    row: Row = dict(zip(by, key, strict=True))
+    for score in SCORES:
+        row[score] = _rounded(sum(one[score] for one in some) / len(some))
+        worst = max if score in LESS_IS_BETTER else min
+        row[f"{score}_worst"] = _rounded(worst(one.get(f"{score}_worst", one[score]) for one in some))
+    row["bytes_per_image"] = round(sum(one["bytes_per_image"] for one in some) / len(some), 1)
+    row["bits"] = max(one["bits"] for one in some)
+    return row
 
 
 def _rounded(value: float) -> float:

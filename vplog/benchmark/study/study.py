@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from glob import escape
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -22,14 +22,13 @@ from vplog.benchmark.compare import check_truth, same_drive
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.study.charts import CHARTS
 from vplog.benchmark.study.example_figures import PICTURES
-from vplog.benchmark.study.experiments import NUMBERS, Plan
+from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
 from vplog.benchmark.study.trial_store import Bench, all_pairs
 from vplog.cache.code_hash import code_of
 from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
-from vplog.places.reference_choice import PAPER_SIZE
 from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
 from vplog.results.staging import staged
 from vplog.storage.folders import check_regular
@@ -40,12 +39,6 @@ if TYPE_CHECKING:
 
     from vplog.pipeline import Pipeline
 
-METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
-"""Compared where the user names none."""
-SIZES = (10, 20, 50, 100)
-"""L of Fig. 6."""
-SEEDS = 3
-"""Libraries drawn for each figure: enough to see where one draw was lucky."""
 EXPERIMENTS = (*NUMBERS, *PICTURES)
 """All of them, in the order they are done."""
 _WORK = ".study"
@@ -57,23 +50,6 @@ _TWO_DRIVES = {
 """What these experiments need two drives for."""
 _SCORES = ("vplog.benchmark.study.trial_store", "vplog.benchmark.recogniser_specs")
 """Modules that the scores of a trial depend on, with all that these import."""
-
-
-@dataclass(frozen=True)
-class StudyOptions:
-    """Which experiments are done, and on what."""
-
-    methods: Sequence[str] = METHODS
-    sizes: Sequence[int] = SIZES
-    """Library sizes of the experiment about them."""
-    seeds: int = SEEDS
-    library_size: int = PAPER_SIZE
-    """References of all other experiments."""
-    min_gap: int | None = None
-    """Frames that a match is older, at least, where a single drive is searched for in its own past."""
-    only: Sequence[str] | None = None
-    """Names of the experiments; None for all."""
-    topics: logs.TopicChoice | None = None
 
 
 def study(
@@ -88,9 +64,8 @@ def study(
 
     Raises VplogError with one line where that cannot be.
     """
-    min_gap, topics, seeds, library_size = options.min_gap, options.topics, options.seeds, options.library_size
+    min_gap, topics = options.min_gap, options.topics
     chosen = _choose(options.only, len(drives))
-    plan = Plan(tuple(options.methods), library_size, tuple(sorted(set(options.sizes))), seeds, pipeline)
     recognisers = read_methods(options.methods, pipeline)
     _check_drives(drives, min_gap)
     warnings: list[str] = []
@@ -113,7 +88,7 @@ def study(
             "truth_hash": _truth_hash(truth),
         }
         bench = Bench(
-            names, opened, hashes, recognisers, known, _covered(known, opened), pipeline.features, min_gap,
+            names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
             {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, stack, execution,
         )  # fmt: skip
         account = {
@@ -124,9 +99,9 @@ def study(
             ],
             "truth": _shown(truth),
             **common,
-            "library_size": library_size,
-            "sizes": list(plan.sizes),
-            "seeds": seeds,
+            "library_size": options.library_size,
+            "sizes": sorted(set(options.sizes)),
+            "seeds": options.seeds,
             "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
         }
         inputs = _hash({**account, "pipeline": pipeline.model_dump(mode="json"), "code": code_of(__name__)})
@@ -139,7 +114,7 @@ def study(
         work.mkdir(exist_ok=True)
         for name in chosen:
             if name not in done:
-                done[name] = _do(name, bench, plan, work)
+                done[name] = _do(name, bench, options, work)
                 files |= {file: work / file for file in done[name]["figures"]}
                 _write(work, account, inputs, done, [])
         for file, path in files.items():
@@ -150,14 +125,14 @@ def study(
     return result
 
 
-def _do(name: str, bench: Bench, plan: Plan, out: Path) -> dict[str, Any]:
+def _do(name: str, bench: Bench, options: StudyOptions, out: Path) -> dict[str, Any]:
     began = time.perf_counter()
     if name in NUMBERS:
-        found = NUMBERS[name](bench, plan)
+        found = NUMBERS[name](bench, options)
         CHARTS[name](found, out)
         figures = [name]
     else:
-        found, figures = PICTURES[name](bench, plan, out)
+        found, figures = PICTURES[name](bench, options, out)
     files = [f"{figure}.{kind}" for figure in figures for kind in ("png", "svg")]
     return {"figures": files, **found, "seconds": round(time.perf_counter() - began, 3)}
 

@@ -11,11 +11,12 @@ from dataclasses import asdict, dataclass, field
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
-from vplog.benchmark.method_scores import describe_walk, score_rows, score_table, stored_bytes
+from vplog.benchmark.method_scores import describe_walk, score_table, search, stored_bytes
 from vplog.benchmark.traversals import candidate_stops, extract_walk
 from vplog.data import Reference
 from vplog.errors import LogError
 from vplog.evaluate import retrieval
+from vplog.execution.execution import Execution
 from vplog.features.store import FeatureStore
 from vplog.places.library_files import references_hash
 from vplog.places.reference_choice import LibrarySettings, choose
@@ -31,15 +32,15 @@ if TYPE_CHECKING:
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.place_truth import PlaceTruth
     from vplog.evaluate.retrieval import Ranks
-    from vplog.execution.execution import Execution
-    from vplog.stages import Extractor, Log, PlaceState
+    from vplog.pipeline import Pipeline
+    from vplog.stages import Log, PlaceState
 
 SCORES = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100")
 """What a trial is judged by, as `evaluate.retrieval` defines them."""
 LESS_IS_BETTER = frozenset({"anr"})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Library:
     """Random frames of a drive as reference images."""
 
@@ -73,7 +74,7 @@ class Bench:
     """By query and map; its keys are the pairs of the study."""
     frames: list[Ints]
     """Numbers of the frames of each drive that the truth covers."""
-    extractor: Extractor
+    pipeline: Pipeline
     min_gap: int | None
     common: dict[str, Any]
     """All else that a trial's outcome depends on, as plain values."""
@@ -98,7 +99,7 @@ class Bench:
         if drive not in self._walks:
             store = self.stack.enter_context(FeatureStore(self.scratch / f"{drive}.features"))
             frames = self.frames[drive]
-            walk = extract_walk(self.logs[drive], self.extractor, store, frames, execution=self.execution)
+            walk = extract_walk(self.logs[drive], self.pipeline.features, store, frames, execution=self.execution)
             self.warnings += walk.warnings
             self._walks[drive] = walk
         return self._walks[drive]
@@ -132,17 +133,15 @@ class Bench:
             self._learned = library, self.references(library)
         return self.methods[method].learn(self._learned[1], self.execution)
 
-    def ask(
-        self, state: PlaceState, query: int, other: int, places: dict[int, Sequence[Any]]
-    ) -> tuple[Ranks, Pairs, Ints]:
-        """Ranks of every query of a pair, its true pairs, and where each query's candidates end."""
+    def ask(self, state: PlaceState, query: int, other: int, places: dict[int, Sequence[Any]]) -> tuple[Ranks, Pairs]:
+        """Ranks of every query of a pair, and its true pairs."""
         walks = self.walk(query), self.walk(other)
         stops = candidate_stops(walks[0].frames, walks[1].frames, self.min_gap)
         truth = self.truth[query, other].pairs(walks[0].frames, walks[1].frames).below(stops)
         index = state.index(places[other])
         scores = score_table(len(walks[0]), len(walks[1]), self.scratch, "scores")
-        score_rows(index, places[query], stops, scores, self.execution)
-        return retrieval.rank_queries(scores, truth, stops), truth, stops
+        search(index, places[query], stops, scores, Execution(self.execution.threads), timed=False)
+        return retrieval.rank_queries(scores, truth, stops), truth
 
     def run(self, stage: str, trials: Iterable[Trial]) -> list[dict[str, Any]]:
         """Figures of every trial, in order. Those remembered are not tried again."""
@@ -156,17 +155,18 @@ class Bench:
         used = {group: sorted({drive for t in some for drive in (t.query, t.map)}) for group, some in groups.items()}
         total = sum(len(self.frames[drive]) for drives in used.values() for drive in drives)
         described = 0
-        for (library, method), some in sorted(groups.items(), key=lambda one: _order(one[0][0])):
+        for (library, method), some in sorted(groups.items(), key=lambda one: one[0][0]):
             state = self.learn(method, library)
             places = {}
             for drive in used[library, method]:
                 places[drive] = self.describe(state, drive, stage, described, total)
                 described += len(self.frames[drive])
             for trial in some:
-                ranks, _, _ = self.ask(state, trial.query, trial.map, places)
+                ranks, _ = self.ask(state, trial.query, trial.map, places)
+                size = stored_bytes(state.to_arrow(places[trial.map])) / len(places[trial.map])
                 done[keys[trial]] = {
                     **asdict(retrieval.score_retrieval(ranks)),
-                    "bytes_per_image": self._bytes(state, places[trial.map]),
+                    "bytes_per_image": round(size, 1),
                     "bits": state.bits,
                     "library_hash": references_hash(self._learned[1], self.methods[method]),
                 }
@@ -177,10 +177,6 @@ class Bench:
         """Places of a walk as a table would give them back; `before` frames of the stage's `total` are done."""
         places, _ = describe_walk(state, self.walk(drive), stage, self.execution.part(before, total))
         return state.from_arrow(state.to_arrow(places))
-
-    @staticmethod
-    def _bytes(state: PlaceState, places: Sequence[Any]) -> float:
-        return round(stored_bytes(state.to_arrow(places)) / len(places), 1)
 
     def _key(self, trial: Trial) -> str:
         about = {
@@ -207,10 +203,6 @@ class Bench:
 def _is_whole(entry: Any) -> bool:
     numbers = (*SCORES, "bytes_per_image", "bits")
     return isinstance(entry, dict) and all(isinstance(entry.get(name), (int, float)) for name in numbers)
-
-
-def _order(library: Library) -> tuple[int, int, int]:
-    return library.drive, library.size, library.seed
 
 
 def all_pairs(count: int) -> list[tuple[int, int]]:
