@@ -115,7 +115,7 @@ def test_depth_of_the_ground_is_where_the_ray_meets_z_0(scene: Scene) -> None:
 def test_a_car_hides_what_is_behind_it(scene: Scene) -> None:
     camera = scene.world_from_body[0] @ scene.camera.body_from_camera
     empty, empty_depth = render(scene.world, scene.camera, camera, FIRST_LIGHT)
-    busy, busy_depth = render(scene.world, scene.camera, camera, FIRST_LIGHT, traffic(scene.world, scene.settings, 0.0))
+    busy, busy_depth = render(scene.world, scene.camera, camera, FIRST_LIGHT, traffic(scene.settings, 0.0))
     hidden = busy_depth < empty_depth
     assert hidden.sum() > 100
     assert np.array_equal(busy[~hidden], empty[~hidden])
@@ -123,7 +123,7 @@ def test_a_car_hides_what_is_behind_it(scene: Scene) -> None:
 
 def test_other_traffic_in_every_lap(scene: Scene) -> None:
     lap_s = route.lap_length(scene.settings) / scene.settings.speed_m_s
-    first, second = (traffic(scene.world, scene.settings, t).corner for t in (1.0, 1.0 + lap_s))
+    first, second = (traffic(scene.settings, t).corner for t in (1.0, 1.0 + lap_s))
     assert len(first)
     assert first.shape != second.shape or not np.allclose(first, second)
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from vplog.data import Bytes, Camera, Float32s, Floats, Ints
+    from vplog.data import Bytes, Camera, Float32s, Floats
 
 IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"
@@ -58,17 +58,12 @@ _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class Drive(Scene):
     """A recorded demo drive."""
 
     log: Path
     truth: Path
     """TUM trajectory, world_from_body at every odometry sample and every frame."""
-    camera: Camera
-    stamp_ns: Ints
-    """(F,) of the frames."""
-    world_from_body: Floats
-    """(F, 4, 4) truth at the frames."""
 
 
 def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Execution | None = None) -> Drive:
@@ -88,7 +83,7 @@ def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Ex
         _write_log(log, settings, scene, execution or Execution(allowed()))
     except OSError as error:
         raise ResultError(f"Cannot write the demo drive to {folder}: {error}. Choose another folder.") from None
-    return Drive(log, truth, scene.camera, scene.stamp_ns, scene.world_from_body)
+    return Drive(**vars(scene), log=log, truth=truth)
 
 
 def _check_own(path: Path, mark: bytes) -> None:
@@ -103,10 +98,8 @@ def _check_own(path: Path, mark: bytes) -> None:
 def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Execution) -> None:
     """All messages in the order in which they reach the recorder."""
     messages = [*_mounting(scene.camera), *_odometry(settings), *_fixes(settings), *_frames(scene, execution)]
-    rng = np.random.default_rng([settings.seed, 5])
-    delays = rng.integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
+    delays = np.random.default_rng([settings.seed, 5]).integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
     logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
-
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="vplog demo")

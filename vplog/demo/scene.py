@@ -91,7 +91,7 @@ def take_picture(scene: Scene, frame: int, right_m: float = 0.0) -> tuple[Bytes,
     later = float(route.second_lap_share(settings, np.array(time_s * settings.speed_m_s)))
     light: Any = [(1 - later) * a + later * b for a, b in zip(FIRST_LIGHT, LATER_LIGHT, strict=True)]
     mount = scene.camera.body_from_camera @ pose(np.eye(3), np.array([right_m, 0.0, 0.0]))
-    occluders = traffic(scene.world, settings, time_s)
+    occluders = traffic(settings, time_s)
     image, depth = render(scene.world, scene.camera, scene.world_from_body[frame] @ mount, Light(*light), occluders)
     rng = np.random.default_rng([settings.seed, 8 if right_m else 4, frame])
     noise = rng.standard_normal(image.shape, np.float32) * np.float32(settings.image_noise)

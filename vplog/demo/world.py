@@ -60,12 +60,10 @@ class Textures(NamedTuple):
 
 
 class World(NamedTuple):
-    """What stands in the street, and the textures of the traffic."""
+    """What stands in the street. Texture 0 is the ground's; after it come the _POSTERS of the traffic."""
 
     textures: Textures
     quads: Quads
-    posters: Ints
-    """(_POSTERS,)."""
 
 
 def _packed(pictures: list[Bytes]) -> Textures:
@@ -104,10 +102,7 @@ def build_world(settings: DemoSettings) -> World:
     axis, _ = axis_point(settings, np.arange(0, lap_length(settings), 0.1))
     pictures = [paint.ground(rng, (axis - upper_left) * (1, -1), size, _ROAD_M)]
     pictures += [paint.poster(rng, 2.0, 1.0) for _ in range(_POSTERS)]
-    ground = Quads(
-        np.array([[*upper_left, 0.0]]), np.array([[size[0], 0, 0]]), np.array([[0, -size[1], 0]]), np.zeros(1, np.int64)
-    )
-    placed = []
+    placed: list[tuple[float, ...]] = [(0, 0, -0.01, 0, *size, 0.01, 0, 0)]  # the ground is a flat box
     for turn, left in product(range(4), (-1, 1)):  # the straight sides as the car drives, the block on its left
         heading, (ahead_m, across_m) = turn * np.pi / 2, half[:: 1 - 2 * (turn % 2)].tolist()
         c, s = np.cos(heading), np.sin(heading)
@@ -116,8 +111,7 @@ def build_world(settings: DemoSettings) -> World:
             placed.append((c * x - s * y, s * x + c * y, bottom, heading, *box))
     table = np.array(placed)
     side, end = table[:, 7:].T.astype(np.int64)
-    houses = _boxes(table[:, :3], table[:, 3], table[:, 4:7], side, end)
-    return World(_packed(pictures), ground.with_others(houses), np.arange(1, 1 + _POSTERS))
+    return World(_packed(pictures), _boxes(table[:, :3], table[:, 3], table[:, 4:7], side, end))
 
 
 def _row_of_houses(
@@ -143,7 +137,7 @@ def _row_of_houses(
             yield *at, 2.5 * hangs, *size, len(pictures) - 2, len(pictures) - 1
 
 
-def traffic(world: World, settings: DemoSettings, time_s: float) -> Quads:
+def traffic(settings: DemoSettings, time_s: float) -> Quads:
     """Cars and people at one time of the drive: others are parked in each lap, and many move."""
     length = lap_length(settings)
     # One draw per slot of 11 m and lap, so that no parked cars stand in each other.
@@ -167,5 +161,4 @@ def traffic(world: World, settings: DemoSettings, time_s: float) -> Quads:
     rows, counts = np.concatenate([cars, cars, np.arange(len(cars), len(point))]), [len(cars), len(cars), on_foot]
     size = np.repeat([(4.2, 1.75, 0.75), (2.3, 1.6, 0.55), (0.3, 0.5, 1.8)], counts, axis=0)
     foot = np.column_stack([point[rows], np.repeat([0.2, 0.95, 0.0], counts)])
-    side, end = (world.posters[(kind[rows] + k) % _POSTERS] for k in (0, 1))
-    return _boxes(foot, heading[rows], size, side, end)
+    return _boxes(foot, heading[rows], size, 1 + kind[rows], 1 + (kind[rows] + 1) % _POSTERS)
