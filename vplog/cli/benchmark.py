@@ -6,6 +6,7 @@ import argparse
 from functools import partial
 from typing import TYPE_CHECKING
 
+from vplog import api
 from vplog.cli.options import at_least, at_least_one, local, option, pipeline_of, place, positive, topics_of
 from vplog.cli.printing import Progress, print_comparison, print_result, print_study
 from vplog.execution.execution import Execution
@@ -13,27 +14,16 @@ from vplog.execution.execution import Execution
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from vplog.evaluate.place_truth import TruthChoice
-
 
 def compare(arguments: argparse.Namespace) -> None:
     """Compare recognisers on two drives, or on one that revisits places."""
-    from vplog.benchmark.compare import CompareOptions
-    from vplog.benchmark.compare import compare as compare_methods
-    from vplog.benchmark.recogniser_specs import split_methods
-
     with Progress(arguments) as progress:
-        done = compare_methods(
-            arguments.query,
-            arguments.map,
-            split_methods(arguments.methods),
-            _truth(arguments),
-            pipeline_of(arguments),
-            CompareOptions(
-                arguments.library, arguments.library_size, arguments.library_seed, arguments.min_gap,
-                arguments.sequence, arguments.output, topics_of(arguments),
-            ),
-            Execution(arguments.threads, progress),
+        done = api.compare(
+            arguments.query, arguments.map, methods=arguments.methods, truth=arguments.truth,
+            tolerance=arguments.tolerance, distance_m=arguments.distance_m, heading_deg=arguments.heading_deg,
+            pipeline=arguments.pipeline, settings=arguments.set, topics=topics_of(arguments), library=arguments.library,
+            library_size=arguments.library_size, library_seed=arguments.library_seed, min_gap=arguments.min_gap,
+            sequence=arguments.sequence, out=arguments.output, threads=arguments.threads, progress=progress,
         )  # fmt: skip
     print_result(arguments, done.record, print_comparison)
 
@@ -43,37 +33,23 @@ def study(arguments: argparse.Namespace) -> None:
     from vplog.benchmark.recogniser_specs import split_methods
     from vplog.benchmark.study.experiments import METHODS, StudyOptions
     from vplog.benchmark.study.study import study as run_study
+    from vplog.evaluate.place_truth import TruthChoice
 
+    truth = TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
+    options = StudyOptions(
+        METHODS if arguments.methods is None else split_methods(arguments.methods), arguments.sizes, arguments.seeds,
+        arguments.library_size, arguments.min_gap, arguments.only, topics_of(arguments),
+    )  # fmt: skip
     with Progress(arguments) as progress:
-        found = run_study(
-            arguments.logs,
-            _truth(arguments),
-            pipeline_of(arguments),
-            arguments.output,
-            StudyOptions(
-                METHODS if arguments.methods is None else split_methods(arguments.methods), arguments.sizes,
-                arguments.seeds, arguments.library_size, arguments.min_gap, arguments.only, topics_of(arguments),
-            ),
-            Execution(arguments.threads, progress),
-        )  # fmt: skip
+        execution = Execution(arguments.threads, progress)
+        found = run_study(arguments.logs, truth, pipeline_of(arguments), arguments.output, options, execution)
     print_result(arguments, found, partial(print_study, arguments.output))
 
 
-def _truth(arguments: argparse.Namespace) -> TruthChoice:
-    from vplog.evaluate.place_truth import TruthChoice
-
-    return TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
-
-
-def add_studies(
-    add: Callable[..., argparse.ArgumentParser],
-    topics: argparse.ArgumentParser,
-    threads: argparse.ArgumentParser,
-    settings: argparse.ArgumentParser,
-) -> None:
+def add_studies(add: Callable[..., argparse.ArgumentParser], *parents: argparse.ArgumentParser) -> None:
     truth = _truth_options()
-    _add_comparison(add("compare", compare, topics, threads, settings, truth))
-    _add_study(add("study", study, topics, threads, settings, truth))
+    _add_comparison(add("compare", compare, *parents, truth))
+    _add_study(add("study", study, *parents, truth))
 
 
 def _truth_options() -> argparse.ArgumentParser:

@@ -401,18 +401,15 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
             cells += [f"{mean['r_at_1_worst']:.2f} / {mean['anr_worst']:.2f}", f"{mean['bytes_per_image']:g}"]
             table.append((mean["method"], *cells))
         print_table(("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes"), table)
+    titles = ("R@1", "ANR %", "AP")
     if "sizes" in done:
-        table = [
-            (str(row["size"]), row["method"], *(f"{row[score]:.3f}" for score in scores))
-            for row in done["sizes"]["mean"]
-        ]
-        print_table(("library size", "method", "R@1", "ANR %", "AP"), table)
+        rows = done["sizes"]["mean"]
+        table = [(str(row["size"]), row["method"], *(f"{row[score]:.3f}" for score in scores)) for row in rows]
+        print_table(("library size", "method", *titles), table)
     if "ablations" in done:
-        table = [
-            (row["name"], row["setting"], *(f"{row[f'{score}_change']:+.3f}" for score in scores))
-            for row in done["ablations"]["rows"]
-        ]
-        print_table(("bobb without", "setting", "R@1", "ANR %", "AP"), table)
+        rows = done["ablations"]["rows"]
+        table = [(row["name"], row["setting"], *(f"{row[f'{score}_change']:+.3f}" for score in scores)) for row in rows]
+        print_table(("bobb without", "setting", *titles), table)
     warn(found["warnings"])
     figures = sum(len(one["figures"]) for one in done.values()) // 2
     print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")

@@ -39,14 +39,11 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 def explain(arguments: argparse.Namespace) -> None:
     """Explain one candidate closure of a run in words and a picture of both frames."""
-    from vplog.verbs.explain import between, numbered, worst
     from vplog.verbs.explain import explain as explain_closure
 
-    if arguments.worst:
-        choose = worst
-    else:
-        choose = numbered(*arguments.closure) if len(arguments.closure) == 1 else between(*arguments.closure)
-    told = explain_closure(arguments.run, choose, arguments.output, arguments.log, arguments.no_picture)
+    told = explain_closure(
+        arguments.run, arguments.closure, arguments.output, arguments.log, words_only=arguments.no_picture
+    )
     print_result(arguments, told, print_explanation)
 
 
@@ -66,10 +63,7 @@ def report(arguments: argparse.Namespace) -> None:
         arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments),
         _truth_options(arguments), Execution(arguments.threads),
     )  # fmt: skip
-    if arguments.json:
-        print_json(found)
-    else:
-        print(found["report"])
+    print_result(arguments, found, lambda found: print(found["report"]))
 
 
 def export(arguments: argparse.Namespace) -> None:

@@ -19,25 +19,24 @@ from vplog.verbs.explain_figure import View, draw
 from vplog.verbs.report import frames_at, recorded_pipeline, recorded_places
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from vplog.data import Closures, Keyframes
     from vplog.figures.closure_view import SharedBoxes
     from vplog.pipeline import Pipeline
 
-    Choose = Callable[[Closures, Keyframes], int]
-
 
 def explain(
     folder: Path,
-    choose: Choose,
+    closure: tuple[int, ...] | None,
     picture: Path | None = None,
     log: Path | None = None,
     words_only: bool = False,
 ) -> dict[str, Any]:
     """What happened to one closure of the run in `folder`: its row, sentences, and what the picture shows.
 
+    `closure` is its row of the ledger, or the rows or stamps in ns of its query and match; None is the one that the
+    solved trajectory is furthest from, in sigma.
     `picture` is the .png or .svg to write, `closure-K.png` in the run folder where None. The run's log is read for it,
     or `log` where that has moved. Raises VplogError with one line.
     """
@@ -49,7 +48,7 @@ def explain(
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     path = folder / "closures.parquet"
     closures = tables.read_closures(path)
-    number = choose(closures, keyframes)
+    number = _chosen(closure, closures, keyframes)
     row = tables.read_closure(path, number)
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
     reason = str(run_record.recorded(record, folder / "run.json", dict, "solution").get("reason", ""))
@@ -62,37 +61,27 @@ def explain(
     return {"run": str(folder), "closure": number, "row": row, **asdict(words), "picture": shown}
 
 
-def numbered(number: int) -> Choose:
-    """The closure in this row of the ledger."""
-    return lambda _closures, _keyframes: number
-
-
-def between(query: int, match: int) -> Choose:
-    """The closure of two keyframes, by their rows or their stamps in ns."""
-
-    def choose(closures: Closures, keyframes: Keyframes) -> int:
-        count = len(keyframes.stamp_ns)
-        rows = [one if one < count else int(np.searchsorted(keyframes.stamp_ns, one)) for one in (query, match)]
-        for one, at in zip((query, match), rows, strict=True):
-            if at >= count or (one >= count and keyframes.stamp_ns[at] != one):
-                raise ResultError(f"No keyframe has the row or stamp {one}. Rows are 0..{count - 1}; stamps are in ns.")
-        found = np.flatnonzero((closures.query == rows[0]) & (closures.match == rows[1]))
-        if not len(found):
-            known = closures.match[closures.query == rows[0]].tolist()
-            raise ResultError(
-                f"Keyframe {rows[1]} was not proposed for keyframe {rows[0]}. "
-                f"Proposed for it: {', '.join(map(str, known)) or 'none'}."
-            )
-        return int(found[0])
-
-    return choose
-
-
-def worst(closures: Closures, _keyframes: Keyframes) -> int:
-    """The closure that the solved trajectory is furthest from, in sigma."""
-    if not np.isfinite(closures.residual_after).any():
-        raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
-    return int(np.nanargmax(closures.residual_after))
+def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyframes) -> int:
+    """Row of the ledger."""
+    if closure is None:
+        if not np.isfinite(closures.residual_after).any():
+            raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
+        return int(np.nanargmax(closures.residual_after))
+    if len(closure) == 1:
+        return closure[0]
+    count = len(keyframes.stamp_ns)
+    rows = [one if one < count else int(np.searchsorted(keyframes.stamp_ns, one)) for one in closure]
+    for one, at in zip(closure, rows, strict=True):
+        if at >= count or (one >= count and keyframes.stamp_ns[at] != one):
+            raise ResultError(f"No keyframe has the row or stamp {one}. Rows are 0..{count - 1}; stamps are in ns.")
+    found = np.flatnonzero((closures.query == rows[0]) & (closures.match == rows[1]))
+    if not len(found):
+        known = closures.match[closures.query == rows[0]].tolist()
+        raise ResultError(
+            f"Keyframe {rows[1]} was not proposed for keyframe {rows[0]}. "
+            f"Proposed for it: {', '.join(map(str, known)) or 'none'}."
+        )
+    return int(found[0])
 
 
 def _show(
