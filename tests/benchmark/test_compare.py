@@ -16,7 +16,7 @@ from vplog import logs
 from vplog.benchmark import compare
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_bytes
 from vplog.benchmark.recogniser_specs import known_methods, read_method, split_methods
-from vplog.benchmark.traversals import candidate_stops, extract_walk
+from vplog.benchmark.traversals import candidate_stops, extract_traversal
 from vplog.errors import LogError, SettingsError
 from vplog.evaluate.pairs import index_pairs
 from vplog.evaluate.place_truth import TruthChoice
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.benchmark.traversals import Walk
+    from vplog.benchmark.traversals import Traversal
     from vplog.data import Ints
     from vplog.demo.record import Drive
     from vplog.evaluate.pairs import Pairs
@@ -56,10 +56,10 @@ TIMES = {"encode_ms", "feature_ms", "mining_ms", "query_ms", "learn_s"}
 
 
 @pytest.fixture(scope="module")
-def walks(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two folders of the same 16 frames: as they are, and darker with other noise."""
     log = logs.open(drive.log)
-    folders = tmp_path_factory.mktemp("walks") / "day", tmp_path_factory.mktemp("walks") / "dusk"
+    folders = tmp_path_factory.mktemp("traversals") / "day", tmp_path_factory.mktemp("traversals") / "dusk"
     for folder in folders:
         folder.mkdir()
     rng = np.random.default_rng(0)
@@ -78,12 +78,14 @@ def store(tmp_path: Path) -> Iterator[FeatureStore]:
 
 
 @pytest.fixture(scope="module")
-def day(walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
+def day(traversals: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Traversal]:
     with FeatureStore(tmp_path_factory.mktemp("day") / "features") as found:
-        yield extract_walk(logs.open(walks[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), execution=Execution(2))
+        yield extract_traversal(
+            logs.open(traversals[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), execution=Execution(2)
+        )
 
 
-def inputs_of(walk: Walk, truth: Pairs, stops: Ints, *more: Any, **others: Any) -> MethodInputs:
+def inputs_of(walk: Traversal, truth: Pairs, stops: Ints, *more: Any, **others: Any) -> MethodInputs:
     """A drive against itself."""
     return MethodInputs(walk.references, walk, walk, truth, stops, *more, **others)
 
@@ -99,10 +101,12 @@ def without_times(record: dict[str, Any]) -> dict[str, Any]:
 # One walk, one method
 
 
-def test_a_walk_holds_the_chosen_frames(walks: tuple[Path, Path], store: FeatureStore) -> None:
-    log = logs.open(walks[0])
+def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: FeatureStore) -> None:
+    log = logs.open(traversals[0])
     seen = []
-    walk = extract_walk(log, SIFT, store, np.array([2, 3, 7]), np.array([3]), Execution(2, lambda *at: seen.append(at)))
+    walk = extract_traversal(
+        log, SIFT, store, np.array([2, 3, 7]), np.array([3]), Execution(2, lambda *at: seen.append(at))
+    )
     assert walk.frames.tolist() == [2, 3, 7]
     assert walk.stamp_ns.tolist() == log.stamps()[[2, 3, 7]].tolist()
     assert [reference.stamp_ns for reference in walk.references] == [int(log.stamps()[3])]
@@ -114,22 +118,22 @@ def test_a_walk_holds_the_chosen_frames(walks: tuple[Path, Path], store: Feature
 
 
 def test_frames_keep_their_numbers_where_others_are_damaged(
-    walks: tuple[Path, Path], store: FeatureStore, tmp_path: Path
+    traversals: tuple[Path, Path], store: FeatureStore, tmp_path: Path
 ) -> None:
     folder = tmp_path / "damaged"
     folder.mkdir()
     for number in range(4):
-        data = (walks[0] / f"{number}.png").read_bytes()
+        data = (traversals[0] / f"{number}.png").read_bytes()
         (folder / f"{number}.png").write_bytes(data[:100] if number == 1 else data)
-    walk = extract_walk(logs.open(folder), SIFT, store, chosen=np.array([1, 2]))
+    walk = extract_traversal(logs.open(folder), SIFT, store, chosen=np.array([1, 2]))
     assert walk.frames.tolist() == [0, 2, 3]
     assert len(walk.references) == 1
     assert "1 of 4 frames could not be decoded" in walk.warnings[0]
     with pytest.raises(LogError, match="none of 1 frames could be decoded"):
-        extract_walk(logs.open(folder), SIFT, store, np.array([1]))
+        extract_traversal(logs.open(folder), SIFT, store, np.array([1]))
 
 
-def test_threads_and_scratch_change_nothing(day: Walk, tmp_path: Path) -> None:
+def test_threads_and_scratch_change_nothing(day: Traversal, tmp_path: Path) -> None:
     """A drive against itself: frames 4 older or more, of which those 4 to 6 older are called true."""
     stops = candidate_stops(day.frames, day.frames, 4)
     truth = index_pairs(day.frames - 5, day.frames, 1)
@@ -145,7 +149,7 @@ def test_threads_and_scratch_change_nothing(day: Walk, tmp_path: Path) -> None:
         assert np.isnan(a.scores[q, max(q - 3, 0) :]).all()
 
 
-def test_figures_of_a_method(day: Walk) -> None:
+def test_figures_of_a_method(day: Traversal) -> None:
     """Every frame finds itself first: each has some feature in the library and no twin."""
     truth = index_pairs(day.frames, day.frames, 0)
     seen: list[tuple[str, int, int]] = []
@@ -163,7 +167,7 @@ def test_figures_of_a_method(day: Walk) -> None:
     assert result.sequence_ranks is None
 
 
-def test_figures_of_sequences(day: Walk, tmp_path: Path) -> None:
+def test_figures_of_sequences(day: Traversal, tmp_path: Path) -> None:
     """Beside those of single views, and the same as by the whole matrix at once."""
     truth, stops = index_pairs(day.frames - 5, day.frames, 1), candidate_stops(day.frames, day.frames, 4)
     sequence = SequenceSettings(length=5)
@@ -240,8 +244,8 @@ def test_methods_that_do_not_exist(name: str, said: str) -> None:
 # Two drives, or one
 
 
-def test_the_same_frames_at_dusk(walks: tuple[Path, Path]) -> None:
-    day, dusk = walks
+def test_the_same_frames_at_dusk(traversals: tuple[Path, Path]) -> None:
+    day, dusk = traversals
     methods = ["bobb", "bobb:windows_along=2", "bovf:words=300"]
     options = compare.CompareOptions(library_size=8)
     done = compare.compare(dusk, day, methods, TruthChoice("index"), SMALL, options, Execution(2))
@@ -282,8 +286,8 @@ def test_the_log_tells_its_own_truth(verb: Verb, drive: Drive) -> None:
         assert 5 < found["positives"] < found["queries"]
 
 
-def test_files_are_the_same_every_time(verb: Verb, walks: tuple[Path, Path], tmp_path: Path) -> None:
-    day, dusk = walks
+def test_files_are_the_same_every_time(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    day, dusk = traversals
     (tmp_path / "truth.csv").write_text("query,match\n" + "".join(f"{i},{i}\n" for i in range(FRAMES)))
     outs = [tmp_path / "a", tmp_path / "b"]
     for out, threads in zip(outs, (1, 3), strict=True):
@@ -314,9 +318,9 @@ def test_files_are_the_same_every_time(verb: Verb, walks: tuple[Path, Path], tmp
     assert b"paper:partitions=5" in (outs[0] / "curves.svg").read_bytes()
 
 
-def test_probabilities_are_held_against_the_truth(verb: Verb, walks: tuple[Path, Path], tmp_path: Path) -> None:
+def test_probabilities_are_held_against_the_truth(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
     """Only FAB-MAP states any; a comparison without it has no diagram, not even one of an earlier comparison."""
-    day, dusk = walks
+    day, dusk = traversals
     out = tmp_path / "out"
     arguments = ("compare", dusk, day, "--truth", "index", "--library-size", 12, "-o", out, "--json", *QUICK)
     found = verb(*arguments, "--methods", "fabmap,thumbnail").json["methods"]
@@ -332,9 +336,9 @@ def test_probabilities_are_held_against_the_truth(verb: Verb, walks: tuple[Path,
 
 
 def test_an_interrupted_comparison_leaves_the_one_before(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    day, dusk = walks
+    day, dusk = traversals
     out = tmp_path / "out"
     arguments = ("compare", dusk, day, "--truth", "index", "--methods", "thumbnail", "-o", out, "--json", *QUICK)
     assert verb(*arguments).code == 0
@@ -351,10 +355,10 @@ def test_an_interrupted_comparison_leaves_the_one_before(
 
 
 def test_libraries_of_every_origin(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The map's own frames are the default; a drive is drawn from in the same way; a saved library is taken whole."""
-    day, dusk = walks
+    day, dusk = traversals
     saved = tmp_path / "library"
     assert verb("library", day, "-o", saved, "--set", "library.size=6", *QUICK).code == 0
     arguments = ("compare", dusk, day, "--truth", "index", "--methods", "vlad:centres=8", "--json", *QUICK)
@@ -372,7 +376,7 @@ def test_libraries_of_every_origin(
     assert few["library"]["size"] == FRAMES
     assert any("16 images instead of 50" in warning for warning in few["warnings"])
     (saved / "features.parquet").write_bytes(b"damaged")
-    monkeypatch.setattr(compare, "extract_walk", None)  # which takes minutes, so a library is read before
+    monkeypatch.setattr(compare, "extract_traversal", None)  # which takes minutes, so a library is read before
     assert str(saved) in verb(*arguments, "--library", saved).error
 
 
@@ -414,16 +418,16 @@ def test_frames_without_truth_are_left_out(verb: Verb, drive: Drive, tmp_path: P
     ],
 )
 def test_what_cannot_be_compared_is_said_in_one_line(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, arguments: tuple[str, ...], said: str
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, arguments: tuple[str, ...], said: str
 ) -> None:
-    folders = {"DAY": walks[0], "DUSK": walks[1], "NOWHERE": tmp_path / "nowhere"}
+    folders = {"DAY": traversals[0], "DUSK": traversals[1], "NOWHERE": tmp_path / "nowhere"}
     named = [folders.get(argument, argument) for argument in arguments]
     methods = () if "--methods" in arguments else ("--methods", "bobb")
     assert said in verb("compare", *named, *methods, *QUICK).error
 
 
-def test_truth_of_another_drive(verb: Verb, walks: tuple[Path, Path], drive: Drive) -> None:
-    said = verb("compare", walks[1], walks[0], "--truth", drive.truth, "--methods", "bobb", *QUICK).error
+def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive: Drive) -> None:
+    said = verb("compare", traversals[1], traversals[0], "--truth", drive.truth, "--methods", "bobb", *QUICK).error
     assert "covers none of the 16 frames of the query dusk" in said
 
 

@@ -19,7 +19,7 @@ import vplog
 from vplog import logs
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
-from vplog.benchmark.traversals import Walk, candidate_stops, extract_walk
+from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.evaluate.retrieval import average_precision, precision_recall, recall_at
@@ -109,17 +109,19 @@ def compare(
             library = None
         wanted = LibrarySettings(choose="random", size=options.library_size, seed=options.library_seed)
 
-        def walk_of(log: Log, role: str, frames: Ints, references: Ints | None = None) -> Walk:
+        def traversal_of(log: Log, role: str, frames: Ints, references: Ints | None = None) -> Traversal:
             store = stack.enter_context(FeatureStore(scratch / f"{role}.features"))
-            return extract_walk(log, pipeline.features, store, frames, references, execution)
+            return extract_traversal(log, pipeline.features, store, frames, references, execution)
 
         source = None
         if library is not None:
             source = load_references(library, execution) if _is_saved(library) else logs.open(library, topics)
-        map_walk, query_walk, references, notes = _extract_all(query_log, map_log, known, source, wanted, walk_of)
+        map_traversal, query_traversal, references, notes = _extract_all(
+            query_log, map_log, known, source, wanted, traversal_of
+        )
         warnings += notes
-        stops = candidate_stops(query_walk.frames, map_walk.frames, min_gap)
-        pairs = known.pairs(query_walk.frames, map_walk.frames).below(stops)
+        stops = candidate_stops(query_traversal.frames, map_traversal.frames, min_gap)
+        pairs = known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
         account: dict[str, Any] = {
             "vplog": vplog.__version__,
             "query": str(query),
@@ -132,13 +134,13 @@ def compare(
                 "hash": references_hash(references, pipeline.features),
             },
             "truth": {**known.about, "pairs": pairs.count},
-            "queries": len(query_walk),
-            "map_frames": len(map_walk),
+            "queries": len(query_traversal),
+            "map_frames": len(map_traversal),
             "positives": int(pairs.positive.sum()),
             "features": pipeline.features.model_dump(mode="json"),
             "methods": {},
         }
-        inputs = MethodInputs(references, map_walk, query_walk, pairs, stops, sequences, scratch)
+        inputs = MethodInputs(references, map_traversal, query_traversal, pairs, stops, sequences, scratch)
         ranks: dict[str, Ranks] = {}
         reliable: dict[str, Reliability] = {}
         for number, (name, settings) in enumerate(recognisers.items(), start=1):
@@ -150,7 +152,9 @@ def compare(
             if result.sequence_ranks is not None:
                 ranks[f"{name}, L={options.sequence}"] = result.sequence_ranks
             if made is not None:
-                result.figures["scores"] = _write_scores(made, number, name, result.scores, query_walk, map_walk)
+                result.figures["scores"] = _write_scores(
+                    made, number, name, result.scores, query_traversal, map_traversal
+                )
         account["warnings"] = list(dict.fromkeys([*query_log.warnings, *map_log.warnings, *warnings]))
         if made is not None:
             draw_curves(ranks, made)
@@ -166,26 +170,26 @@ def _extract_all(
     known: PlaceTruth,
     library: Log | list[Reference] | None,
     wanted: LibrarySettings,
-    walk_of: Callable[..., Walk],
-) -> tuple[Walk, Walk, list[Reference], list[str]]:
+    traversal_of: Callable[..., Traversal],
+) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
     """Walks of the map and the query, one and the same for a drive against itself, the references, and warnings."""
     chosen = known.map_frames[choose(other.stamps()[known.map_frames], wanted)] if library is None else None
-    map_walk = walk_of(other, "map", known.map_frames, chosen)
-    query_walk = map_walk if query is other else walk_of(query, "query", known.query_frames)
-    warnings = list(dict.fromkeys(map_walk.warnings + query_walk.warnings))
+    map_traversal = traversal_of(other, "map", known.map_frames, chosen)
+    query_traversal = map_traversal if query is other else traversal_of(query, "query", known.query_frames)
+    warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
     if isinstance(library, list):
-        return map_walk, query_walk, library, warnings
-    references = map_walk.references
+        return map_traversal, query_traversal, library, warnings
+    references = map_traversal.references
     if library is not None:
         rows = choose(library.stamps(), wanted)
-        walk = walk_of(library, "library", rows, rows)
-        references = walk.references
-        warnings += walk.warnings
+        traversal = traversal_of(library, "library", rows, rows)
+        references = traversal.references
+        warnings += traversal.warnings
     if len(references) < (wanted.size or 0):
         warnings.append(
             f"The library has {len(references)} images instead of {wanted.size}: its drive has no more frames."
         )
-    return map_walk, query_walk, references, warnings
+    return map_traversal, query_traversal, references, warnings
 
 
 def _is_saved(library: Path | None) -> bool:
@@ -235,7 +239,7 @@ def _comparison_in(out: Path) -> list[str]:
     return ["compare.json", "scores-[0-9][0-9]-*.npz", *(f"{name}.[ps][nv]g" for name in ("curves", "reliability"))]
 
 
-def _write_scores(out: Path, number: int, name: str, scores: Float32s, query: Walk, other: Walk) -> str:
+def _write_scores(out: Path, number: int, name: str, scores: Float32s, query: Traversal, other: Traversal) -> str:
     """Name of the file; the number tells apart what the letters that files may have do not."""
     file = f"scores-{number:02d}-{re.sub(r'[^A-Za-z0-9.=+-]+', '_', Path(name).name)[:80]}.npz"
     with replacing(out / file) as stream:

@@ -1,4 +1,4 @@
-"""One place recogniser on one query walk and one map: what it finds, what it takes.
+"""One place recogniser on one query traversal and one map: what it finds, what it takes.
 
 Times are CPU time of the thread that does the work, so they are those of one thread, however many are busy.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from vplog.benchmark.traversals import Walk
+    from vplog.benchmark.traversals import Traversal
     from vplog.data import Float32s, Floats, Ints, Reference
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.retrieval import Ranks, Reliability
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceIndex, PlaceState
 
 RELIABILITY_BINS = 10
-"""Of probability: with the 200 answers of a short walk a bin holds 20."""
+"""Of probability: with the 200 answers of a short traversal a bin holds 20."""
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` asks for by default, and the deepest recall reported."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What one method made of one query walk and one map."""
+    """What one method made of one query traversal and one map."""
 
     scores: Float32s
     """(Q, M), NaN for rows that are no candidates."""
@@ -58,8 +58,8 @@ class MethodInputs:
     """What every method of a comparison gets."""
 
     references: Sequence[Reference]
-    map_walk: Walk
-    query_walk: Walk
+    map_traversal: Traversal
+    query_traversal: Traversal
     """The same object for a drive against itself, which is described once."""
     truth: Pairs
     stops: Ints
@@ -70,27 +70,32 @@ class MethodInputs:
 
 
 def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Execution = Execution()) -> MethodResult:
-    """Learn the references, describe both walks, search the map for every query.
+    """Learn the references, describe both traversals, search the map for every query.
 
     The map is rebuilt from what a table would store of it, so the bytes counted are all that is used.
     Raises TruthError without a true pair, and whatever the method raises.
     """
-    map_walk, query_walk, truth, stops = inputs.map_walk, inputs.query_walk, inputs.truth, inputs.stops
+    map_traversal, query_traversal, truth, stops = (
+        inputs.map_traversal,
+        inputs.query_traversal,
+        inputs.truth,
+        inputs.stops,
+    )
     began = time.process_time()
     state: Any = settings.learn(inputs.references, execution)
     learn_s = time.process_time() - began  # of all threads
-    places, mining_ms = describe_walk(state, map_walk, "describe map", execution)
+    places, mining_ms = describe_traversal(state, map_traversal, "describe map", execution)
     column = state.to_arrow(places)
     places = state.from_arrow(column)
     index, queries = state.index(places), places
-    if query_walk is not map_walk:
-        queries, more = describe_walk(state, query_walk, "describe queries", execution)
+    if query_traversal is not map_traversal:
+        queries, more = describe_traversal(state, query_traversal, "describe queries", execution)
         mining_ms = np.concatenate([mining_ms, more])
     scores = score_table(len(queries), len(index), inputs.scratch, "scores")
     query_ms = search(index, queries, stops, scores, execution)
     ranks = retrieval.rank_queries(scores, truth, stops)
-    walks = [map_walk] if query_walk is map_walk else [map_walk, query_walk]
-    feature_ms = float(np.median(np.concatenate([walk.feature_ms for walk in walks])))
+    traversals = [map_traversal] if query_traversal is map_traversal else [map_traversal, query_traversal]
+    feature_ms = float(np.median(np.concatenate([traversal.feature_ms for traversal in traversals])))
     figures = {
         **asdict(retrieval.score_retrieval(ranks)),
         "bytes_per_image": round(stored_bytes(column) / len(column), 1),
@@ -116,16 +121,18 @@ def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Ex
     return MethodResult(scores, ranks, figures, by_sequence, reliable)
 
 
-def describe_walk(state: PlaceState, walk: Walk, stage: str, execution: Execution) -> tuple[list[Any], Floats]:
+def describe_traversal(
+    state: PlaceState, traversal: Traversal, stage: str, execution: Execution
+) -> tuple[list[Any], Floats]:
     """A descriptor for every row, and the CPU ms (N,) each took."""
 
     def work(row: int) -> tuple[Any, float]:
-        features = walk.store[row]
+        features = traversal.store[row]
         began = time.thread_time()
         place = state.describe(features)
         return place, 1e3 * (time.thread_time() - began)
 
-    return _timed_map(work, len(walk), stage, execution)
+    return _timed_map(work, len(traversal), stage, execution)
 
 
 def search(

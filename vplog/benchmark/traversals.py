@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Walk:
+class Traversal:
     """The frames of a drive as features, on disk."""
 
     name: str
@@ -40,14 +40,14 @@ class Walk:
         return len(self.frames)
 
 
-def extract_walk(
+def extract_traversal(
     log: Log,
     extractor: Extractor,
     store: FeatureStore,
     frames: Ints | None = None,
     chosen: Ints | None = None,
     execution: Execution = Execution(),
-) -> Walk:
+) -> Traversal:
     """Features of the frames with these numbers (all where None), streamed into an empty store.
 
     The images of `chosen`, numbers among them, are kept as references. Frames that cannot be decoded are left out,
@@ -56,7 +56,7 @@ def extract_walk(
     stamps = log.stamps()
     frames = np.arange(len(stamps)) if frames is None else frames
     wanted = set() if chosen is None else set(chosen.tolist())
-    kept, spent, references, lost = [], [], [], []
+    numbers, spent, references, lost = [], [], [], []
 
     def timed(image: Bytes, depth_m: Float32s | None = None) -> Features:
         began = time.thread_time()
@@ -71,17 +71,17 @@ def extract_walk(
             continue
         number = int(np.searchsorted(stamps, stamp_ns))
         store.append(features)
-        kept.append(number)
+        numbers.append(number)
         if number in wanted:
             references.append(Reference(frame.image, features, log.name, stamp_ns))
-    if not kept:
+    if not numbers:
         why = f" The first: {lost[0]}" if lost else " `vplog info` shows what is in it."
         raise LogError(f"{log.name}: none of {len(frames)} frames could be decoded.{why}")
     warnings = []
     if lost:
         warnings.append(f"{log.name}: {len(lost)} of {len(frames)} frames could not be decoded. First: {lost[0]}")
-    rows = np.array(kept, np.int64)
-    return Walk(log.name, store, rows, stamps[rows], references, np.array(spent), warnings)
+    rows = np.array(numbers, np.int64)
+    return Traversal(log.name, store, rows, stamps[rows], references, np.array(spent), warnings)
 
 
 def candidate_stops(query_frames: Ints, map_frames: Ints, min_gap: int | None) -> Ints:

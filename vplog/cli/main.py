@@ -207,7 +207,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
     from vplog.run.report import outcome_of
 
-    paths, pipeline, library, topics = _asked(arguments)
+    paths, pipeline, library, topics = _request(arguments)
     remote = "://" in str(arguments.shown)  # and `output` what is sent there
     with Progress(arguments) as progress:
         found = api.run(
@@ -222,7 +222,7 @@ def run(arguments: argparse.Namespace) -> None:
         print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
 
 
-def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
+def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
     """Logs, settings, library and topics: those of the command, or with --resume those of the unfinished run."""
     if not arguments.resume:
         if not arguments.logs:
@@ -234,15 +234,15 @@ def _asked(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | 
 
     if "://" in str(arguments.shown):
         arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
-    asking, asked_by = vars(arguments), ("pipeline", "set", "library", "gps")
-    names = [name for name in asking if name in asked_by or name.endswith(("_topic", "_file"))]
-    given = [name for name in names if asking[name] not in (None, [], False, "default")]
+    fixed = ("pipeline", "set", "library", "gps")
+    names = [name for name in vars(arguments) if name in fixed or name.endswith(("_topic", "_file"))]
+    given = [name for name in names if getattr(arguments, name) not in (None, [], False, "default")]
     if given or not arguments.cache:
-        option = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
-        arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{option}")
-    asked = resume_request(arguments.output, arguments.logs)
-    arguments.one_drive, arguments.force = not asked.several, True  # what it replaces, it was asked when it began
-    return asked.logs, asked.pipeline, asked.library, asked.topics
+        name = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
+        arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{name}")
+    request = resume_request(arguments.output, arguments.logs)
+    arguments.one_drive, arguments.force = not request.several, True  # what it replaces, it was asked when it began
+    return request.logs, request.pipeline, request.library, request.topics
 
 
 def config(arguments: argparse.Namespace) -> None:
@@ -306,8 +306,8 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
     def group(name: str, text: str, parents: Sequence[argparse.ArgumentParser] = ()) -> argparse.ArgumentParser:
-        said = text[0].lower() + text[1:].rstrip(".")
-        return verbs.add_parser(name, help=said, description=text, parents=parents)
+        summary = text[0].lower() + text[1:].rstrip(".")
+        return verbs.add_parser(name, help=summary, description=text, parents=parents)
 
     def add(name: str, verb: Verb, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
         sub = group(name, verb.__doc__ or "", [common, *parents])

@@ -103,8 +103,8 @@ def _end(
         if found["failed"]:
             raise ResultError(wrong)
         if found["join_error"]:
-            said = f"The drives are in {found['map']}, but not joined: {found['join_error'].rstrip('.')}."
-            raise ResultError(f"{said} Then join them: vplog map join {found['map']}")
+            text = f"The drives are in {found['map']}, but not joined: {found['join_error'].rstrip('.')}."
+            raise ResultError(f"{text} Then join them: vplog map join {found['map']}")
 
 
 def info_map(arguments: argparse.Namespace) -> None:

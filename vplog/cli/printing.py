@@ -223,12 +223,12 @@ def _print_lines(label: str, lines: list[str]) -> None:
         label = ""
 
 
-def print_explanation(told: dict[str, Any]) -> None:
-    print(f"closure {told['closure']} of {told['run']}")
+def print_explanation(found: dict[str, Any]) -> None:
+    print(f"closure {found['closure']} of {found['run']}")
     for name in ("verdict", "proposed", "geometry", "solver", "change"):
-        print_line("to change" if name == "change" else name, told[name])
-    if told["picture"]:
-        print(f"{'picture':10}{told['picture']['file']}")
+        print_line("to change" if name == "change" else name, found[name])
+    if found["picture"]:
+        print(f"{'picture':10}{found['picture']['file']}")
 
 
 def print_optimised(found: dict[str, Any]) -> None:

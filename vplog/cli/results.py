@@ -41,10 +41,10 @@ def explain(arguments: argparse.Namespace) -> None:
     """Explain one candidate closure of a run in words and a picture of both frames."""
     from vplog.verbs.explain import explain as explain_closure
 
-    told = explain_closure(
+    found = explain_closure(
         arguments.run, arguments.closure, arguments.output, arguments.log, words_only=arguments.no_picture
     )
-    print_result(arguments, told, print_explanation)
+    print_result(arguments, found, print_explanation)
 
 
 def optimize(arguments: argparse.Namespace) -> None:

@@ -39,10 +39,10 @@ QUICK = (
 
 
 @pytest.fixture(scope="module")
-def walks(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two folders of the same frames: as they are, and darker with other noise."""
     log = logs.open(drive.log)
-    folders = tmp_path_factory.mktemp("walks") / "walk_day", tmp_path_factory.mktemp("walks") / "walk_dusk"
+    folders = tmp_path_factory.mktemp("traversals") / "walk_day", tmp_path_factory.mktemp("traversals") / "walk_dusk"
     rng = np.random.default_rng(0)
     for folder in folders:
         folder.mkdir()
@@ -63,11 +63,11 @@ def without_seconds(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_every_experiment_on_two_drives(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     two = [departure for departure in DEPARTURES if departure.name in ("no agreement", "own image left out")]
     monkeypatch.setattr("vplog.benchmark.study.experiments.DEPARTURES", two)  # they stand for all: one loop does them
-    day, dusk = walks
+    day, dusk = traversals
     out = tmp_path / "study"
     arguments = ("study", day, dusk, "--truth", "index", "-o", out, *QUICK)
     found = verb(*arguments, "--threads", 2, "--json").json
@@ -141,10 +141,10 @@ def find(rows: list[dict[str, Any]], method: str, query: str) -> dict[str, Any]:
 
 
 def test_bytes_do_not_depend_on_threads_and_the_interrupted_goes_on(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
 ) -> None:
     outs = [tmp_path / "a", tmp_path / "b"]
-    arguments = ("study", *walks, "--truth", "index", *QUICK, "--seeds", 1, "--json")
+    arguments = ("study", *traversals, "--truth", "index", *QUICK, "--seeds", 1, "--json")
     records = [
         verb(*arguments, "-o", out, "--only", "pairs,sequence", "--threads", threads).json
         for out, threads in zip(outs, (1, 3), strict=True)
@@ -172,11 +172,11 @@ def test_bytes_do_not_depend_on_threads_and_the_interrupted_goes_on(
 
 
 def test_an_interrupted_study_leaves_the_one_before_and_goes_on(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it had finished is not done again, and nothing of it is in OUT before all is."""
     out = tmp_path / "study"
-    arguments = ("study", *walks, "--truth", "index", "-o", out, *QUICK, "--methods", "thumbnail,gist")
+    arguments = ("study", *traversals, "--truth", "index", "-o", out, *QUICK, "--methods", "thumbnail,gist")
     assert verb(*arguments, "--only", "pairs", "--library-size", 4).code == 0
 
     def state() -> dict[str, bytes]:
@@ -226,11 +226,11 @@ def test_departures_are_settings_that_change_something() -> None:
 
 @pytest.mark.parametrize("gone", ["soft_sift=true", "agreement_floor=2", "pairing=worst"])
 def test_a_departure_that_is_no_more_is_one_line(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: str
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: str
 ) -> None:
     stale = Departure("stale", (gone,), "Once there.")
     monkeypatch.setattr("vplog.benchmark.study.experiments.DEPARTURES", (*DEPARTURES, stale))
-    arguments = ("study", *walks, "--truth", "index", "-o", tmp_path / "out", *QUICK)
+    arguments = ("study", *traversals, "--truth", "index", "-o", tmp_path / "out", *QUICK)
     said = verb(*arguments, "--only", "ablations").error
     assert f"bobb:{gone}" in said
     assert "`vplog config` prints every setting" in said
@@ -259,9 +259,9 @@ def test_a_departure_that_is_no_more_is_one_line(
     ],
 )
 def test_what_cannot_be_studied_is_said_in_one_line(
-    verb: Verb, walks: tuple[Path, Path], tmp_path: Path, arguments: tuple[str, ...], said: str
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, arguments: tuple[str, ...], said: str
 ) -> None:
-    folders = {"DAY": walks[0], "DUSK": walks[1], "OTHER": tmp_path / "other"}
+    folders = {"DAY": traversals[0], "DUSK": traversals[1], "OTHER": tmp_path / "other"}
     folders["OTHER"].mkdir()
     (folders["OTHER"] / "study.json").write_text('{"drives": [{"log": "/other.mcap", "hash": "0"}]}')
     named = [folders.get(argument, argument) for argument in arguments]

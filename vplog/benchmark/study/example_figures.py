@@ -90,8 +90,8 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
                     "query": bench.names[query],
                     "map": bench.names[other],
                     "kind": kind,
-                    "query_frame": int(bench.walk(query).frames[row]),
-                    "map_frame": int(bench.walk(other).frames[match]),
+                    "query_frame": int(bench.traversal(query).frames[row]),
+                    "map_frame": int(bench.traversal(other).frames[match]),
                     "rank": int(ranks.better[row]),
                     "shared_references": _shared(state, places[query][row], places[other][match]),
                     "figure": f"{file}.png",
@@ -122,7 +122,7 @@ def sequence(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
         "method": name,
         "query": bench.names[query],
         "library": bench.names[other],
-        "frames": [int(bench.walk(query).frames[row]) for row in rows],
+        "frames": [int(bench.traversal(query).frames[row]) for row in rows],
         "references": {str(reference): int(used[reference]) for reference in order},
     }
     return about, ["sequence"]
@@ -208,9 +208,9 @@ def _draw_example(
             _show(axes, image)
             _windows(axes, image, state.windows(0))
             axes.set_title(
-                as_text(f"{role}: {bench.names[drive]}, frame {int(bench.walk(drive).frames[row])}"), fontsize=8.5
+                as_text(f"{role}: {bench.names[drive]}, frame {int(bench.traversal(drive).frames[row])}"), fontsize=8.5
             )
-            features = bench.walk(drive).store[row]
+            features = bench.traversal(drive).store[row]
             for column, j in enumerate(chosen, start=1):
                 reference = int(mine.references[j])
                 picture = state.references[reference].image
@@ -221,7 +221,7 @@ def _draw_example(
                     _coloured(grid[line, column], picture, boxes, int(rank[0]))
                     text = f"reference {reference}, no. {int(rank[0]) + 1} of {role.split()[-1]}"
                 else:
-                    itself = state.references[reference].stamp_ns == int(bench.walk(drive).stamp_ns[row])
+                    itself = state.references[reference].stamp_ns == int(bench.traversal(drive).stamp_ns[row])
                     text = f"reference {reference}, {'this very frame' if itself else 'not chosen'}"
                 grid[line, column].set_title(text, fontsize=8.5, color="black" if len(rank) else "#999999")
         explain(
@@ -250,7 +250,7 @@ def _draw_sequence(
             np.atleast_1d(strip.subplots(1, len(rows))), bench.images(query, rows), rows, colours, strict=True
         ):
             _show(axes, image)
-            axes.set_title(f"{int(bench.walk(query).frames[row])}", fontsize=8, color=colour, fontweight="bold")
+            axes.set_title(f"{int(bench.traversal(query).frames[row])}", fontsize=8, color=colour, fontweight="bold")
             for spine in axes.spines.values():
                 spine.set(visible=True, color=colour, linewidth=2.5)
         axes = plane.subplots()
@@ -278,12 +278,12 @@ def _draw_sequence(
         for axes, reference in zip(np.atleast_1d(below.subplots(1, max(len(close_ups), 1))), close_ups, strict=False):
             image = state.references[reference].image
             _show(axes, image)
-            seen: dict[tuple[float, ...], int] = {}
+            drawn_at: dict[tuple[float, ...], int] = {}
             for boxes, colour in zip(run, colours, strict=True):
                 at = np.flatnonzero(boxes.references == reference)
                 corners = boxes.corners[int(at[0]), middle] if len(at) else np.full(4, np.nan)
                 if not np.isnan(corners).any():
-                    _box(axes, image, _inside(corners, seen), colour, width=1.6)
+                    _box(axes, image, _inside(corners, drawn_at), colour, width=1.6)
             axes.set_title(f"reference {reference}: box of the middle window, frame by frame", fontsize=8.5)
         explain(
             figure,
@@ -344,16 +344,16 @@ def _windows(axes: Axes, image: Bytes, windows: Floats) -> None:
 
 def _coloured(axes: Axes, image: Bytes, boxes: Boxes, rank: int) -> None:
     """Boxes in the colours of their windows; those in one spot are drawn inside each other."""
-    seen: dict[tuple[float, ...], int] = {}
+    drawn_at: dict[tuple[float, ...], int] = {}
     colours = _window_colours(boxes.corners.shape[1])
     for corners, colour in zip(boxes.corners[rank], colours, strict=True):
         if np.isnan(corners).any():
             continue
-        _box(axes, image, _inside(corners, seen), colour)
+        _box(axes, image, _inside(corners, drawn_at), colour)
 
 
-def _inside(corners: Floats, seen: dict[tuple[float, ...], int]) -> Floats:
+def _inside(corners: Floats, drawn_at: dict[tuple[float, ...], int]) -> Floats:
     """A little smaller for each box drawn in the same spot before, so that none hides another."""
-    times = seen[tuple(corners)] = seen.get(tuple(corners), -1) + 1
+    times = drawn_at[tuple(corners)] = drawn_at.get(tuple(corners), -1) + 1
     shrink = 0.008 * min(times, 6)
     return corners + np.array([shrink, shrink, -shrink, -shrink])

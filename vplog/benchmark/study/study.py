@@ -119,8 +119,8 @@ def study(
                 _write(work, account, inputs, done, [])
         for file, path in files.items():
             shutil.copy2(path, made / file)
-        said = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
-        result = _write(made, account, inputs, done, list(dict.fromkeys(said)))
+        notes = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
+        result = _write(made, account, inputs, done, list(dict.fromkeys(notes)))
     shutil.rmtree(out / _WORK, ignore_errors=True)
     return result
 

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, field
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
-from vplog.benchmark.method_scores import describe_walk, score_table, search, stored_bytes
-from vplog.benchmark.traversals import candidate_stops, extract_walk
+from vplog.benchmark.method_scores import describe_traversal, score_table, search, stored_bytes
+from vplog.benchmark.traversals import candidate_stops, extract_traversal
 from vplog.data import Reference
 from vplog.errors import LogError
 from vplog.evaluate import retrieval
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from contextlib import ExitStack
     from pathlib import Path
 
-    from vplog.benchmark.traversals import Walk
+    from vplog.benchmark.traversals import Traversal
     from vplog.data import Bytes, Ints
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.place_truth import PlaceTruth
@@ -85,7 +85,7 @@ class Bench:
     """Closes the feature stores."""
     execution: Execution
     warnings: list[str] = field(default_factory=list)
-    _walks: dict[int, Walk] = field(default_factory=dict)
+    _traversals: dict[int, Traversal] = field(default_factory=dict)
     _done: dict[str, dict[str, Any]] | None = None
     _learned: tuple[Any, Any] = (None, None)
 
@@ -94,35 +94,37 @@ class Bench:
         """(query, map) of every pair, in order."""
         return list(self.truth)
 
-    def walk(self, drive: int) -> Walk:
+    def traversal(self, drive: int) -> Traversal:
         """The drive's frames as features."""
-        if drive not in self._walks:
+        if drive not in self._traversals:
             store = self.stack.enter_context(FeatureStore(self.scratch / f"{drive}.features"))
             frames = self.frames[drive]
-            walk = extract_walk(self.logs[drive], self.pipeline.features, store, frames, execution=self.execution)
-            self.warnings += walk.warnings
-            self._walks[drive] = walk
-        return self._walks[drive]
+            traversal = extract_traversal(
+                self.logs[drive], self.pipeline.features, store, frames, execution=self.execution
+            )
+            self.warnings += traversal.warnings
+            self._traversals[drive] = traversal
+        return self._traversals[drive]
 
     def images(self, drive: int, rows: Sequence[int]) -> list[Bytes]:
-        """The grey images of rows of a walk, in the order given. Raises LogError where one is gone."""
-        walk = self.walk(drive)
-        stamps = walk.stamp_ns[sorted(set(rows))]
+        """The grey images of rows of a traversal, in the order given. Raises LogError where one is gone."""
+        traversal = self.traversal(drive)
+        stamps = traversal.stamp_ns[sorted(set(rows))]
         found = {one.stamp_ns: one.decode().image for one in self.logs[drive].frames(stamps)}
         if len(found) < len(stamps):
             why = "a frame that was read before cannot be read again. Leave the log unchanged, and run again."
             raise LogError(f"{self.names[drive]}: {why}")
-        return [found[int(walk.stamp_ns[row])] for row in rows]
+        return [found[int(traversal.stamp_ns[row])] for row in rows]
 
     def references(self, library: Library) -> list[Reference]:
         """Frames as `vplog compare` chooses them; those that cannot be decoded are left out after the choice."""
-        walk, covered = self.walk(library.drive), self.frames[library.drive]
+        traversal, covered = self.traversal(library.drive), self.frames[library.drive]
         wanted = LibrarySettings(choose="random", size=library.size, seed=library.seed)
         numbers = set(covered[choose(covered, wanted)].tolist())
-        rows = [row for row, number in enumerate(walk.frames.tolist()) if number in numbers]
+        rows = [row for row, number in enumerate(traversal.frames.tolist()) if number in numbers]
         images = self.images(library.drive, rows)
         return [
-            Reference(image, walk.store[row], walk.name, int(walk.stamp_ns[row]))
+            Reference(image, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
             for image, row in zip(images, rows, strict=True)
         ]
 
@@ -135,11 +137,11 @@ class Bench:
 
     def ask(self, state: PlaceState, query: int, other: int, places: dict[int, Sequence[Any]]) -> tuple[Ranks, Pairs]:
         """Ranks of every query of a pair, and its true pairs."""
-        walks = self.walk(query), self.walk(other)
-        stops = candidate_stops(walks[0].frames, walks[1].frames, self.min_gap)
-        truth = self.truth[query, other].pairs(walks[0].frames, walks[1].frames).below(stops)
+        traversals = self.traversal(query), self.traversal(other)
+        stops = candidate_stops(traversals[0].frames, traversals[1].frames, self.min_gap)
+        truth = self.truth[query, other].pairs(traversals[0].frames, traversals[1].frames).below(stops)
         index = state.index(places[other])
-        scores = score_table(len(walks[0]), len(walks[1]), self.scratch, "scores")
+        scores = score_table(len(traversals[0]), len(traversals[1]), self.scratch, "scores")
         search(index, places[query], stops, scores, Execution(self.execution.threads), timed=False)
         return retrieval.rank_queries(scores, truth, stops), truth
 
@@ -174,8 +176,8 @@ class Bench:
         return [done[keys[trial]] for trial in wanted]
 
     def describe(self, state: PlaceState, drive: int, stage: str, before: int, total: int) -> Sequence[Any]:
-        """Places of a walk as a table would give them back; `before` frames of the stage's `total` are done."""
-        places, _ = describe_walk(state, self.walk(drive), stage, self.execution.part(before, total))
+        """Places of a traversal as a table would give them back; `before` frames of the stage's `total` are done."""
+        places, _ = describe_traversal(state, self.traversal(drive), stage, self.execution.part(before, total))
         return state.from_arrow(state.to_arrow(places))
 
     def _key(self, trial: Trial) -> str:
