@@ -1,7 +1,7 @@
 """Eq. (1) over a large map against what other systems scan: binary codes, and vectors of floats.
 
 Made-up places, for no one has recorded a million. What decides the cost is how long the lists are, how fast weights
-fall and how alike neighbours are, so these are as `vplog batch` has them of kitti00 and the Gardens traversals, with a
+fall and how alike neighbours are, so these are as `vplog batch` has them of kitti00 and the Gardens walks, with a
 library of the paper's size: reference r is as popular as 1 / (r + L / 18), which makes the first ten times as frequent
 as the median one (the paper's Fig. 9; 4 to 12 on real drives); weights fall with rank n as n^-0.8 (mean weights 255,
 178, 137, 111, 93, .. 42; real ones 255, 150-169, 112-119, 92-100, 80-89, .. 57-69); 9 % of boxes are nowhere (8 to 12),
