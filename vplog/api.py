@@ -280,21 +280,15 @@ def compare(
 
     threads = threads or available()
     with limited(threads), ExitStack() as stack:
+        references = None if library is None else stack.enter_context(local_copy(located(library)))
+        place = None if out is None else located(out)
         return compare_methods(
             located(query),
             None if map is None else located(map),
             split_methods(methods) if isinstance(methods, str) else methods,
             TruthChoice(os.fspath(truth), tolerance, distance_m, heading_deg),
             _pipeline(pipeline, settings),
-            CompareOptions(
-                library=None if library is None else stack.enter_context(local_copy(located(library))),
-                library_size=library_size,
-                library_seed=library_seed,
-                min_gap=min_gap,
-                sequence=sequence,
-                out=None if out is None else located(out),
-                topics=_topics(topics),
-            ),
+            CompareOptions(references, library_size, library_seed, min_gap, sequence, place, _topics(topics)),
             Execution(threads, progress),
         )
 

@@ -33,18 +33,19 @@ def place(text: str) -> Path:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def local(text: str) -> Path:
-    """A folder that is written to bit by bit, which storage by URL is not."""
-    if "://" in text:
-        raise argparse.ArgumentTypeError(f"must be a local folder, not {text}")
-    return _path(text)
+def _local(what: str) -> Callable[[str], Path]:
+    def path(text: str) -> Path:
+        if "://" in text:
+            raise argparse.ArgumentTypeError(f"must be a local {what}, not {text}")
+        return _path(text)
+
+    return path
 
 
-def local_file(text: str) -> Path:
-    """A single file that is written by those who do not send what they write."""
-    if "://" in text:
-        raise argparse.ArgumentTypeError(f"must be a local file, not {text}")
-    return _path(text)
+local = _local("folder")
+"""A folder that is written to bit by bit, which storage by URL is not."""
+local_file = _local("file")
+"""A single file that is written by those who do not send what they write."""
 
 
 def local_file_or_stdout(text: str) -> Path:
@@ -126,27 +127,21 @@ def at_least(least: int) -> Callable[[str], int]:
     return whole_number
 
 
-def at_least_one(text: str) -> int:
-    return at_least(1)(text)
+at_least_one = at_least(1)
 
 
-def not_negative(text: str) -> float:
-    value = _number(text)
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number of 0 or more, not {text!r}")
-    return value
+def _number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"must be a number {words}, not {text!r}")
+        return value
+
+    return number
 
 
-def positive(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number above 0, not {text!r}")
-    return value
-
-
-def _number(text: str) -> float:
-    """NaN where it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+not_negative = _number(lambda value: 0 <= value < math.inf, "of 0 or more")
+positive = _number(lambda value: 0 < value < math.inf, "above 0")

@@ -177,7 +177,7 @@ def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]
     settings, baseline_m = scene.settings, scene.settings.stereo_baseline_m
 
     def jpeg(image: Bytes) -> Bytes:
-        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])[1].ravel()
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].ravel()
 
     def encoded(frame: int) -> tuple[Bytes, Bytes | None, Bytes | None]:
         image, depth = take_picture(scene, frame)

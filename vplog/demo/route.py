@@ -25,6 +25,8 @@ FIRST_FRAME_NS = 12_345_678
 ORIGIN_DEG = (48.137, 11.575)
 """Latitude and longitude of the world's origin."""
 ORIGIN_ALTITUDE_M = 520.0
+_LATERAL_OFFSET_M = 0.8
+"""How far left of the first lap's track the car is after it."""
 SHIFT_LENGTH_M = 10.0
 """Distance before the end of the first lap over which the car moves to its new track and the light changes."""
 
@@ -66,7 +68,7 @@ def second_lap_share(settings: DemoSettings, distance_m: Floats) -> Floats:
 def track_point(settings: DemoSettings, distance_m: Floats) -> Floats:
     """(T, 2) of the car: on the axis in the first lap, then 0.4 to 1 times the offset left of it, meandering."""
     point, heading = axis_point(settings, distance_m)
-    left_m = settings.lateral_offset_m * second_lap_share(settings, distance_m)
+    left_m = _LATERAL_OFFSET_M * second_lap_share(settings, distance_m)
     left_m = left_m * (0.7 + 0.3 * np.sin(2 * np.pi * distance_m / 31.0))
     return point + left_m[..., None] * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 CAMERA_FRAME = "camera_optical"
 BODY_FRAME = "base_link"
+_FIELD_OF_VIEW_DEG, _IMAGE_NOISE = 80.0, 1.5
+"""Horizontal field of view; standard deviation of the sensor noise in grey levels."""
 _MOUNT_M = (0.3, 0.0, 1.5)
 """Of the camera ahead of, left of and above the body's origin on the ground: behind the windscreen."""
 _MOUNT_PITCH_RAD = 0.035
@@ -70,7 +72,7 @@ class Scene:
 
 def make_scene(settings: DemoSettings) -> Scene:
     """The scene with a calibrated pinhole camera on the car."""
-    focal_px = settings.width / 2 / np.tan(np.radians(settings.field_of_view_deg) / 2)
+    focal_px = settings.width / 2 / np.tan(np.radians(_FIELD_OF_VIEW_DEG) / 2)
     matrix = np.array([
         [focal_px, 0, (settings.width - 1) / 2], [0, focal_px, (settings.height - 1) / 2], [0, 0, 1.0],
     ])  # fmt: skip
@@ -94,7 +96,7 @@ def take_picture(scene: Scene, frame: int, right_m: float = 0.0) -> tuple[Bytes,
     occluders = traffic(settings, time_s)
     image, depth = render(scene.world, scene.camera, scene.world_from_body[frame] @ mount, Light(*light), occluders)
     rng = np.random.default_rng([settings.seed, 8 if right_m else 4, frame])
-    noise = rng.standard_normal(image.shape, np.float32) * np.float32(settings.image_noise)
+    noise = rng.standard_normal(image.shape, np.float32) * np.float32(_IMAGE_NOISE)
     return np.clip(np.round(image + noise), 0, 255).astype(np.uint8), depth
 
 

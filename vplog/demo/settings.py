@@ -24,20 +24,12 @@ class DemoSettings(Settings):
     """Radius of the turns at the four corners; wider ones than 12 m would run through the houses inside."""
     speed_m_s: float = Field(default=6.0, gt=0.5, le=20)
     """Speed of the car along the axis of the street."""
-    lateral_offset_m: float = Field(default=0.8, ge=0, le=1)
-    """How far left of the first lap's track the car keeps after it."""
     frame_rate_hz: float = Field(default=4.0, gt=0.1, le=60)
     """Camera frames per second."""
     width: int = Field(default=640, ge=64, le=4096)
     """Width of the images in px."""
     height: int = Field(default=360, ge=64, le=4096)
     """Height of the images in px."""
-    field_of_view_deg: float = Field(default=80.0, ge=30, le=120)
-    """Horizontal field of view of the pinhole camera."""
-    image_noise: float = Field(default=1.5, ge=0, le=50)
-    """Standard deviation of the sensor noise in grey levels."""
-    jpeg_quality: int = Field(default=88, ge=1, le=100)
-    """Quality of the JPEG images."""
     depth: bool = False
     """Also write a depth image for every frame, in mm, registered to the grey image."""
     stereo_baseline_m: float = Field(default=0.0, ge=0, le=2)
