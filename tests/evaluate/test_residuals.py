@@ -10,7 +10,7 @@ import pytest
 from tests.graph.drive import ledger
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
 from vplog.evaluate.body_truth import BodyTruth
-from vplog.evaluate.residuals import score_residuals
+from vplog.evaluate.closures import score_residuals
 from vplog.geometry import se3
 
 SIGMA = np.repeat([0.003, 0.05], 3)

@@ -1,4 +1,4 @@
-"""Precision of closures and recall of revisits.
+"""Precision of closures, recall of revisits, and the residuals of closures by their claimed covariances.
 
 Accepted closures are judged by their pose (`closure_pose`), candidates and revisits by place: a distance and a heading
 between the true poses, as in `vplog compare`.
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _OPPOSITE_DEG = 90.0
 """Degrees; beyond it a forward camera looks the other way."""
+_NEAR = 5
+"""Keyframes that the ends of two closures may be apart to be neighbours; the truth between them is short, and good."""
 
 
 @dataclass(frozen=True)
@@ -283,3 +285,61 @@ def _area(curve: Floats | None, revisits: bool) -> tuple[float | None, float | N
 
 def _share(part: Any, whole: Any) -> float | None:
     return float(part / whole) if whole else None
+
+
+@dataclass(frozen=True)
+class ResidualScore:
+    """Medians of sqrt(e' C^-1 e / 6): honest covariances have about 1 (0.94 for Gaussian errors)."""
+
+    closures: int
+    """Accepted ones with a covariance and a truth."""
+    to_truth: float | None
+    """Median of the closures against the truth. A truth that is itself off between two visits counts as their error."""
+    pairs: int
+    """Closures with an accepted neighbour."""
+    to_neighbours: float | None
+    """Median of each closure against the next one near it, moved by the truth over the few keyframes between them. What
+    the truth is off between two visits cancels, and so does what neighbours share, so it may be less."""
+
+
+def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) -> ResidualScore:
+    """Score the accepted closures of a ledger."""
+    at = truth.at(keyframes.stamp_ns)
+    poses, known = at.world_from_body, at.known & truth.oriented
+    usable = closures.of(Verdict.ACCEPTED) & known[closures.query] & known[closures.match]
+    rows = np.flatnonzero(usable & np.isfinite(closures.information).all((1, 2)))
+    query, match = closures.query[rows], closures.match[rows]
+    measured = closures.match_from_query[rows]
+    covariance = np.asarray(np.linalg.inv(closures.information[rows]), np.float64)
+    to_truth = _normalised(se3.between(poses[match], poses[query]), measured, covariance)
+    this, following = _neighbours(query.astype(np.int64), match.astype(np.int64))
+    moved = se3.between(poses[query[following]], poses[query[this]])  # the next query's frame from this one's
+    predicted = se3.between(poses[match[following]], poses[match[this]]) @ measured[this] @ se3.inverse(moved)
+    turned = se3.adjoint(moved)
+    both = covariance[following] + turned @ covariance[this] @ np.swapaxes(turned, 1, 2)
+    to_neighbours = _normalised(predicted, measured[following], both)
+    return ResidualScore(len(rows), _median(to_truth), len(this), _median(to_neighbours))
+
+
+def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:
+    """Positions of closures, and of the next one in order of queries whose ends are near but not both the same."""
+    order = np.lexsort((match, query))
+    this, following = [], []
+    for at, row in enumerate(order[:-1].tolist()):
+        for other in order[at + 1 :].tolist():
+            if query[other] - query[row] > _NEAR:
+                break
+            if query[other] > query[row] and abs(match[other] - match[row]) <= _NEAR:
+                this.append(row)
+                following.append(other)
+                break
+    return np.array(this, np.int64), np.array(following, np.int64)
+
+
+def _normalised(expected: Floats, measured: Floats, covariance: Floats) -> Floats:
+    chi2 = se3.mahalanobis2(se3.log(se3.between(measured, expected)), covariance)
+    return np.sqrt(np.maximum(chi2, 0.0) / 6.0)
+
+
+def _median(values: Floats) -> float | None:
+    return float(np.median(values)) if len(values) else None

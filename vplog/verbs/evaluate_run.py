@@ -9,7 +9,7 @@ import numpy as np
 
 from vplog.data import Trajectory
 from vplog.errors import ResultError, TruthError
-from vplog.evaluate import closures, residuals, trajectory
+from vplog.evaluate import closures, trajectory
 from vplog.evaluate.body_truth import body_truth
 from vplog.evaluate.closure_pose import pose_bounds
 from vplog.evaluate.truth import ate_to_gps, read_truth
@@ -85,7 +85,7 @@ def evaluate_poses(
         "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
         **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
-        "residuals": asdict(residuals.score_residuals(keyframes, ledger, of_body)),
+        "residuals": asdict(closures.score_residuals(keyframes, ledger, of_body)),
     }
     return Evaluation(found, keyframes, of_body, judged)
 
