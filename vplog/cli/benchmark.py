@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from vplog import api
-from vplog.cli.options import at_least, at_least_one, local, option, pipeline_of, place, positive, topics_of
+from vplog.cli.parser import at_least, at_least_one, local, option, pipeline_of, place, positive, topics_of
 from vplog.cli.printing import Progress, print_comparison, print_result, print_study
 from vplog.execution.execution import Execution
 

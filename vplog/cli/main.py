@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, NoReturn
 
 import vplog
 from vplog import api
+from vplog.cli import printing
 from vplog.cli.benchmark import add_studies
 from vplog.cli.maps import add_maps
-from vplog.cli.options import (
+from vplog.cli.parser import (
+    Parser,
     at_least_one,
     flag,
     local,
@@ -28,20 +30,8 @@ from vplog.cli.options import (
     settings_options,
     topic_options,
     topics_of,
-)  # fmt: skip
-from vplog.cli.parser import Parser
-from vplog.cli.printing import (
-    Progress,
-    print_evaluation,
-    print_info,
-    print_joint,
-    print_json,
-    print_line,
-    print_result,
-    print_run,
-    say,
-    warn,
-)  # fmt: skip
+)
+from vplog.cli.printing import Progress, print_json, print_result, say
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, was_interrupted
 from vplog.execution.cores import available, limited
@@ -173,7 +163,7 @@ def info(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(record)
     elif not arguments.check:
-        print_info(record)
+        printing.print_info(record)
         if arguments.html is not None:
             print(f"page      {arguments.html}")
     elif record["ready"]:
@@ -198,8 +188,8 @@ def library(arguments: argparse.Namespace) -> None:
         print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
         return
     text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
-    print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
-    warn(warnings)
+    printing.print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
+    printing.warn(warnings)
     print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
 
 
@@ -217,9 +207,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"run": str(arguments.shown), **found})
     elif "maps" in found:
-        print_joint(arguments.shown, found)
+        printing.print_joint(arguments.shown, found)
     else:
-        print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
+        printing.print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
 
 
 def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
@@ -289,8 +279,8 @@ def demo(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
-    print_evaluation(found)
+    printing.print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
+    printing.print_evaluation(found)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vplog import api
 from vplog.cli import printing
-from vplog.cli.options import (
+from vplog.cli.parser import (
     at_least,
     at_least_one,
     flag,
@@ -19,7 +19,7 @@ from vplog.cli.options import (
     place,
     settings_options,
     topics_of,
-)  # fmt: skip
+)
 from vplog.cli.printing import Progress, print_result
 
 if TYPE_CHECKING:

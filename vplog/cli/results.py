@@ -8,7 +8,7 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from vplog.cli.options import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
+from vplog.cli.parser import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
 from vplog.cli.printing import print_evaluation, print_explanation, print_json, print_optimised, print_result
 from vplog.execution.execution import Execution
 
