@@ -36,6 +36,7 @@ from vplog.execution.execution import Execution
 from vplog.logs.frames import RecordedFrame
 from vplog.loops.propose import Proposals
 from vplog.pipeline import CacheOptions, Pipeline, load_pipeline, run
+from vplog.results.run_record import read_run_json
 from vplog.run import feature_extraction, verification
 from vplog.run.feature_extraction import compute_part, cut, extract, missing_parts, parts_of, put_part, stored_features
 from vplog.run.provenance import head
@@ -72,7 +73,7 @@ def results(out: Path) -> dict[str, str]:
 
 def computed(out: Path) -> list[str]:
     """Of the stages that are kept, those that the last run into `out` computed, in part at least."""
-    stages = json.loads((out / "run.json").read_text())["stages"]
+    stages = read_run_json(out / "run.json")["stages"]
     return [name for name in KEPT if stages[name]["result"] != "reused"]
 
 
@@ -144,7 +145,7 @@ def test_a_killed_run_is_gone_on_with_to_the_same_bytes(
         code = KILLED.format(part=PART, after=after, before=chance.random() < 0.5)
         killed = subprocess.run([sys.executable, "-c", code, *command, *told], capture_output=True, check=False)
         assert killed.returncode == -9, killed.stderr
-        assert json.loads((out / ".cache" / "run.json").read_text())["finished"] is False
+        assert read_run_json(out / ".cache" / "run.json")["finished"] is False
         assert not (out / "run.json").exists()
     done = list((out / ".cache").glob("extract-*"))
     assert len(done) >= 2
@@ -489,7 +490,7 @@ def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_
 def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
     assert "has no run.json" in verb("run", "--resume", "-o", tmp_path / "none").error
     assert "is finished" in verb("run", "--resume", "-o", whole).error
-    account = json.loads((whole / "run.json").read_text())
+    account = read_run_json(whole / "run.json")
     out = tmp_path / "out"
     out.mkdir()
 

@@ -230,7 +230,7 @@ class StageCache:
 
     def _write_inputs(self, known: dict[str, Any]) -> None:
         try:
-            write_run_json(self.folder / INPUTS, known, checksum=True)
+            write_run_json(self.folder / INPUTS, known)
         except ResultError:  # it only spares work; the result's own files say that the disk is full
             self._full = True
 

@@ -26,13 +26,13 @@ CACHE = ".cache"
 REQUEST = f"{CACHE}/run.json"
 """What a run that is not finished was asked for; run.json of its folder is that of the finished run before, if any."""
 CHECKSUM = "record_sha256"
-"""Field of a record of a map: sha256 of `canonical_json` of all others. One without it is taken as it is: an
-older vplog or an editor wrote it."""
+"""Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an older vplog or an
+editor wrote it."""
 _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
 
-def write_run_json(path: Path, record: dict[str, Any], checksum: bool = False) -> None:
+def write_run_json(path: Path, record: dict[str, Any], checksum: bool = True) -> None:
     """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
     record = with_checksum(record) if checksum else plain(record)
     text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -41,8 +41,8 @@ def write_run_json(path: Path, record: dict[str, Any], checksum: bool = False) -
 
 
 def read_run_json(path: Path) -> dict[str, Any]:
-    """A record of a run or a map, without its checksum. Raises ResultError where the file is missing, is no JSON object
-    or does not have its checksum, and NewerError where it is of a newer version."""
+    """A record of a run or a map, without its checksum and without retired settings. Raises ResultError where the file
+    is missing, is no JSON object or does not have its checksum, and NewerError where it is of a newer version."""
     try:
         check_file(path)
         record = _sound_json(path.read_text(encoding="utf-8"))
@@ -58,7 +58,16 @@ def read_run_json(path: Path) -> dict[str, Any]:
         raise ResultError(f"{path} is damaged: its checksum does not match. Copy it back from a backup, or run again.")
     if type(version := record.get("format")) is int:
         check_version(path, version, FORMAT, record.get("vplog"))
+    _drop_retired(record.get("settings"))
     return record
+
+
+def _drop_retired(settings: Any) -> None:
+    """Remove from a tree of settings those that are gone and were off: `verify.direction`."""
+    verify = settings.get("verify") if isinstance(settings, dict) else None
+    direction = verify.get("direction") if isinstance(verify, dict) else None
+    if isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False:
+        del verify["direction"]
 
 
 def with_checksum(record: dict[str, Any]) -> dict[str, Any]:
