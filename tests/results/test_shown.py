@@ -23,9 +23,9 @@ from vplog.data import Gps, Verdict
 from vplog.errors import ResultError
 from vplog.results import geo, mcap_read
 from vplog.results.contracts import TOPICS
-from vplog.results.mcap import camera_topic, write_mcap
+from vplog.results.geo import Earth
+from vplog.results.mcap import Explained, Shown, camera_topic, write_mcap
 from vplog.results.previews import PictureSettings, Previews, jpeg, preview, scaled_size, shrink
-from vplog.results.shown import Earth, Explained, Shown
 
 if TYPE_CHECKING:
     from vplog.data import Camera

@@ -20,7 +20,7 @@ from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, tables
-from vplog.results.report.content import Judged
+from vplog.results.report.page import Judged
 from vplog.results.report.page import page as write_page
 from vplog.results.run_record import read_run_json
 from vplog.run.report import gather

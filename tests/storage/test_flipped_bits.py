@@ -28,7 +28,7 @@ from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings
 from vplog.places.library_files import load_references, save_references
 from vplog.results import geo, kept_features, placed, places_map, tables
-from vplog.results.shown import Earth
+from vplog.results.geo import Earth
 
 if TYPE_CHECKING:
     from collections.abc import Callable

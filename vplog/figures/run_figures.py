@@ -12,8 +12,9 @@ from vplog.errors import ResultError
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
 from vplog.results.collage import Half, Panel, collage
+from vplog.results.geo import Earth
+from vplog.results.mcap import Explained, Shown
 from vplog.results.previews import jpeg, scaled_size, shrink
-from vplog.results.shown import Earth, Explained, Shown
 from vplog.stages import BoxState
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 import re
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,18 +28,19 @@ from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
 from vplog.results.run_record import canonical_json
-from vplog.results.shown import Shown
 from vplog.results.tables import covariance_of
+from vplog.storage.image_file import image_size
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from google.protobuf.message import Message
 
-    from vplog.data import Camera, Closures, Floats, Ints, Keyframes, PoseGraph
+    from vplog.data import Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph
     from vplog.results.foxglove import Part
+    from vplog.results.geo import Earth
     from vplog.results.tables import TableMetadata
 
     Timed = tuple[int, str, Message]
@@ -78,6 +80,41 @@ TOPICS = {
     ),
 }
 """Schema and meaning of every topic; NAME stands for the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """Where the parts of one keyframe were found on the reference that explains it best.
+
+    All places are shares of an image's sides, x0 y0 x1 y1.
+    """
+
+    references: Sequence[int]
+    """Those that explain it, best first; the boxes are on the first."""
+    windows: Floats
+    """(I, 4) parts of the keyframe."""
+    boxes: Floats
+    """(I, 4) where each was found, NaN where it was not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What result.mcap shows beside the tables, all of it optional."""
+
+    image: Callable[[int], bytes] | None = None
+    """JPEG of a keyframe by its row."""
+    image_size: tuple[int, int] = (0, 0)
+    """Width and height in px of these JPEGs."""
+    explained: Callable[[int], Explained | None] | None = None
+    """By row of the keyframe."""
+    references: Mapping[int, bytes] = field(default_factory=dict)
+    """JPEG of a reference of the library by its number."""
+    pictures: Mapping[int, bytes] = field(default_factory=dict)
+    """JPEG of a candidate closure by its row in the ledger."""
+    gps: Gps | None = None
+    earth: Earth | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """Versions, input hashes: what the file's metadata says beside the settings, as plain values by name."""
 
 
 def camera_topic(camera: Camera) -> str:
@@ -159,7 +196,7 @@ def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, s
     topic, size = camera_topic(camera), shown.image_size
     if shown.image is None:
         size = camera.width, camera.height  # annotations then are drawn on the log's own images
-    sizes = {number: _jpeg_size(data) for number, data in shown.references.items()}
+    sizes = {number: image_size(data) or (0, 0) for number, data in shown.references.items()}
     pictures = sorted(shown.pictures, key=lambda row: (int(closures.query[row]), row))
     for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
         if shown.image is not None or shown.explained is not None:
@@ -270,10 +307,3 @@ def _loop_closure(
     message.residual_after_sigma = float(closures.residual_after[row])
     message.weight = float(closures.weight[row])
     return message
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height in px."""
-    from vplog.storage.image_file import image_size
-
-    return image_size(data) or (0, 0)

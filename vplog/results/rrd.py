@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Closures, Floats, Keyframes, Trajectory
-    from vplog.results.shown import Earth
+    from vplog.results.geo import Earth
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
 _AMBER = (240, 180, 30)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.maps.storage.remote_map import Mirror
-    from vplog.results.shown import Earth
+    from vplog.results.geo import Earth
 
     T = TypeVar("T")
 
