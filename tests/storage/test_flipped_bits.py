@@ -27,7 +27,7 @@ from vplog.maps.search.segment import open_segment
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings
 from vplog.places.library_files import load_references, save_references
-from vplog.results import geo, kept_features, placed, places_map, tables
+from vplog.results import geo, kept_features, places_map, tables
 from vplog.results.geo import Earth
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     )
     (folder / "run").mkdir()
     tables.write_keyframes(folder / "run" / "keyframes.parquet", RUN.keyframes, RUN.solution.world_from_body, METADATA)
-    tables.write_descriptors(folder / "run" / "descriptors.parquet", RUN.keyframes, [column], KIND, METADATA)
+    tables.write_descriptors(folder / "run" / "descriptors.parquet", RUN.keyframes, column, METADATA)
     exported = folder / "map.parquet"
     places_map.write_map(exported, [folder / "run"])
     kept, joins, answers = folder / "features.parquet", folder / "joins.parquet", folder / "placed.parquet"
@@ -73,7 +73,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     tables.write_joins(joins, [(RUN.keyframes, RUN.keyframes, RUN.closures)], METADATA)
     rows = np.arange(9, dtype=np.int32)
     values = [rows, rows.astype(np.int64), rows, ["a"] * 9, rows, rows.astype(np.int64), rows.astype(np.float32), rows]
-    placed.write_placed(answers, placed.placed_table(values), METADATA)
+    tables.write_placed(answers, tables.placed_table(values), METADATA)
     geo.write_geoparquet(folder / "geo.parquet", RUN.trajectory, Earth((48.0, 11.0, 500.0), np.eye(4)), {})
     world = RUN.solution.world_from_body
     return {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.results import kept_features, messages, placed, places_map, tables
+from vplog.results import kept_features, messages, places_map, tables
 from vplog.results.mcap import TOPICS
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.storage.scratch import replacing
@@ -57,8 +57,8 @@ LAYOUTS: dict[str, list[tuple[str, str, str]]] = {
     "gist": [("descriptor", "float16[D]", "Mean energy by scale, orientation, then block, row by row.")],
     "thumbnail": [("descriptor", "uint8[2048]", "Patch-normalised pixels, row by row.")],
 }
-"""By recogniser: name, type and meaning of the parts of `descriptor`, which become columns of a map. J references with I
-boxes or windows on each, W words of B bits: settings under `places`, which the header of every table holds."""
+"""By recogniser: name, type and meaning of the parts of `descriptor`, which become columns of a map. J references
+with I boxes or windows on each, W words of B bits: settings under `places`, which the header of every table holds."""
 _OF_TABLE: dict[str, dict[str, Any]] = {
     "features": {"file": "MAP/joins/drive=ID/features.parquet", "metadata": kept_features.HEADER},
     "joins": {
@@ -96,7 +96,7 @@ def table_schemas() -> dict[str, pa.Schema]:
         "joins": tables.JOINS,
         "edges": tables.EDGES,
         "trajectory": tables.TRAJECTORY,
-        "placed": placed.PLACED,
+        "placed": tables.PLACED,
         "features": kept_features.FEATURES,
         "map": pa.schema([*places_map.PLACE, tables.descriptors_schema(pa.binary()).field("descriptor")]),
     }

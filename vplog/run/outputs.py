@@ -95,8 +95,7 @@ def write(
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
     )  # fmt: skip
-    column = [run.state.to_arrow(run.places)]
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, run.state.arrow_type, header)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, run.state.to_arrow(run.places), header)
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)
