@@ -178,6 +178,7 @@ def run(
         result = Run(
             log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved
         )
-        do(write, folder, result, pipeline, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
+        header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
+        do(write, folder, result, pipeline.verify, pipeline.pictures, header)
         head = provenance.head(pipeline, path, execution.threads, topics)
         return finish(folder, result, do(report, folder, result, head), do)

@@ -17,9 +17,8 @@ from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_tables import write_all
-from vplog.cache.checked_file import DamagedError, content_of, sealed
 from vplog.cache.codecs import closures_codec
-from vplog.cache.stage_cache import digest_of
+from vplog.cache.stage_cache import DamagedError, content_of, digest_of, sealed
 from vplog.data import Features, Reference
 from vplog.errors import ResultError, VplogError
 from vplog.maps.search.index import update_index

@@ -25,10 +25,9 @@ from tests.logs.messages.test_video import messages, packets
 from tests.results.example import make_run
 from vplog import logs
 from vplog.cache import code_hash, feature_shards
-from vplog.cache.checked_file import CONTENT_AT, DamagedError, sealed
 from vplog.cache.codecs import closures_codec, columns_codec, images_codec
 from vplog.cache.feature_shards import Extracted
-from vplog.cache.stage_cache import StageCache, digest_of, inputs_of
+from vplog.cache.stage_cache import CONTENT_AT, DamagedError, StageCache, digest_of, inputs_of, key_of, sealed
 from vplog.cache.steps import Steps
 from vplog.data import Closures, Keyframes
 from vplog.errors import LogError, ResultError
@@ -235,6 +234,25 @@ def test_a_log_is_known_by_its_content_where_its_times_are_new(
     os.utime(copy, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert not missing_parts(again / ".cache", parts_of(log, pipeline, cache=again / ".cache"))
     assert missing_parts(again / ".cache", parts_of(copy, pipeline, cache=again / ".cache"))
+
+
+def test_no_flipped_bit_of_a_logs_identity_is_believed(tmp_path: Path) -> None:
+    """The log has the name it had in the cache, or another that nothing is kept by."""
+    file, cache, chance = tmp_path / "a.mcap", tmp_path / "cache", random.Random(5)
+    file.write_bytes(b"a log")
+    with StageCache(cache, file, []) as stages:
+        stages.store("extract-000000", "0" * 64, [], b"")
+        stages.finish(["extract-000000.stage"])
+    os.utime(file, ns=(0, 0))
+    known, sound = inputs_of(file, cache), (cache / "inputs.json").read_bytes()
+    assert known.token != key_of(known.look)
+    for _ in range(200):
+        flipped = bytearray(sound)
+        flipped[chance.randrange(len(sound))] ^= 1 << chance.randrange(8)
+        (cache / "inputs.json").write_bytes(flipped)
+        found = inputs_of(file, cache)
+        assert found.token in (known.token, key_of(known.look))
+        assert found.look == known.look
 
 
 def test_what_was_lost_and_said_is_told_again(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import json
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from vplog.cache.checked_file import CONTENT_AT, AbsentError, DamagedError
+from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 from vplog.errors import ResultError
 from vplog.features.store import features_from, features_to, size_of
 from vplog.results.previews import Previews

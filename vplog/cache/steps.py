@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
-from vplog.cache.checked_file import AbsentError
 from vplog.cache.code_hash import code_of
-from vplog.cache.stage_cache import StageCache, digest_of, key_of
+from vplog.cache.stage_cache import AbsentError, StageCache, digest_of, key_of
 from vplog.execution.cores import limited
 from vplog.execution.execution import logged_warnings
 from vplog.execution.timing import Watch

@@ -126,9 +126,10 @@ def _move(out: Path) -> None:
             with suppress(OSError):  # it holds something
                 folder.rmdir()
     except OSError as error:
+        where = error.filename2 or error.filename
         raise ResultError(
-            f"Cannot move the results from {committed} to {out}: {error.filename}: {error.strerror}. They are whole; "
-            "clear the way, and give the command again."
+            f"Cannot move the results from {committed} to {out}: {where}: {error.strerror}. They are whole; clear the "
+            "way, and give the command again."
         ) from None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,15 +31,6 @@ if TYPE_CHECKING:
     from vplog.results.previews import PictureSettings
     from vplog.run.back_end import Solved
     from vplog.stages import Log, PlaceState
-
-
-class Pictured(Protocol):
-    """The settings of what a run shows, as the pipeline has them."""
-
-    @property
-    def verify(self) -> VerifySettings: ...
-    @property
-    def pictures(self) -> PictureSettings: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +71,8 @@ class Run:
 def write(
     folder: Path,
     run: Run,
-    pipeline: Pictured,
+    verify: VerifySettings,
+    pictures: PictureSettings,
     header: tables.TableMetadata,
     *,
     steps: Steps,
@@ -91,7 +83,7 @@ def write(
     previews, gps = run.features.pictures, log.gps()
     inputs = ClosureInputs(previews.image, run.features.__getitem__, run.camera, run.state, run.places)
     shown = finished_picture(
-        inputs, previews, run.closures, run.references, pipeline.verify, pipeline.pictures, gps=gps,
+        inputs, previews, run.closures, run.references, verify, pictures, gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
     )  # fmt: skip

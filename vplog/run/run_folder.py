@@ -9,8 +9,8 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.cache.checked_file import CACHE_FILES, ENDING
 from vplog.cache.input_hashes import bytes_of, files_of, hash_inputs
+from vplog.cache.stage_cache import CACHE_FILES, ENDING
 from vplog.errors import ResultError, SettingsError, was_interrupted
 from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
