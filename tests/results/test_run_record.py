@@ -71,7 +71,7 @@ def test_a_record_without_a_checksum_is_read(tmp_path: Path) -> None:
 
 def test_the_request_of_an_unfinished_run_has_a_checksum(tmp_path: Path) -> None:
     out, log = tmp_path / "out", written(tmp_path / "a.mcap", b"a log")
-    with pytest.raises(KeyboardInterrupt), begun(out, Pipeline(), log, 1):
+    with pytest.raises(KeyboardInterrupt), begun(out, head(Pipeline(), log, 1), [log]):
         (out / ".cache" / "extract-0.stage").write_text("a result")
         raise KeyboardInterrupt
     request = out / ".cache" / "run.json"

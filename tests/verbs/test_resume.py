@@ -492,8 +492,9 @@ def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_
     log.write_text("a log")
 
     def done(library: Path | None = None) -> None:
-        with begun(out, pipeline, log, 1, library) as made:
-            (made / "run.json").write_text(json.dumps({"vplog": "1", **head(pipeline, log, 1)}))
+        account = head(pipeline, log, 1)
+        with begun(out, account, [log], library) as made:
+            (made / "run.json").write_text(json.dumps(account))
 
     done()
     assert {file.name for file in out.iterdir()} == {"run.json"}

@@ -74,7 +74,7 @@ def library_of(library: Path | None) -> str:
 
 def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
     """What run.json says of the logs of several drives."""
-    return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)} if drives else {}
+    return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)}
 
 
 @contextmanager
