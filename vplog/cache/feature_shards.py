@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 from vplog.errors import ResultError
 from vplog.features.store import features_from, features_to, size_of
-from vplog.results.previews import Previews
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -99,10 +98,11 @@ class Extracted:
         return features_from(data, row.features, row.width, row.height, bool(row.thumbnail))
 
     @property
-    def pictures(self) -> Previews:
-        return Previews(sum(row.picture > 0 for _, _, row in self._rows), self._picture)
+    def has_pictures(self) -> bool:
+        return any(row.picture for _, _, row in self._rows)
 
-    def _picture(self, at: int) -> bytes:
+    def picture(self, at: int) -> bytes:
+        """The JPEG of keyframe `at`; empty where pictures are switched off."""
         path, begin, row = self._rows[at]
         return _bytes_at(path, begin + row.offset + row.size, row.picture)
 

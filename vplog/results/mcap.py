@@ -243,18 +243,14 @@ class _Channels:
 
     def write(self, stamp_ns: int, topic: str, message: Message) -> None:
         if topic not in self._ids:
-            self._ids[topic] = self._register(topic)
+            kind = self._classes[topic]
+            name = kind.DESCRIPTOR.full_name
+            if name not in self._schemas:
+                self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(kind))
+            self._ids[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
         data, sequence = message.SerializeToString(deterministic=True), self._sequence[topic]
         self._writer.add_message(self._ids[topic], stamp_ns, data, publish_time=stamp_ns, sequence=sequence)
         self._sequence[topic] = sequence + 1
-
-    def _register(self, topic: str) -> int:
-        """The topic's number, with its schema where no other topic has brought it."""
-        message = self._classes[topic]
-        name = message.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(message))
-        return self._writer.register_channel(topic, "protobuf", self._schemas[name])
 
 
 _FATES = {
@@ -293,17 +289,14 @@ def _loop_closure(
     message.shared_references.extend(closures.shared_references[row].tolist())
     message.shared_overlap.extend(closures.shared_overlap[row].tolist())
     message.scale = closures.scale[row]
-    message.score, message.spread = float(closures.score[row]), float(closures.spread[row])
+    numbers = {name: getattr(closures, name)[row] for name in ("score", "spread", "weight")}
+    numbers |= {f"{name}_sigma": getattr(closures, name)[row] for name in ("residual_before", "residual_after")}
     position, quaternion = match_from_query
-    message.tx_m, message.ty_m, message.tz_m = position
-    message.qx, message.qy, message.qz, message.qw = quaternion
-    information = closures.information[row]
-    if np.isfinite(information).all():
-        message.information.extend(information.reshape(-1).tolist())
-    if np.isfinite(covariance).all():
-        message.covariance.extend(covariance.reshape(-1).tolist())
+    numbers |= zip(("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
+    for name, value in numbers.items():
+        setattr(message, name, float(value))
+    for name, matrix in (("information", closures.information[row]), ("covariance", covariance)):
+        if np.isfinite(matrix).all():
+            getattr(message, name).extend(matrix.reshape(-1).tolist())
     message.verdict, message.reason = closures.verdict[row].value, closures.verdict[row].sentence
-    message.residual_before_sigma = float(closures.residual_before[row])
-    message.residual_after_sigma = float(closures.residual_after[row])
-    message.weight = float(closures.weight[row])
     return message

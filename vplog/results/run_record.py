@@ -16,7 +16,6 @@ from vplog.storage.parquet_limits import check_file, check_version
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
 FORMAT = 1
@@ -91,35 +90,26 @@ def _sound_json(text: str) -> Any:
     if "\\u" in text:  # half a character that takes two, which no file or terminal can hold
         json.dumps(tree, ensure_ascii=False).encode()
     level, depth = [tree] if text.count("[") + text.count("{") > _MOST_DEPTH else [], 0
-    while level := [part for one in level if isinstance(one, dict | list) for part in _parts(one)]:
+    while level:
+        within = [one.values() if isinstance(one, dict) else one for one in level]
+        level = [one for values in within for one in values if isinstance(one, dict | list)]
         if (depth := depth + 1) > _MOST_DEPTH:
             raise ValueError(f"values are nested in more than {_MOST_DEPTH} others")
     return tree
 
 
-def _parts(one: dict[str, Any] | list[Any]) -> Iterable[Any]:
-    return one.values() if isinstance(one, dict) else one
-
-
 def read_finished_run(folder: Path) -> dict[str, Any]:
     """The record of the run in a folder that came to its end. Raises ResultError, also where something in the folder is
-    not its own file."""
+    not its own file. Results that a killed process had only to move into place are moved."""
     check_regular(folder, "run.json")
-    record = read_run_json(begun_in(folder) or folder / "run.json")
+    recover(folder)
+    begun = (folder / REQUEST).is_file() and not (folder / "run.json").is_file()
+    record = read_run_json(folder / (REQUEST if begun else "run.json"))
     if not record.get("finished"):
         whose = f" of {record['log']}" if isinstance(record.get("log"), str) else ""
         command = f"vplog run --resume -o {shlex.quote(str(folder))}"
         raise ResultError(f"The run{whose} in {folder} did not finish. Go on with it: {command}")
     return record
-
-
-def begun_in(folder: Path) -> Path | None:
-    """The record of a run that was begun in a folder which holds no finished one; None elsewhere.
-
-    Results that a killed process had only to move into place are moved. Raises VplogError.
-    """
-    recover(folder)
-    return folder / REQUEST if (folder / REQUEST).is_file() and not (folder / "run.json").is_file() else None
 
 
 def read_single_run(folder: Path) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import about_gps
 from vplog.run.report import write_report
+from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -80,10 +81,12 @@ def write(
 ) -> None:
     """Write the tables, the trajectory, the graph and result.mcap of a run into its folder."""
     log, keyframes, trajectory, poses = run.log, run.keyframes, run.solved.trajectory, run.solution.world_from_body
-    previews, gps = run.features.pictures, log.gps()
-    inputs = ClosureInputs(previews.image, run.features.__getitem__, run.camera, run.state, run.places)
+    picture, gps = run.features.picture, log.gps()
+    inputs = ClosureInputs(
+        lambda row: decode_image(picture(row)), run.features.__getitem__, run.camera, run.state, run.places
+    )
     shown = finished_picture(
-        inputs, previews, run.closures, run.references, verify, pictures, gps=gps,
+        inputs, picture if run.features.has_pictures else None, run.closures, run.references, verify, pictures, gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
     )  # fmt: skip

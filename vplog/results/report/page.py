@@ -205,8 +205,9 @@ def _ledger(content: Content, pictures: list[int]) -> dict[str, Any] | None:
     """Columns and rows as JSON, None without candidates; `pictures` are the rows that have one in the page."""
     if not len(content.closures):
         return None
-    rows = _chosen(content.closures)
-    columns = _columns(content, rows)
+    closures = content.closures
+    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*_TAKEN)))
+    columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
     return {
         "columns": list(columns),
         "rows": list(map(list, zip(*columns.values(), strict=True))),
@@ -236,14 +237,6 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
         "sigma after": _rounded(closures.residual_after[rows], 2),
         "weight": _rounded(closures.weight[rows], 3),
     }
-
-
-def _chosen(closures: Closures) -> list[int]:
-    """Rows of the ledger that are in the page."""
-    if len(closures) <= _MOST_ROWS:
-        return list(range(len(closures)))
-    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*_TAKEN)))
-    return sorted(order[:_MOST_ROWS].tolist())
 
 
 def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
