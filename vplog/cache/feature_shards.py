@@ -49,7 +49,7 @@ class Extracted:
 
     def __init__(self) -> None:
         self.stamp_ns: list[int] = []
-        """Of the keyframes that were decoded."""
+        """Stamps of the keyframes that were decoded."""
         self.lost: list[str] = []
         """Why each of the others was not."""
         self.undecodable: list[tuple[str, int]] = []
@@ -63,10 +63,10 @@ class Extracted:
             with path.open("rb") as stream:
                 length = path.stat().st_size
                 stream.seek(CONTENT_AT)
-                begin = CONTENT_AT + _LENGTH.size + (told := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
+                begin = CONTENT_AT + _LENGTH.size + (head_bytes := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
                 if begin > length:
                     raise DamagedError("its header is longer than the file")
-                head = json.loads(stream.read(told))
+                head = json.loads(stream.read(head_bytes))
             rows = [_Row(*map(int, row)) for row in head["rows"]]
             lost = [str(why) for why in head["lost"]]
             undecodable = [(str(topic), int(stamp_ns)) for topic, stamp_ns in head["undecodable"]]

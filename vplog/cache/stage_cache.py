@@ -2,7 +2,7 @@
 
 A file is named by its stage and the sha256 over what it depends on: the results and settings that went in, the code
 that made it and the packages which that uses. It is written beside and renamed, and holds length and checksum of its
-content: what is found is whole, or is made anew with a warning. One folder is for one drive.
+content: what is found is whole, or is computed again with a warning. One folder is for one drive.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _HEAD = struct.Struct("<8s32sQI")
 """Magic with the version of the format, key, bytes that follow, their CRC-32: it is there against damage, and is summed
 up at 2.8 GB/s where sha256 takes eight times as long."""
 ENDING = ".stage"
-"""Of the files of a cache: what else is in its folder is not touched."""
+"""Suffix of the files of a cache: what else is in its folder is not touched."""
 INPUTS = "inputs.json"
 """Name of the file with the identity and hashes of the log that a cache is of."""
 CACHE_FILES = (f"*{ENDING}", ".*.part", INPUTS)

@@ -76,7 +76,7 @@ class Steps:
     ) -> None:
         """Results of the steps of `drive` are kept in `folder`. Raises ResultError where it cannot be made."""
         self.warnings: list[str] = []
-        """Of the run so far. What a cached step warned of is repeated when its result is found."""
+        """Warnings of the run so far. What a cached step warned of is repeated when its result is found."""
         self.cache = StageCache(folder, drive, self.warnings, use_cache)
         self._execution, self._watch = execution, Watch()
         self._results: dict[str, dict[str, Any]] = {}

@@ -23,7 +23,7 @@ FORMAT = 1
 CACHE = ".cache"
 """Where a run folder keeps what its stages came to, unless another place is named."""
 REQUEST = f"{CACHE}/run.json"
-"""What a run that is not finished was asked for; run.json of its folder is that of the finished run before, if any."""
+"""Request of a run that is not finished; run.json of its folder is that of the finished run before, if any."""
 CHECKSUM = "record_sha256"
 """Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an older vplog or an
 editor wrote it."""
@@ -106,9 +106,9 @@ def read_finished_run(folder: Path) -> dict[str, Any]:
     begun = (folder / REQUEST).is_file() and not (folder / "run.json").is_file()
     record = read_run_json(folder / (REQUEST if begun else "run.json"))
     if not record.get("finished"):
-        whose = f" of {record['log']}" if isinstance(record.get("log"), str) else ""
+        of_log = f" of {record['log']}" if isinstance(record.get("log"), str) else ""
         command = f"vplog run --resume -o {shlex.quote(str(folder))}"
-        raise ResultError(f"The run{whose} in {folder} did not finish. Go on with it: {command}")
+        raise ResultError(f"The run{of_log} in {folder} did not finish. Go on with it: {command}")
     return record
 
 

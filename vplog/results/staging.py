@@ -134,7 +134,7 @@ def _move(out: Path) -> None:
 
 
 def _stale(committed: Path) -> list[str]:
-    """Names of results to remove. Raises ResultError where that is not told in a sound way, and OSError."""
+    """Names of results to remove. Raises ResultError where they are no list of names, and OSError."""
     path = committed / _STALE
     if not path.exists():  # all was moved, and the folder on its way out
         return []

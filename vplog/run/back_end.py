@@ -61,10 +61,10 @@ class Solved:
     """The ledger, judged."""
     refined: Refined
     fixes: Fixes | None
-    """GPS, where it was asked for."""
+    """Of GPS, with `gps.use`."""
     trajectory: Trajectory
     noise_source: str
-    """Of the odometry's noise, as `edge_covariance` names it."""
+    """Source of the odometry's noise, as `edge_covariance` names it."""
     warnings: list[str]
 
 

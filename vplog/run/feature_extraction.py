@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from vplog.stages import Log
 
     Decoded = tuple[int, Frame | None, Features | None, str]
-    """Of `extract_frames`: stamp, frame, features, and why there are none."""
+    """Stamp, frame, features, and why there are none, as `extract_frames` gives them."""
 
 _log = logging.getLogger(__name__)
 _UNCALIBRATED = (
@@ -96,7 +96,7 @@ class Part:
     topics: logs.TopicChoice
     pipeline: Extraction
     stamp_ns: tuple[int, ...]
-    """Of its keyframes, increasing."""
+    """Stamps of its keyframes, increasing."""
     number: int
     key: str
     """sha256 over all that its content depends on."""

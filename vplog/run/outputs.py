@@ -43,7 +43,7 @@ class Run:
     camera: Camera
     keyframes: Keyframes
     features: Extracted
-    """Of the keyframes, as long as the stage cache is there."""
+    """Features of the keyframes, as long as the stage cache is there."""
     library: Path | None
     """The folder of the library given; None where the references are of the drive's own keyframes."""
     references: list[Reference]

@@ -52,7 +52,7 @@ def begun(
     Raises SettingsError where `out` holds other things, or without `force` the run of another log.
     """
     cache, request = out / CACHE, out / REQUEST
-    asked = {
+    record = {
         **head,
         "finished": False,
         "topics": (topics or TopicChoice()).model_dump(mode="json"),
@@ -73,7 +73,7 @@ def begun(
         try:
             if resumable:
                 cache.mkdir(exist_ok=True)
-                run_record.write_run_json(request, asked)
+                run_record.write_run_json(request, record)
             yield made
         except BaseException as error:
             kept = set(cache.rglob(f"*{ENDING}")) - before if resumable else ()
@@ -90,7 +90,7 @@ def begun(
 
 
 def _what_is_kept(out: Path, kept: Collection[Path]) -> str:
-    """Of a run that was interrupted, and the command that resumes it."""
+    """Stages and bytes that an interrupted run leaves, and the command that resumes it."""
     stages = ", ".join(sorted({file.name.split("-")[0] for file in kept}))
     return (
         f"{sum(file.stat().st_size for file in kept) / 1e6:.1f} MB of results of stages ({stages}) are kept in "
