@@ -24,6 +24,7 @@ from tests.maps.bucket import serving
 from vplog import errors
 from vplog.demo import make_drive
 from vplog.execution.process_pool import OwnProcesses
+from vplog.results.run_record import read_run_json
 from vplog.storage.remote_path import local_output, located
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def test_a_folder_of_the_same_name_leaves_the_function(name: str) -> None:
 
 def test_tables_are_those_of_the_files(run: vplog.RunFolder) -> None:
     again = vplog.open_run(run.folder)
-    assert again.record == json.loads((run.folder / "run.json").read_text())
+    assert again.record == read_run_json(run.folder / "run.json")
     assert again.record["counts"] == run.record["counts"]
     assert len(run.trajectory) == run.record["counts"]["odometry"]
     assert len(run.closures) == run.record["counts"]["candidates"]

@@ -24,6 +24,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.pipeline import CacheOptions, load_pipeline, pipeline_schema, run
 from vplog.results import tables
+from vplog.results.run_record import read_run_json
 from vplog.run.reference_library import build_library
 from vplog.verbs.evaluate_run import evaluate
 
@@ -42,7 +43,7 @@ QUICK = ("features.max_features=400", "propose.per_query=2", "library.size=5")
 
 
 def record_of(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    return read_run_json(folder / "run.json")
 
 
 def contents(folder: Path) -> dict[str, bytes]:

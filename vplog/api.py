@@ -431,7 +431,7 @@ class Answers:
         """A row for each answer: `query`, `rank`, `drive`, `keyframe`, `score`, ..., best first for each view."""
         import pyarrow as pa
 
-        from vplog.results.placed import PLACED
+        from vplog.results.tables import PLACED
 
         return pa.Table.from_pylist(self.record["answers"], schema=PLACED)
 

@@ -153,11 +153,9 @@ def run(
     topics = topics or logs.TopicChoice()
     log = logs.open_drive(files_of(path), topics)
     check_library(library, pipeline)
-    resumable = cache.use and not cache.folder
+    resumable, head = cache.use and not cache.folder, provenance.head(pipeline, path, execution.threads, topics)
     with (
-        begun(
-            out, pipeline, path, execution.threads, library, topics, resumable=resumable, force=cache.force
-        ) as folder,
+        begun(out, head, files_of(path), library, topics, resumable=resumable, force=cache.force) as folder,
         Steps(path, cache.folder or (out if cache.use else folder) / CACHE, execution, use_cache=cache.use) as do,
     ):
         odometry, camera, selected = do(read, log, pipeline.keyframes)
@@ -178,6 +176,6 @@ def run(
         result = Run(
             log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved
         )
-        do(write, folder, result, pipeline, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
-        head = provenance.head(pipeline, path, execution.threads, topics)
+        header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
+        do(write, folder, result, pipeline.verify, pipeline.pictures, header)
         return finish(folder, result, do(report, folder, result, head), do)

@@ -26,6 +26,7 @@ from vplog.demo import SMALL, make_drive
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline
+from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -117,7 +118,7 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
 
     told = run_batch([first_log, second_log, long_log], root, pipeline, engine="ray", address=cluster.address)
     assert [one["state"] for one in told["drives"]] == ["unchanged", "unchanged", "computed"]
-    stages = json.loads((root / "runs" / "drive=third" / "run.json").read_text())["stages"]
+    stages = read_run_json(root / "runs" / "drive=third" / "run.json")["stages"]
     assert stages["extract"]["parts"] == stages["extract"]["parts_reused"] >= 2
     assert tables(root) == tables(alone)
     assert not [path for place in places for path in place.glob("vplog-*/run-*")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +28,7 @@ from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.sequence import SequenceSettings
+from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -308,7 +308,7 @@ def test_files_are_the_same_every_time(verb: Verb, traversals: tuple[Path, Path]
     ]
     for name in names[1:]:
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
-    records = [json.loads((out / "compare.json").read_text()) for out in outs]
+    records = [read_run_json(out / "compare.json") for out in outs]
     assert without_times(records[0]) == without_times(records[1])
     assert all(record["methods"]["bobb"]["sequence"]["length"] == 3 for record in records)
     with np.load(outs[0] / records[0]["methods"]["bobb"]["scores"]) as scores:

@@ -98,7 +98,7 @@ def write_drive(store: Store, first: int, places: Places, state: BobbState) -> N
     run.mkdir(parents=True, exist_ok=True)
     column = state.to_arrow([Place(*one) for one in zip(places.references, places.weights, places.boxes, strict=True)])
     about = tables.TableMetadata(state.settings.model_dump(mode="json"), state.hash)
-    tables.write_descriptors(run / "descriptors.parquet", keyframes, [column], state.arrow_type, about)
+    tables.write_descriptors(run / "descriptors.parquet", keyframes, column, about)
     record = {"drive": drive, "log": drive, "key": drive, "library": state.hash, "inputs": {}}
     run_record.write_run_json(run / "drive.json", record)
 

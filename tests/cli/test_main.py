@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import vplog
 from vplog.demo.record import GPS, IMAGE, ODOMETRY, TYPES
+from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -79,7 +80,7 @@ def with_position(value: Callable[[int, float], float]) -> Change:
 
 
 def record_of(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    return read_run_json(folder / "run.json")
 
 
 def started(*arguments: object, **options: Any) -> subprocess.Popen[str]:

@@ -20,6 +20,7 @@ from tests.logs.drives import ros_messages, write_ros2
 from vplog.cli import printing
 from vplog.demo.record import IMAGE
 from vplog.results import tables
+from vplog.results.run_record import read_run_json
 from vplog.run.report import Outcome, outcome_of
 
 if TYPE_CHECKING:
@@ -162,9 +163,8 @@ def test_an_evaluation_wraps_between_words(
 def test_a_run_ends_with_what_came_of_it_where_to_look_and_what_next(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import json
 
-    record = json.loads((finished / "run.json").read_text())
+    record = read_run_json(finished / "run.json")
     outcome = outcome_of(finished, 5)
     printing.print_run(finished, record, outcome)
     out = capsys.readouterr().out
@@ -205,9 +205,8 @@ def test_what_came_of_a_run_is_said_in_metres(outcome: Outcome, gps: Any, said: 
 
 
 def test_a_joint_run_says_what_next(joint: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import json
 
-    printing.print_joint(joint, json.loads((joint / "run.json").read_text()))
+    printing.print_joint(joint, read_run_json(joint / "run.json"))
     out = capsys.readouterr().out
     assert f"next      vplog evaluate {joint} --truth FILE.tum" in out
     assert "report.html" in out

@@ -39,7 +39,7 @@ def write_run(
         [{"references": rng.integers(100, size=3), "boxes": rng.integers(256, size=6)} for _ in range(COUNT)], KIND
     )
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, run.solution.world_from_body, about)
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, [column], KIND, about)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, about)
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, about)
     residual = np.zeros(len(run.graph.a))
     tables.write_edges(folder / "edges.parquet", run.graph, run.solution, residual, about)

@@ -50,7 +50,7 @@ def a_run(folder: Path, kind: pa.DataType, seed: int) -> pa.Array:
     keyframes = replace(run.keyframes, drive=f"drive {seed}")
     column = pa.array([value(kind, rng) for _ in range(COUNT)], kind)
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, run.solution.world_from_body, METADATA)
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, [column], kind, METADATA)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, METADATA)
     return column
 
 

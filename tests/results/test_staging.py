@@ -181,7 +181,7 @@ def test_where_a_folder_may_be(tmp_path: Path, out: Path, monkeypatch: pytest.Mo
 
 def test_things_in_the_way_are_named_and_results_wait_for_them(out: Path) -> None:
     (out / "c.parquet").mkdir()
-    with pytest.raises(ResultError, match=r"c\.parquet.*clear the way"):
+    with pytest.raises(ResultError, match=rf": {out}/c\.parquet: .*clear the way"):
         replace(out)
     with pytest.raises(ResultError, match="clear the way"):
         recover(out)

@@ -20,8 +20,9 @@ from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, tables
-from vplog.results.report.content import Judged
+from vplog.results.report.page import Judged
 from vplog.results.report.page import page as write_page
+from vplog.results.run_record import read_run_json
 from vplog.run.report import gather
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finishe
 
 
 def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> None:
-    record = json.loads((finished / "run.json").read_text())
+    record = read_run_json(finished / "run.json")
     for name in record["stages"]:
         if name != "report":  # it is written before it knows how long it took
             assert f"<td>{name}</td>" in page
@@ -209,7 +210,7 @@ def test_damaged_and_unfinished_runs_are_one_line(verb: Verb, finished: Path, tm
     assert "result.mcap cannot be read" in verb("report", folder).error
     (folder / "result.mcap").unlink()
     assert "does not exist" in verb("report", folder).error
-    record = json.loads((folder / "run.json").read_text())
+    record = read_run_json(folder / "run.json")
     (folder / "run.json").write_text(json.dumps({**record, "finished": False}))
     assert "did not finish" in verb("report", folder).error
     assert "run.json" in verb("report", tmp_path).error
@@ -220,7 +221,7 @@ def hostile(finished: Path, tmp_path: Path) -> Path:
     """A run whose names come from a stranger."""
     folder = tmp_path / "run"
     shutil.copytree(finished, folder)
-    record = json.loads((folder / "run.json").read_text())
+    record = read_run_json(folder / "run.json")
     record |= {"log": HOSTILE, "warnings": [HOSTILE], "noise": HOSTILE, "inputs": {HOSTILE: HOSTILE}}
     record["solution"]["reason"] = HOSTILE
     record["stages"] = {HOSTILE: {"seconds": HOSTILE}}
@@ -244,7 +245,7 @@ def test_what_strangers_wrote_is_text(verb: Verb, hostile: Path, page: str) -> N
 def test_losses_are_placed_in_time(verb: Verb, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(finished, folder)
-    record = json.loads((folder / "run.json").read_text())
+    record = read_run_json(folder / "run.json")
     start = int(tables.read_keyframes(folder / "keyframes.parquet")[0].stamp_ns[0])
     spans = [[start + 1_000_000_000, start + 2_000_000_000], [start + 3_000_000_000, start + 3_500_000_000]]
     loss = {"reason": "cut", "topic": "/a<b", "messages": 450, "of": 1500, "spans_ns": spans, "detail": "no footer"}

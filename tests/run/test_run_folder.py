@@ -47,14 +47,17 @@ def complete(out: Path, logs: Path | list[Path], force: bool = False, joint: boo
     """A run that has nothing but its account."""
     paths = logs if isinstance(logs, list) else [logs]
     drives = {path.stem: path for path in paths} if joint else {}
-    with begun(out, Pipeline(), paths[0] if joint else paths, 1, drives=drives, force=force) as made:
+    asked = head(Pipeline(), paths[0] if joint else paths, 1)
+    if joint:
+        asked |= run_folder.provenance.logs_of(paths)
+    with begun(out, asked, paths, drives=drives, force=force) as made:
         for name, one in {**drives, **({} if joint else {"": paths})}.items():
             if name:
                 complete(made / name, one)
             else:
                 write(made, one)
         if joint:
-            account = {**head(Pipeline(), paths[0], 1), **run_folder.provenance.logs_of(paths), "finished": True}
+            account = {**asked, "finished": True}
             (made / "run.json").write_text(json.dumps({**account, "drives": [{"folder": name} for name in drives]}))
         if stage:
             (out / ".cache" / "extract-0.stage").write_text("a result")
@@ -204,7 +207,7 @@ def test_an_unfinished_run_of_another_log_is_not_dropped(log: Path, other: Path,
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, LogError, ResultError])
 def test_a_run_that_came_to_nothing_leaves_nothing(error: type[BaseException], log: Path, tmp_path: Path) -> None:
-    with pytest.raises(error), begun(tmp_path / "new" / "out", Pipeline(), log, 1):
+    with pytest.raises(error), begun(tmp_path / "new" / "out", head(Pipeline(), log, 1), [log]):
         raise error
     assert not (tmp_path / "new").exists()
 
@@ -212,7 +215,8 @@ def test_a_run_that_came_to_nothing_leaves_nothing(error: type[BaseException], l
 def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: Path, tmp_path: Path) -> None:
     """It would fail again; stages that it finished stay for other runs."""
     out = tmp_path / "out"
-    with pytest.raises(LogError) as failed, begun(out, Pipeline(), log, 1, drives={"a": log, "b": other}):
+    asked = {**head(Pipeline(), log, 1), **run_folder.provenance.logs_of([log, other])}
+    with pytest.raises(LogError) as failed, begun(out, asked, [log, other], drives=["a", "b"]):
         written(out / ".cache" / "extract-0.stage", b"a result")
         raise LogError
     assert not hasattr(failed.value, "__notes__")
@@ -223,7 +227,7 @@ def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: P
 def test_a_request_stays_while_it_is_gone_on_with(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for stage in (True, False):
-        with pytest.raises(KeyboardInterrupt), begun(out, Pipeline(), log, 1):
+        with pytest.raises(KeyboardInterrupt), begun(out, head(Pipeline(), log, 1), [log]):
             if stage:
                 (out / ".cache" / "extract-0.stage").write_text("a result")
             raise KeyboardInterrupt

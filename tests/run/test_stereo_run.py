@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,6 +10,7 @@ from vplog.data import Verdict
 from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline, run
+from vplog.results.run_record import read_run_json
 from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:
@@ -28,6 +28,6 @@ def test_metres_come_from_the_pair(tmp_path: Path) -> None:
     assert {done.closures.scale[row] for row in accepted} == {"stereo"}
     found = evaluate(tmp_path / "run", str(drive.truth))
     assert found["ate_after"]["rmse_m"] < 0.1 * found["ate_before"]["rmse_m"]
-    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    record = read_run_json(tmp_path / "run" / "run.json")
     # the demo's odometry is 1 % too long
     assert record["odometry"]["scale"] == pytest.approx(1 / (1 + SMALL.odometry_scale_error), abs=0.01)

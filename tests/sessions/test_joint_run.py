@@ -17,6 +17,7 @@ from vplog.evaluate.truth import read_truth
 from vplog.geometry import se3
 from vplog.geometry.tum import write_tum
 from vplog.results import tables
+from vplog.results.run_record import read_run_json
 from vplog.run.provenance import OWN_LIBRARY
 from vplog.verbs.evaluate_run import evaluate
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_not(joint: Path, drive: Drive) -> None:
-    record = json.loads((joint / "run.json").read_text())
+    record = read_run_json(joint / "run.json")
     assert record["finished"] is True
     assert [found["drives"] for found in record["maps"]] == [["before", "after"], ["drive"]]
     ties = {(tie["query_drive"], tie["match_drive"]): tie for tie in record["joins"]}
@@ -52,7 +53,7 @@ def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_no
 
 
 def test_a_killed_run_of_several_drives_is_gone_on_with(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
-    whole = json.loads((joint / "run.json").read_text())
+    whole = read_run_json(joint / "run.json")
     out = shutil.copytree(joint, tmp_path / "out")
     asked = {**whole, "finished": False, "topics": {}, "drives": None, "library": {"from": OWN_LIBRARY}}
     (out / ".cache" / "run.json").write_text(json.dumps(asked))
@@ -70,13 +71,13 @@ def test_a_killed_run_of_several_drives_is_gone_on_with(joint: Path, tmp_path: P
     assert tables_of(out) == tables_of(joint)
     assert not (out / "gone").exists()
     assert not (out / ".cache" / "run.json").exists()
-    assert json.loads((out / "after" / "run.json").read_text())["library"]["from"] == str(out / "library")
+    assert read_run_json(out / "after" / "run.json")["library"]["from"] == str(out / "library")
 
 
 def _resumed(verb: Callable[..., Said], out: Path) -> dict[str, Any]:
     """run.json of each drive."""
     told = verb("run", "--resume", "-o", out, "--json").json
-    return {drive["name"]: json.loads((out / drive["folder"] / "run.json").read_text()) for drive in told["drives"]}
+    return {drive["name"]: read_run_json(out / drive["folder"] / "run.json") for drive in told["drives"]}
 
 
 def tables_of(out: Path) -> dict[str, bytes]:
@@ -119,7 +120,7 @@ def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Ca
     assert found["maps"][0]["ate_after"]["rmse_m"] < 1.5
     pairs = {(pair["query_drive"], pair["match_drive"]): pair for pair in found["joins"]}
     joined = pairs["after", "before"]
-    record = json.loads((joint / "run.json").read_text())
+    record = read_run_json(joint / "run.json")
     kept = {(tie["query_drive"], tie["match_drive"]): tie["kept"] for tie in record["joins"]}
     assert joined["accepted"] + joined["not_judged"] == kept["after", "before"]
     assert joined["precision"] == 1.0

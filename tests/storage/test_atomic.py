@@ -91,7 +91,7 @@ def test_every_writer_says_that_the_disk_is_full_and_leaves_nothing(tmp_path: Pa
     column = pa.array([np.random.default_rng(0).bytes(100)] * len(world), pa.binary())
     write = {
         "closures": lambda: tables.write_closures(path, run.closures, run.keyframes, METADATA),
-        "descriptors": lambda: tables.write_descriptors(path, run.keyframes, [column], pa.binary(), METADATA),
+        "descriptors": lambda: tables.write_descriptors(path, run.keyframes, column, METADATA),
         "tum": lambda: write_tum(path, run.trajectory),
         "g2o": lambda: write_g2o(path, run.graph, world),
         "mcap": lambda: write_mcap(path, run.keyframes, world, run.graph, run.closures, METADATA),

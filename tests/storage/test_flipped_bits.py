@@ -17,9 +17,8 @@ from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_tables import write_all
-from vplog.cache.checked_file import DamagedError, content_of, sealed
 from vplog.cache.codecs import closures_codec
-from vplog.cache.stage_cache import digest_of
+from vplog.cache.stage_cache import DamagedError, content_of, digest_of, sealed
 from vplog.data import Features, Reference
 from vplog.errors import ResultError, VplogError
 from vplog.maps.search.index import update_index
@@ -27,8 +26,8 @@ from vplog.maps.search.segment import open_segment
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings
 from vplog.places.library_files import load_references, save_references
-from vplog.results import geo, kept_features, placed, places_map, tables
-from vplog.results.shown import Earth
+from vplog.results import geo, kept_features, places_map, tables
+from vplog.results.geo import Earth
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -65,7 +64,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     )
     (folder / "run").mkdir()
     tables.write_keyframes(folder / "run" / "keyframes.parquet", RUN.keyframes, RUN.solution.world_from_body, METADATA)
-    tables.write_descriptors(folder / "run" / "descriptors.parquet", RUN.keyframes, [column], KIND, METADATA)
+    tables.write_descriptors(folder / "run" / "descriptors.parquet", RUN.keyframes, column, METADATA)
     exported = folder / "map.parquet"
     places_map.write_map(exported, [folder / "run"])
     kept, joins, answers = folder / "features.parquet", folder / "joins.parquet", folder / "placed.parquet"
@@ -73,7 +72,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     tables.write_joins(joins, [(RUN.keyframes, RUN.keyframes, RUN.closures)], METADATA)
     rows = np.arange(9, dtype=np.int32)
     values = [rows, rows.astype(np.int64), rows, ["a"] * 9, rows, rows.astype(np.int64), rows.astype(np.float32), rows]
-    placed.write_placed(answers, placed.placed_table(values), METADATA)
+    tables.write_placed(answers, tables.placed_table(values), METADATA)
     geo.write_geoparquet(folder / "geo.parquet", RUN.trajectory, Earth((48.0, 11.0, 500.0), np.eye(4)), {})
     world = RUN.solution.world_from_body
     return {

@@ -19,6 +19,7 @@ from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results import tables
+from vplog.results.run_record import read_run_json
 from vplog.verbs.explain_text import describe
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def copied(finished: Path, tmp_path: Path) -> Path:
 
 
 def changed(folder: Path, **values: Any) -> None:
-    record = json.loads((folder / "run.json").read_text())
+    record = read_run_json(folder / "run.json")
     (folder / "run.json").write_text(json.dumps({**record, **values}))
 
 

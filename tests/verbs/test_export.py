@@ -22,7 +22,7 @@ from vplog.geometry import geodesy, se3
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
 from vplog.results import tables
-from vplog.results.layouts import LAYOUTS
+from vplog.results.contracts import LAYOUTS
 from vplog.verbs.export import FORMATS
 
 if TYPE_CHECKING:

@@ -25,10 +25,9 @@ from tests.logs.messages.test_video import messages, packets
 from tests.results.example import make_run
 from vplog import logs
 from vplog.cache import code_hash, feature_shards
-from vplog.cache.checked_file import CONTENT_AT, DamagedError, sealed
 from vplog.cache.codecs import closures_codec, columns_codec, images_codec
 from vplog.cache.feature_shards import Extracted
-from vplog.cache.stage_cache import StageCache, digest_of, inputs_of
+from vplog.cache.stage_cache import CONTENT_AT, DamagedError, StageCache, digest_of, inputs_of, key_of, sealed
 from vplog.cache.steps import Steps
 from vplog.data import Closures, Keyframes
 from vplog.errors import LogError, ResultError
@@ -36,6 +35,7 @@ from vplog.execution.execution import Execution
 from vplog.logs.frames import RecordedFrame
 from vplog.loops.propose import Proposals
 from vplog.pipeline import CacheOptions, Pipeline, load_pipeline, run
+from vplog.results.run_record import read_run_json
 from vplog.run import feature_extraction, verification
 from vplog.run.feature_extraction import compute_part, cut, extract, missing_parts, parts_of, put_part, stored_features
 from vplog.run.provenance import head
@@ -72,7 +72,7 @@ def results(out: Path) -> dict[str, str]:
 
 def computed(out: Path) -> list[str]:
     """Of the stages that are kept, those that the last run into `out` computed, in part at least."""
-    stages = json.loads((out / "run.json").read_text())["stages"]
+    stages = read_run_json(out / "run.json")["stages"]
     return [name for name in KEPT if stages[name]["result"] != "reused"]
 
 
@@ -144,7 +144,7 @@ def test_a_killed_run_is_gone_on_with_to_the_same_bytes(
         code = KILLED.format(part=PART, after=after, before=chance.random() < 0.5)
         killed = subprocess.run([sys.executable, "-c", code, *command, *told], capture_output=True, check=False)
         assert killed.returncode == -9, killed.stderr
-        assert json.loads((out / ".cache" / "run.json").read_text())["finished"] is False
+        assert read_run_json(out / ".cache" / "run.json")["finished"] is False
         assert not (out / "run.json").exists()
     done = list((out / ".cache").glob("extract-*"))
     assert len(done) >= 2
@@ -234,6 +234,25 @@ def test_a_log_is_known_by_its_content_where_its_times_are_new(
     os.utime(copy, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert not missing_parts(again / ".cache", parts_of(log, pipeline, cache=again / ".cache"))
     assert missing_parts(again / ".cache", parts_of(copy, pipeline, cache=again / ".cache"))
+
+
+def test_no_flipped_bit_of_a_logs_identity_is_believed(tmp_path: Path) -> None:
+    """The log has the name it had in the cache, or another that nothing is kept by."""
+    file, cache, chance = tmp_path / "a.mcap", tmp_path / "cache", random.Random(5)
+    file.write_bytes(b"a log")
+    with StageCache(cache, file, []) as stages:
+        stages.store("extract-000000", "0" * 64, [], b"")
+        stages.finish(["extract-000000.stage"])
+    os.utime(file, ns=(0, 0))
+    known, sound = inputs_of(file, cache), (cache / "inputs.json").read_bytes()
+    assert known.token != key_of(known.look)
+    for _ in range(200):
+        flipped = bytearray(sound)
+        flipped[chance.randrange(len(sound))] ^= 1 << chance.randrange(8)
+        (cache / "inputs.json").write_bytes(flipped)
+        found = inputs_of(file, cache)
+        assert found.token in (known.token, key_of(known.look))
+        assert found.look == known.look
 
 
 def test_what_was_lost_and_said_is_told_again(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -473,8 +492,9 @@ def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_
     log.write_text("a log")
 
     def done(library: Path | None = None) -> None:
-        with begun(out, pipeline, log, 1, library) as made:
-            (made / "run.json").write_text(json.dumps({"vplog": "1", **head(pipeline, log, 1)}))
+        account = head(pipeline, log, 1)
+        with begun(out, account, [log], library) as made:
+            (made / "run.json").write_text(json.dumps(account))
 
     done()
     assert {file.name for file in out.iterdir()} == {"run.json"}
@@ -489,7 +509,7 @@ def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_
 def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
     assert "has no run.json" in verb("run", "--resume", "-o", tmp_path / "none").error
     assert "is finished" in verb("run", "--resume", "-o", whole).error
-    account = json.loads((whole / "run.json").read_text())
+    account = read_run_json(whole / "run.json")
     out = tmp_path / "out"
     out.mkdir()
 

@@ -11,13 +11,10 @@ import platform
 import sys
 from functools import cache
 from importlib import metadata
+from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import vplog
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _PACKAGE = Path(vplog.__file__).parent
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
@@ -44,8 +41,7 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
     """Files by name of the vplog modules that these import, and the names of the packages of others."""
     files: dict[str, Path] = {}
     packages: set[str] = set()
-    waiting = list(modules)
-    followed: set[str] = set()
+    waiting, followed = list(modules), set[str]()
     while waiting:
         module = waiting.pop()
         if module in followed:
@@ -54,14 +50,11 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
         path = _file(module)
         if path is None:
             raise ValueError(f"{module} is no module of vplog")
-        parts = module.split(".")
-        for depth in range(1, len(parts)):
-            parent = ".".join(parts[:depth])
-            if (entered := _file(parent)) is not None:
-                files[parent] = entered
+        parents = accumulate(module.split(".")[:-1], "{}.{}".format)
+        files |= {parent: file for parent in parents if (file := _file(parent)) is not None}
         files[module] = path
         for name in _imports(path, path.stat().st_mtime_ns):
-            top = name.split(".", maxsplit=1)[0]
+            top = name.partition(".")[0]
             if top == "vplog":
                 waiting.append(name if _file(name) is not None else name.rpartition(".")[0])
             elif top not in sys.stdlib_module_names:
@@ -78,27 +71,20 @@ def _file(module: str) -> Path | None:
 @cache
 def _imports(path: Path, _changed_ns: int) -> list[str]:
     """Full names of all that a file imports when it runs, wherever in it. Stages share most of their files."""
-    found = []
-    for node in _running(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    found: list[str] = []
+    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while waiting:
+        match waiting.pop():
+            case ast.If(test=ast.Name(id="TYPE_CHECKING"), orelse=other):
+                waiting += other
+            case ast.Import(names=names):
+                found += [alias.name for alias in names]
+            case ast.ImportFrom(module=module, names=names, level=0):
+                found += [f"{module}.{alias.name}" for alias in names]
+            case node:
+                below = ast.iter_child_nodes(node)
+                waiting += [one for one in below if isinstance(one, ast.stmt | ast.excepthandler | ast.match_case)]
     return found
-
-
-def _running(node: ast.AST) -> Iterator[ast.AST]:
-    """Every statement below this one but those behind `if TYPE_CHECKING`."""
-    for child in ast.iter_child_nodes(node):
-        if not isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
-            continue
-        if isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
-            for other in child.orelse:
-                yield other
-                yield from _running(other)
-            continue
-        yield child
-        yield from _running(child)
 
 
 def _version(package: str) -> str:

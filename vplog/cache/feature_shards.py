@@ -6,10 +6,9 @@ import json
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from vplog.cache.checked_file import CONTENT_AT, AbsentError, DamagedError
+from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 from vplog.errors import ResultError
 from vplog.features.store import features_from, features_to, size_of
-from vplog.results.previews import Previews
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -50,7 +49,7 @@ class Extracted:
 
     def __init__(self) -> None:
         self.stamp_ns: list[int] = []
-        """Of the keyframes that were decoded."""
+        """Stamps of the keyframes that were decoded."""
         self.lost: list[str] = []
         """Why each of the others was not."""
         self.undecodable: list[tuple[str, int]] = []
@@ -64,10 +63,10 @@ class Extracted:
             with path.open("rb") as stream:
                 length = path.stat().st_size
                 stream.seek(CONTENT_AT)
-                begin = CONTENT_AT + _LENGTH.size + (told := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
+                begin = CONTENT_AT + _LENGTH.size + (head_bytes := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
                 if begin > length:
                     raise DamagedError("its header is longer than the file")
-                head = json.loads(stream.read(told))
+                head = json.loads(stream.read(head_bytes))
             rows = [_Row(*map(int, row)) for row in head["rows"]]
             lost = [str(why) for why in head["lost"]]
             undecodable = [(str(topic), int(stamp_ns)) for topic, stamp_ns in head["undecodable"]]
@@ -99,10 +98,11 @@ class Extracted:
         return features_from(data, row.features, row.width, row.height, bool(row.thumbnail))
 
     @property
-    def pictures(self) -> Previews:
-        return Previews(sum(row.picture > 0 for _, _, row in self._rows), self._picture)
+    def has_pictures(self) -> bool:
+        return any(row.picture for _, _, row in self._rows)
 
-    def _picture(self, at: int) -> bytes:
+    def picture(self, at: int) -> bytes:
+        """The JPEG of keyframe `at`; empty where pictures are switched off."""
         path, begin, row = self._rows[at]
         return _bytes_at(path, begin + row.offset + row.size, row.picture)
 

@@ -1,4 +1,4 @@
-"""The files of a drive: which they are, and how it is told that they are the same as before."""
+"""The files of a drive, their sha256, lengths and times."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def files_of(drive: Path | Sequence[Path]) -> list[Path]:
     return list(drive) if isinstance(drive, list | tuple) else [cast("Path", drive)]
 
 
-def hash_inputs(drive: Path | Sequence[Path], told: Callable[[int], None] = lambda _: None) -> dict[str, str]:
+def hash_inputs(drive: Path | Sequence[Path], progress: Callable[[int], None] = lambda _: None) -> dict[str, str]:
     """sha256 of every file of a log, by name; of remote ones what changes with them, as they are not read whole.
 
-    `told` the bytes of every block read; what it raises ends the reading.
+    `progress` gets the bytes of every block read; what it raises ends the reading.
     """
     result: dict[str, str] = {}
     for own, file in _named(drive):
@@ -37,7 +37,7 @@ def hash_inputs(drive: Path | Sequence[Path], told: Callable[[int], None] = lamb
             digest, block = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
             while count := stream.readinto(block):
                 digest.update(block[:count])
-                told(count)
+                progress(count)
         result[name] = digest.hexdigest()
     return result
 

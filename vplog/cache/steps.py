@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
-from vplog.cache.checked_file import AbsentError
 from vplog.cache.code_hash import code_of
-from vplog.cache.stage_cache import StageCache, digest_of, key_of
+from vplog.cache.stage_cache import AbsentError, StageCache, digest_of, key_of
 from vplog.execution.cores import limited
 from vplog.execution.execution import logged_warnings
 from vplog.execution.timing import Watch
@@ -77,7 +76,7 @@ class Steps:
     ) -> None:
         """Results of the steps of `drive` are kept in `folder`. Raises ResultError where it cannot be made."""
         self.warnings: list[str] = []
-        """Of the run so far. What a cached step warned of is repeated when its result is found."""
+        """Warnings of the run so far. What a cached step warned of is repeated when its result is found."""
         self.cache = StageCache(folder, drive, self.warnings, use_cache)
         self._execution, self._watch = execution, Watch()
         self._results: dict[str, dict[str, Any]] = {}

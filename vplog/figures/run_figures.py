@@ -12,8 +12,9 @@ from vplog.errors import ResultError
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
 from vplog.results.collage import Half, Panel, collage
+from vplog.results.geo import Earth
+from vplog.results.mcap import Explained, Shown
 from vplog.results.previews import jpeg, scaled_size, shrink
-from vplog.results.shown import Earth, Explained, Shown
 from vplog.stages import BoxState
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Camera, Closures, Features, Gps, Reference, Trajectory
     from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
-    from vplog.results.previews import PictureSettings, Previews
+    from vplog.results.previews import PictureSettings
     from vplog.stages import PlaceState
 
 _REFERENCE_MEGAPIXELS = 0.05
@@ -50,21 +51,22 @@ class ClosureInputs:
 
 
 def finished_picture(
-    inputs: ClosureInputs, previews: Previews, closures: Closures, references: list[Reference], verify: VerifySettings,
-    pictures: PictureSettings, gps: Gps | None, earth: Earth | None, about: dict[str, Any], execution: Execution
+    inputs: ClosureInputs, picture: Callable[[int], bytes] | None, closures: Closures, references: list[Reference],
+    verify: VerifySettings, pictures: PictureSettings, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
+    execution: Execution
 ) -> Shown:  # fmt: skip
-    """All that result.mcap shows of a run, made while its features are at hand."""
+    """All that result.mcap shows of a run, made while its features are at hand; `picture` gives a keyframe's JPEG."""
     state, camera = inputs.state, inputs.camera
     small = {
         number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
         for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
     }
     drawn = {}
-    if len(previews):
+    if picture is not None:
         rows = choose_examples(closures, pictures.closures)
         drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, execution)
     return Shown(
-        image=previews.__getitem__ if len(previews) else None,
+        image=picture,
         image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
         explained=(lambda row: explain(state, inputs.places[row])) if isinstance(state, BoxState) else None,
         references=small,

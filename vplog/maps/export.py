@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from vplog.data import Floats
     from vplog.maps.geo_bounds import Box
     from vplog.maps.storage.map_store import Store
+    from vplog.results.geo import Earth
     from vplog.results.places_map import DrivePlaces
-    from vplog.results.shown import Earth
 
     Progress = Callable[[str, int, int], None]
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from vplog.figures.run_figures import earth_of
 from vplog.results import mcap_read, run_record, tables
-from vplog.results.geo import on_earth
-from vplog.results.shown import Earth
+from vplog.results.geo import Earth, on_earth
 
 if TYPE_CHECKING:
     from pathlib import Path

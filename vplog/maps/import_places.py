@@ -61,7 +61,7 @@ def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[st
         shutil.rmtree(made, ignore_errors=True)
         made.mkdir()
         record = _record(path, about, places.drive, about.drives.get(places.drive, {}))
-        _write_run(made, places, taken, about, kind)
+        _write_run(made, places, taken, about)
         earth = earth_as_plain(earth_from_plain(record["earth"]), places.world_from_body)
         record = {**record, "drive": taken, "earth": earth}
         run_record.write_run_json(made / "drive.json", {**record, "key": drive_ids.key_of(record | {"earth": None})})
@@ -100,7 +100,7 @@ def _kind(store: Store, path: Path) -> pa.DataType:
     return pipeline.places.load(store.library(library), Execution()).arrow_type
 
 
-def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap, kind: pa.DataType) -> None:
+def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap) -> None:
     """The run folder of a drive of which the places alone are known."""
     stamps, poses = places.stamp_ns, places.world_from_body
     if not np.isfinite(poses).all() or np.any(np.diff(stamps) <= 0):
@@ -111,7 +111,7 @@ def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap, k
     graph = PoseGraph(poses, rows, rows, np.empty((0, 4, 4)), np.empty((0, 6, 6)), kinds)
     solution = Solution(poses, none, 0.0, 0.0, 0, True, "Places alone were taken.")
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, [places.descriptors], kind, header)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, places.descriptors, header)
     tables.write_closures(folder / "closures.parquet", no_closures(), keyframes, header)
     tables.write_edges(folder / "edges.parquet", graph, solution, none, header)
     tables.write_trajectory(

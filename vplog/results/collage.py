@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog.results.evenly import evenly
+from vplog.results.report.charts import evenly
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Bytes, Floats

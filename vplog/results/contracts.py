@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.results import kept_features, messages, placed, places_map, tables
-from vplog.results.layouts import layouts
+from vplog.results import kept_features, messages, places_map, tables
 from vplog.results.mcap import TOPICS
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.storage.scratch import replacing
@@ -31,22 +30,61 @@ _MAP_HEADER = {
     "`topics`, those that were requested; `earth`, where on earth its frame is.",
 }
 
+_CODE = (
+    "By reference, then window: where the window is found, the number of a box of places.box_columns x places.box_rows "
+    "cells in a grid of places.columns x places.rows, row by row by its upper left cell; 255: nowhere."
+)
+_CORNERS = "By reference, then box: x0 y0 x1 y1 in cells of a grid of places.grid x places.grid; all 0: none."
+_BEST_FIRST = "Numbers of the library images that explain it, best first"
+
+LAYOUTS: dict[str, list[tuple[str, str, str]]] = {
+    "bobb": [
+        ("references", "uint16[J]", f"{_BEST_FIRST}; 65535: none."),
+        ("weights", "uint8[J]", "How much each explains, in 255ths of the most."),
+        ("boxes", "uint8[J*I]", _CODE),
+    ],
+    "bobb_paper": [
+        ("references", "int32[J]", f"{_BEST_FIRST}; -1: none."),
+        ("boxes", "uint8[J*I*4]", _CORNERS),
+    ],
+    "hybrid": [
+        ("boxes", "as bobb", "The boxes; in a map boxes.references, boxes.weights, boxes.boxes."),
+        ("signs", "uint8[W*B/8]", "One bit for each visual word and direction."),
+    ],
+    "bovf": [("descriptor", "(uint16 word, uint8 count)[]", "Words by number, and how often each is there.")],
+    "fabmap": [("descriptor", "uint16[]", "Words that are there, increasing.")],
+    "vlad": [("descriptor", "float16[D]", "Of unit length; compared by the scalar product.")],
+    "gist": [("descriptor", "float16[D]", "Mean energy by scale, orientation, then block, row by row.")],
+    "thumbnail": [("descriptor", "uint8[2048]", "Patch-normalised pixels, row by row.")],
+}
+"""By recogniser: name, type and meaning of the parts of `descriptor`, which become columns of a map. J references
+with I boxes or windows on each, W words of B bits: settings under `places`, which the header of every table holds."""
+_OF_TABLE: dict[str, dict[str, Any]] = {
+    "features": {"file": "MAP/joins/drive=ID/features.parquet", "metadata": kept_features.HEADER},
+    "joins": {
+        "file": "joins.parquet, MAP/joins/drive=ID/match=ID.parquet, MAP/joint/component=KEY/joins.parquet",
+    },
+    "placed": {"file": "named by `vplog map query -o`"},
+    "map": {"file": "named by `vplog map export -o`", "metadata": {**_HEADER, **_MAP_HEADER}},
+}
+"""What the contract of a table says otherwise than those of most."""
+
 
 def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
     """Write the contracts into a folder; the files written, in order. The pipeline's JSON Schema comes from outside:
     the settings of all stages are known only to the pipeline."""
-    texts = {"vplog.LoopClosure.proto": messages.loop_closure_proto()}
     topics = [{"topic": name, "schema": kind, "description": about} for name, (kind, about) in TOPICS.items()]
-    texts["result.mcap.json"] = json.dumps({"file": "result.mcap", "topics": topics}, indent=2) + "\n"
-    texts["pipeline.schema.json"] = json.dumps(pipeline_schema, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+    texts = {
+        "vplog.LoopClosure.proto": messages.loop_closure_proto(),
+        "result.mcap.json": json.dumps({"file": "result.mcap", "topics": topics}, indent=2) + "\n",
+        "pipeline.schema.json": json.dumps(pipeline_schema, indent=2, sort_keys=True, ensure_ascii=False) + "\n",
+    }
     for name, schema in table_schemas().items():
         texts[f"{name}.json"] = json.dumps(_contract(name, schema), indent=2, ensure_ascii=False) + "\n"
-    written = []
     for name, text in texts.items():
         with replacing(folder / name) as stream:
             stream.write(text.encode())
-        written.append(folder / name)
-    return written
+    return [folder / name for name in texts]
 
 
 def table_schemas() -> dict[str, pa.Schema]:
@@ -58,45 +96,30 @@ def table_schemas() -> dict[str, pa.Schema]:
         "joins": tables.JOINS,
         "edges": tables.EDGES,
         "trajectory": tables.TRAJECTORY,
-        "placed": placed.PLACED,
+        "placed": tables.PLACED,
         "features": kept_features.FEATURES,
         "map": pa.schema([*places_map.PLACE, tables.descriptors_schema(pa.binary()).field("descriptor")]),
     }
 
 
 def _contract(name: str, schema: pa.Schema) -> dict[str, Any]:
-    columns = []
-    for column in schema:
-        metadata = {key.decode(): value.decode() for key, value in column.metadata.items()}
-        kind = _kind(column.type)
-        if column.name == "descriptor":
-            kind = "any"
-        columns.append(
-            {
-                "name": column.name,
-                "type": kind,
-                "nullable": column.nullable,
-                "unit": metadata["unit"],
-                "description": metadata["description"],
-            }
-        )
-    contract = {
-        "table": name,
-        "version": TABLE_VERSION,
-        "file": f"{name}.parquet",
-        "metadata": _HEADER,
-        "columns": columns,
-    }
-    if name == "features":
-        contract |= {"file": "MAP/joins/drive=ID/features.parquet", "metadata": kept_features.HEADER}
-    if name == "joins":
-        files = "joins.parquet, MAP/joins/drive=ID/match=ID.parquet, MAP/joint/component=KEY/joins.parquet"
-        contract |= {"file": files}
-    if name == "placed":
-        contract |= {"file": "named by `vplog map query -o`"}
-    if name == "map":
-        contract |= {"file": "named by `vplog map export -o`", "metadata": {**_HEADER, **_MAP_HEADER}}
-    return {**contract, "descriptor": layouts()} if columns[-1]["name"] == "descriptor" else contract
+    columns = [
+        {
+            "name": column.name,
+            "type": "any" if column.name == "descriptor" else _kind(column.type),
+            "nullable": column.nullable,
+            **{key: column.metadata[key.encode()].decode() for key in ("unit", "description")},
+        }
+        for column in schema
+    ]
+    about = {"table": name, "version": TABLE_VERSION, "file": f"{name}.parquet", "metadata": _HEADER}
+    contract = {**about, "columns": columns, **_OF_TABLE.get(name, {})}
+    if columns[-1]["name"] == "descriptor":
+        keys = ("name", "type", "description")
+        contract["descriptor"] = {
+            kind: [dict(zip(keys, part, strict=True)) for part in parts] for kind, parts in LAYOUTS.items()
+        }
+    return contract
 
 
 def _kind(kind: pa.DataType) -> str:

@@ -45,7 +45,7 @@ _HUES: tuple[Rgba, ...] = (
     (1.0, 0.62, 0.18, 1.0), (0.3, 0.76, 1.0, 1.0), (1.0, 0.37, 0.66, 1.0), (0.73, 0.88, 0.29, 1.0),
     (0.72, 0.52, 1.0, 1.0), (1.0, 0.85, 0.2, 1.0), (0.2, 0.9, 0.75, 1.0), (1.0, 0.45, 0.35, 1.0), (0.7, 0.7, 0.7, 1.0),
 )  # fmt: skip
-"""One for each window, apart from each other and bright on grey pictures; a tenth window begins anew."""
+"""One for each window, apart from each other and bright on grey pictures; a tenth window has the first."""
 _DISTORTION = {"plumb_bob": "plumb_bob", "rational_polynomial": "rational_polynomial", "equidistant": "kannala_brandt"}
 """Our names of distortion models, as Foxglove's schema has them (ROS says equidistant for Kannala and Brandt's)."""
 
@@ -140,7 +140,7 @@ def boxes(stamp_ns: int, corners: Floats, size: tuple[int, int], title: str) -> 
     for number, one in enumerate(corners.tolist()):
         if not np.isfinite(one).all():
             continue
-        # each a little smaller than the one before, so that lines that would lie on each other are all seen
+        # each a little smaller than the one before, so that lines that would lie on each other are all visible
         inset = 1.0 + number % len(_HUES)
         x0, y0, x1, y1 = (share * side for share, side in zip(one, (width, height) * 2, strict=True))
         drawn = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=_LINE_PX)

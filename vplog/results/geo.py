@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,12 +20,21 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Closures, Floats, Ints, Trajectory
-    from vplog.results.shown import Earth
 
 _DEGREE_DIGITS, _METRE_DIGITS = 8, 3
 """Decimals of GeoJSON: 1e-8 degrees are a millimetre."""
 _POINT_Z = struct.pack("<BI", 1, 1001)
 """Head of a point in ISO WKB: little endian, POINT Z (OGC 06-103r4, table 4)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Earth:
+    """Where on earth the trajectory's frame is."""
+
+    origin: tuple[float, float, float]
+    """Latitude and longitude in degrees and altitude in m, WGS84."""
+    enu_from_world: Floats
+    """(4, 4): from the trajectory's frame to m east, north and up of the origin."""
 
 
 def on_earth(earth: Earth, world_from_body: Floats) -> Floats:

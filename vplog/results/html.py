@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -29,7 +29,8 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
         undefined=ChainableUndefined,  # a run.json of another version may lack any field
     )
-    environment.filters |= {"figure": figure, "data_url": data_url, "mapping": mapping, "indented": _indented}
+    indented = partial(json.dumps, indent=1, ensure_ascii=False)
+    environment.filters |= {"figure": figure, "data_url": data_url, "mapping": mapping, "indented": indented}
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return environment
 
@@ -49,7 +50,3 @@ def data_url(data: bytes) -> str:
 def mapping(value: Any) -> dict[str, Any]:
     """The value where it is an object of JSON, else an empty one."""
     return value if isinstance(value, dict) else {}
-
-
-def _indented(tree: Any) -> str:
-    return json.dumps(tree, indent=1, ensure_ascii=False)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 import re
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,18 +28,19 @@ from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
 from vplog.results.run_record import canonical_json
-from vplog.results.shown import Shown
 from vplog.results.tables import covariance_of
+from vplog.storage.image_file import image_size
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from google.protobuf.message import Message
 
-    from vplog.data import Camera, Closures, Floats, Ints, Keyframes, PoseGraph
+    from vplog.data import Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph
     from vplog.results.foxglove import Part
+    from vplog.results.geo import Earth
     from vplog.results.tables import TableMetadata
 
     Timed = tuple[int, str, Message]
@@ -78,6 +80,41 @@ TOPICS = {
     ),
 }
 """Schema and meaning of every topic; NAME stands for the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """Where the parts of one keyframe were found on the reference that explains it best.
+
+    All places are shares of an image's sides, x0 y0 x1 y1.
+    """
+
+    references: Sequence[int]
+    """Those that explain it, best first; the boxes are on the first."""
+    windows: Floats
+    """(I, 4) parts of the keyframe."""
+    boxes: Floats
+    """(I, 4) where each was found, NaN where it was not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What result.mcap shows beside the tables, all of it optional."""
+
+    image: Callable[[int], bytes] | None = None
+    """JPEG of a keyframe by its row."""
+    image_size: tuple[int, int] = (0, 0)
+    """Width and height in px of these JPEGs."""
+    explained: Callable[[int], Explained | None] | None = None
+    """By row of the keyframe."""
+    references: Mapping[int, bytes] = field(default_factory=dict)
+    """JPEG of a reference of the library by its number."""
+    pictures: Mapping[int, bytes] = field(default_factory=dict)
+    """JPEG of a candidate closure by its row in the ledger."""
+    gps: Gps | None = None
+    earth: Earth | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """Versions, input hashes: what the file's metadata says beside the settings, as plain values by name."""
 
 
 def camera_topic(camera: Camera) -> str:
@@ -159,7 +196,7 @@ def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, s
     topic, size = camera_topic(camera), shown.image_size
     if shown.image is None:
         size = camera.width, camera.height  # annotations then are drawn on the log's own images
-    sizes = {number: _jpeg_size(data) for number, data in shown.references.items()}
+    sizes = {number: image_size(data) or (0, 0) for number, data in shown.references.items()}
     pictures = sorted(shown.pictures, key=lambda row: (int(closures.query[row]), row))
     for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
         if shown.image is not None or shown.explained is not None:
@@ -206,18 +243,14 @@ class _Channels:
 
     def write(self, stamp_ns: int, topic: str, message: Message) -> None:
         if topic not in self._ids:
-            self._ids[topic] = self._register(topic)
+            kind = self._classes[topic]
+            name = kind.DESCRIPTOR.full_name
+            if name not in self._schemas:
+                self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(kind))
+            self._ids[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
         data, sequence = message.SerializeToString(deterministic=True), self._sequence[topic]
         self._writer.add_message(self._ids[topic], stamp_ns, data, publish_time=stamp_ns, sequence=sequence)
         self._sequence[topic] = sequence + 1
-
-    def _register(self, topic: str) -> int:
-        """The topic's number, with its schema where no other topic has brought it."""
-        message = self._classes[topic]
-        name = message.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(message))
-        return self._writer.register_channel(topic, "protobuf", self._schemas[name])
 
 
 _FATES = {
@@ -256,24 +289,14 @@ def _loop_closure(
     message.shared_references.extend(closures.shared_references[row].tolist())
     message.shared_overlap.extend(closures.shared_overlap[row].tolist())
     message.scale = closures.scale[row]
-    message.score, message.spread = float(closures.score[row]), float(closures.spread[row])
+    numbers = {name: getattr(closures, name)[row] for name in ("score", "spread", "weight")}
+    numbers |= {f"{name}_sigma": getattr(closures, name)[row] for name in ("residual_before", "residual_after")}
     position, quaternion = match_from_query
-    message.tx_m, message.ty_m, message.tz_m = position
-    message.qx, message.qy, message.qz, message.qw = quaternion
-    information = closures.information[row]
-    if np.isfinite(information).all():
-        message.information.extend(information.reshape(-1).tolist())
-    if np.isfinite(covariance).all():
-        message.covariance.extend(covariance.reshape(-1).tolist())
+    numbers |= zip(("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
+    for name, value in numbers.items():
+        setattr(message, name, float(value))
+    for name, matrix in (("information", closures.information[row]), ("covariance", covariance)):
+        if np.isfinite(matrix).all():
+            getattr(message, name).extend(matrix.reshape(-1).tolist())
     message.verdict, message.reason = closures.verdict[row].value, closures.verdict[row].sentence
-    message.residual_before_sigma = float(closures.residual_before[row])
-    message.residual_after_sigma = float(closures.residual_after[row])
-    message.weight = float(closures.weight[row])
     return message
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height in px."""
-    from vplog.storage.image_file import image_size
-
-    return image_size(data) or (0, 0)

@@ -47,13 +47,6 @@ LOOP_CLOSURE_FIELDS = (
 """Name, type and description; the number of a field is its place here, from 1. Only ever add to the end."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
-_TYPES = {
-    "string": _FIELD.TYPE_STRING,
-    "int32": _FIELD.TYPE_INT32,
-    "uint32": _FIELD.TYPE_UINT32,
-    "float": _FIELD.TYPE_FLOAT,
-    "double": _FIELD.TYPE_DOUBLE,
-}
 
 
 def _file_descriptor() -> descriptor_pb2.FileDescriptorProto:
@@ -64,10 +57,10 @@ def _file_descriptor() -> descriptor_pb2.FileDescriptorProto:
         repeated, _, base = kind.rpartition(" ")
         field = message.field.add(name=name, number=number)
         field.label = _FIELD.LABEL_REPEATED if repeated else _FIELD.LABEL_OPTIONAL
-        if base in _TYPES:
-            field.type = _TYPES[base]
-        else:
+        if "." in base:
             field.type, field.type_name = _FIELD.TYPE_MESSAGE, f".{base}"
+        else:
+            field.type = _FIELD.Type.Value(f"TYPE_{base.upper()}")
     return file
 
 
@@ -94,16 +87,15 @@ def loop_closure_proto() -> str:
 
 def descriptor_set(message: type[Message]) -> bytes:
     """The FileDescriptorSet that MCAP stores for a message: its file after all those it imports."""
-    files = descriptor_pb2.FileDescriptorSet()
-    seen: set[str] = set()
+    files: dict[str, Any] = {}
 
     def add(file: Any) -> None:
-        if file.name in seen:
-            return
-        seen.add(file.name)
         for imported in file.dependencies:
             add(imported)
-        file.CopyToProto(files.file.add())
+        files.setdefault(file.name, file)
 
     add(message.DESCRIPTOR.file)
-    return files.SerializeToString(deterministic=True)
+    found = descriptor_pb2.FileDescriptorSet()
+    for file in files.values():
+        file.CopyToProto(found.file.add())
+    return found.SerializeToString(deterministic=True)

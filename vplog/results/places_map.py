@@ -1,4 +1,4 @@
-"""A map of places in one Parquet file: the descriptors of one drive or many, with where and when they were seen.
+"""A map of places in one Parquet file: the descriptors of one drive or many, with their poses and stamps.
 
 A descriptor becomes one column for each of its parts, and a part that is a list of fixed length becomes as many bytes
 (little endian): a fixed width without levels, which reads more than ten times as fast as a list and is smaller. The
@@ -97,7 +97,7 @@ def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:
 
 
 def about_run(folder: Path) -> dict[str, Any]:
-    """What the header says of a drive: the content of its log, the topics that were asked for, and where it is, as
+    """What the header says of a drive: the content of its log, the topics that were requested, and where it is, as
     drive.json has it in a map; of a run elsewhere the first two, by run.json."""
     records = [folder / name for name in ("drive.json", "run.json") if (folder / name).is_file()]
     account = run_record.read_run_json(records[0]) if records else {}

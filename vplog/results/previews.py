@@ -9,11 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from vplog.settings import Settings
-from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vplog.data import Bytes
 
 
@@ -52,24 +49,3 @@ def jpeg(image: Bytes, quality: int) -> bytes:
 def preview(image: Bytes, settings: PictureSettings) -> bytes:
     """A keyframe's picture as a JPEG; empty where pictures are switched off."""
     return jpeg(shrink(image, settings.megapixels), settings.quality) if settings.megapixels else b""
-
-
-class Previews:
-    """The pictures of a drive's keyframes, each read when it is asked for, so that memory does not grow."""
-
-    def __init__(self, count: int, read: Callable[[int], bytes]) -> None:
-        """`read` gives the JPEG of a row."""
-        self._count, self._read = count, read
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, row: int) -> bytes:
-        """The JPEG of keyframe `row`."""
-        if not 0 <= row < self._count:
-            raise IndexError(row)
-        return self._read(row)
-
-    def image(self, row: int) -> Bytes:
-        """(h, w) uint8 grey."""
-        return decode_image(self[row])

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Closures, Floats, Keyframes, Trajectory
-    from vplog.results.shown import Earth
+    from vplog.results.geo import Earth
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
 _AMBER = (240, 180, 30)
@@ -87,10 +87,12 @@ def _log_camera(recording: Any, rr: Any, result: Path) -> None:
         transform = rr.Transform3D(translation=placed[:3, 3], mat3x3=placed[:3, :3])
         recording.log("map/body/camera", transform, static=True)
     known = False
-    for seen in read_images(result):
-        if seen.matrix is not None and not known:
-            pinhole = rr.Pinhole(image_from_camera=seen.matrix, resolution=seen.size, camera_xyz=rr.ViewCoordinates.RDF)
+    for picture in read_images(result):
+        if picture.matrix is not None and not known:
+            pinhole = rr.Pinhole(
+                image_from_camera=picture.matrix, resolution=picture.size, camera_xyz=rr.ViewCoordinates.RDF
+            )
             recording.log("map/body/camera", pinhole, static=True)
             known = True
-        recording.set_time("stamp", timestamp=np.datetime64(seen.stamp_ns, "ns"))
-        recording.log("map/body/camera/image", rr.EncodedImage(contents=seen.image, media_type="image/jpeg"))
+        recording.set_time("stamp", timestamp=np.datetime64(picture.stamp_ns, "ns"))
+        recording.log("map/body/camera/image", rr.EncodedImage(contents=picture.image, media_type="image/jpeg"))

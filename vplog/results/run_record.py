@@ -16,7 +16,6 @@ from vplog.storage.parquet_limits import check_file, check_version
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
 FORMAT = 1
@@ -24,15 +23,15 @@ FORMAT = 1
 CACHE = ".cache"
 """Where a run folder keeps what its stages came to, unless another place is named."""
 REQUEST = f"{CACHE}/run.json"
-"""What a run that is not finished was asked for; run.json of its folder is that of the finished run before, if any."""
+"""Request of a run that is not finished; run.json of its folder is that of the finished run before, if any."""
 CHECKSUM = "record_sha256"
-"""Field of a record of a map: sha256 of `canonical_json` of all others. One without it is taken as it is: an
-older vplog or an editor wrote it."""
+"""Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an older vplog or an
+editor wrote it."""
 _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
 
-def write_run_json(path: Path, record: dict[str, Any], checksum: bool = False) -> None:
+def write_run_json(path: Path, record: dict[str, Any], checksum: bool = True) -> None:
     """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
     record = with_checksum(record) if checksum else plain(record)
     text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -41,8 +40,8 @@ def write_run_json(path: Path, record: dict[str, Any], checksum: bool = False) -
 
 
 def read_run_json(path: Path) -> dict[str, Any]:
-    """A record of a run or a map, without its checksum. Raises ResultError where the file is missing, is no JSON object
-    or does not have its checksum, and NewerError where it is of a newer version."""
+    """A record of a run or a map, without its checksum and without retired settings. Raises ResultError where the file
+    is missing, is no JSON object or does not have its checksum, and NewerError where it is of a newer version."""
     try:
         check_file(path)
         record = _sound_json(path.read_text(encoding="utf-8"))
@@ -58,7 +57,16 @@ def read_run_json(path: Path) -> dict[str, Any]:
         raise ResultError(f"{path} is damaged: its checksum does not match. Copy it back from a backup, or run again.")
     if type(version := record.get("format")) is int:
         check_version(path, version, FORMAT, record.get("vplog"))
+    _drop_retired(record.get("settings"))
     return record
+
+
+def _drop_retired(settings: Any) -> None:
+    """Remove from a tree of settings those that are gone and were off: `verify.direction`."""
+    verify = settings.get("verify") if isinstance(settings, dict) else None
+    direction = verify.get("direction") if isinstance(verify, dict) else None
+    if isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False:
+        del verify["direction"]
 
 
 def with_checksum(record: dict[str, Any]) -> dict[str, Any]:
@@ -82,35 +90,26 @@ def _sound_json(text: str) -> Any:
     if "\\u" in text:  # half a character that takes two, which no file or terminal can hold
         json.dumps(tree, ensure_ascii=False).encode()
     level, depth = [tree] if text.count("[") + text.count("{") > _MOST_DEPTH else [], 0
-    while level := [part for one in level if isinstance(one, dict | list) for part in _parts(one)]:
+    while level:
+        within = [one.values() if isinstance(one, dict) else one for one in level]
+        level = [one for values in within for one in values if isinstance(one, dict | list)]
         if (depth := depth + 1) > _MOST_DEPTH:
             raise ValueError(f"values are nested in more than {_MOST_DEPTH} others")
     return tree
 
 
-def _parts(one: dict[str, Any] | list[Any]) -> Iterable[Any]:
-    return one.values() if isinstance(one, dict) else one
-
-
 def read_finished_run(folder: Path) -> dict[str, Any]:
     """The record of the run in a folder that came to its end. Raises ResultError, also where something in the folder is
-    not its own file."""
+    not its own file. Results that a killed process had only to move into place are moved."""
     check_regular(folder, "run.json")
-    record = read_run_json(begun_in(folder) or folder / "run.json")
-    if not record.get("finished"):
-        whose = f" of {record['log']}" if isinstance(record.get("log"), str) else ""
-        command = f"vplog run --resume -o {shlex.quote(str(folder))}"
-        raise ResultError(f"The run{whose} in {folder} did not finish. Go on with it: {command}")
-    return record
-
-
-def begun_in(folder: Path) -> Path | None:
-    """The record of a run that was begun in a folder which holds no finished one; None elsewhere.
-
-    Results that a killed process had only to move into place are moved. Raises VplogError.
-    """
     recover(folder)
-    return folder / REQUEST if (folder / REQUEST).is_file() and not (folder / "run.json").is_file() else None
+    begun = (folder / REQUEST).is_file() and not (folder / "run.json").is_file()
+    record = read_run_json(folder / (REQUEST if begun else "run.json"))
+    if not record.get("finished"):
+        of_log = f" of {record['log']}" if isinstance(record.get("log"), str) else ""
+        command = f"vplog run --resume -o {shlex.quote(str(folder))}"
+        raise ResultError(f"The run{of_log} in {folder} did not finish. Go on with it: {command}")
+    return record
 
 
 def read_single_run(folder: Path) -> dict[str, Any]:

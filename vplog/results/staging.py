@@ -126,14 +126,15 @@ def _move(out: Path) -> None:
             with suppress(OSError):  # it holds something
                 folder.rmdir()
     except OSError as error:
+        where = error.filename2 or error.filename
         raise ResultError(
-            f"Cannot move the results from {committed} to {out}: {error.filename}: {error.strerror}. They are whole; "
-            "clear the way, and give the command again."
+            f"Cannot move the results from {committed} to {out}: {where}: {error.strerror}. They are whole; clear the "
+            "way, and give the command again."
         ) from None
 
 
 def _stale(committed: Path) -> list[str]:
-    """Names of results to remove. Raises ResultError where that is not told in a sound way, and OSError."""
+    """Names of results to remove. Raises ResultError where they are no list of names, and OSError."""
     path = committed / _STALE
     if not path.exists():  # all was moved, and the folder on its way out
         return []

@@ -10,7 +10,8 @@ from __future__ import annotations
 import io
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -26,16 +27,17 @@ from vplog.storage.parquet_limits import (
     open_table,
     read_schema,
     read_table,
-    table_writer,
     write_table,
 )
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from vplog.data import Floats, Ints, Solution
+
+T = TypeVar("T", bound=StrEnum)
 
 ROWS_PER_GROUP = 65_536
 """Rows of a row group; 64 Ki rows of the widest table here are about 40 MB in memory."""
@@ -45,7 +47,7 @@ DESCRIPTORS_PER_GROUP = 1_024
 
 @dataclass(frozen=True)
 class TableMetadata:
-    """What every table says of the run that made it; equal for equal runs."""
+    """The run that made a table, in its header; equal for equal runs."""
 
     settings: dict[str, Any]
     """The full tree of settings."""
@@ -144,7 +146,19 @@ TRAJECTORY = pa.schema(
     ]
 )
 
-
+PLACED = pa.schema(
+    [
+        column("query", pa.int32(), "row", "View of the log, 0 is the first."),
+        column("query_stamp_ns", pa.int64(), "ns", "Stamp of the view, in the log's clock."),
+        column("rank", pa.int32(), "1", "0 is the view's best answer."),
+        column("drive", pa.string(), "", "Drive of the place; with keyframe it joins with MAP/keyframes."),
+        column("keyframe", pa.int32(), "row", "Keyframe of that drive, 0 is the first."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
+        column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
+        column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
+    ]
+)
+"""What a query of a map answers, in order of the views, then of rank."""
 _SCHEMAS = {"keyframes": KEYFRAMES, "closures": CLOSURES, "joins": JOINS, "edges": EDGES, "trajectory": TRAJECTORY}
 
 
@@ -169,7 +183,7 @@ def write_keyframes(path: Path, keyframes: Keyframes, world_from_body: Floats, m
         **_pose_values("odom_", keyframes.odom_from_body),
         **_pose_values("world_", world_from_body),
     }
-    _write(path, "keyframes", KEYFRAMES, columns, metadata)
+    _write(path, "keyframes", _table(KEYFRAMES, columns), metadata)
 
 
 def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:
@@ -182,23 +196,20 @@ def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:
 
 def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadata: TableMetadata) -> None:
     """closures.parquet, the ledger with the stamps of both keyframes and each verdict's sentence."""
-    _write(path, "closures", CLOSURES, _ledger_columns(closures, keyframes, keyframes), metadata)
+    _write(path, "closures", _table(CLOSURES, _ledger_columns(closures, keyframes, keyframes)), metadata)
 
 
 def write_joins(path: Path, ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], metadata: TableMetadata) -> None:
     """joins.parquet: the ledgers of pairs of drives, the later one (its keyframes are the queries) and the earlier."""
-    _write_table(path, "joins", _joins(ledgers), metadata)
+    _write(path, "joins", _joins(ledgers), metadata)
 
 
 def joins_as_bytes(
     ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], metadata: TableMetadata, made_from: str
 ) -> bytes:
-    """The bytes of such a table, whose header says what it was made from: a hash, which `read_metadata` gives back as
-    `vplog.made_from`."""
-    table = _joins(ledgers)
-    schema = _with_metadata(table.schema, "joins", metadata)
+    """The bytes of such a table; `read_metadata` gives the hash of what it was made from as `vplog.made_from`."""
     sink = io.BytesIO()
-    table = table.cast(schema.with_metadata({**(schema.metadata or {}), "vplog.made_from": made_from}))
+    table = _with_header(_joins(ledgers), "joins", metadata, {"vplog.made_from": made_from})
     write_table(sink, table, ROWS_PER_GROUP, compression="zstd")
     return sink.getvalue()
 
@@ -207,9 +218,8 @@ def _joins(ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]]) -> pa.Table
     parts = []
     for later, earlier, closures in ledgers:
         drives = {"query_drive": [later.drive] * len(closures), "match_drive": [earlier.drive] * len(closures)}
-        parts.append(_arrays(JOINS, {**drives, **_ledger_columns(closures, later, earlier)}))
-    table = pa.concat_tables([pa.Table.from_arrays(part, schema=JOINS) for part in parts] or [JOINS.empty_table()])
-    return table.combine_chunks()
+        parts.append(_table(JOINS, {**drives, **_ledger_columns(closures, later, earlier)}))
+    return pa.concat_tables(parts or [JOINS.empty_table()]).combine_chunks()
 
 
 def _ledger_columns(closures: Closures, query: Keyframes, match: Keyframes) -> dict[str, Any]:
@@ -259,8 +269,7 @@ EXACT_LEDGER = pa.schema(
 def exact_ledger(closures: Closures) -> pa.Table:
     """The ledger bit for bit."""
     columns = {name: getattr(closures, name) for name in EXACT_LEDGER.names}
-    columns["verdict"] = [verdict.value for verdict in closures.verdict]
-    return pa.Table.from_arrays(_arrays(EXACT_LEDGER, columns), schema=EXACT_LEDGER)
+    return _table(EXACT_LEDGER, {**columns, "verdict": [verdict.value for verdict in closures.verdict]})
 
 
 def ledger_of(table: pa.Table) -> Closures:
@@ -287,10 +296,6 @@ def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
 
 
 def _ledger_from(table: pa.Table, path: Path | str, match_from_query: Floats) -> Closures:
-    try:
-        verdict = [Verdict(text) for text in table["verdict"].to_pylist()]
-    except ValueError as error:
-        raise ResultError(f"{path}: {error}. Verdicts: {', '.join(Verdict)}.") from None
     scale = table["scale"].to_pylist()
     if not set(scale) <= set(_SCALES):
         raise ResultError(f"{path}: {sorted(set(scale) - set(_SCALES))[0]!r} is no scale: {', '.join(_SCALES)}.")
@@ -303,7 +308,7 @@ def _ledger_from(table: pa.Table, path: Path | str, match_from_query: Floats) ->
         scale=scale,
         match_from_query=match_from_query,
         information=_matrices(table, "information"),
-        verdict=verdict,
+        verdict=_members(table, "verdict", Verdict, path),
         **{name: _values(table, name) for name in _PLAIN_LEDGER},
     )
 
@@ -332,7 +337,7 @@ def write_edges(path: Path, graph: PoseGraph, solution: Solution, residual: Floa
         "weight": solution.weight,
         "residual": residual,
     }
-    _write(path, "edges", EDGES, columns, metadata)
+    _write(path, "edges", _table(EDGES, columns), metadata)
 
 
 def read_edges(path: Path, world_from_body: Floats) -> tuple[PoseGraph, Floats, Floats]:
@@ -341,10 +346,7 @@ def read_edges(path: Path, world_from_body: Floats) -> tuple[PoseGraph, Floats, 
     a, b = _values(table, "a"), _values(table, "b")
     if len(table) and not 0 <= min(a.min(), b.min()) <= max(a.max(), b.max()) < len(world_from_body):
         raise ResultError(f"{path} names a node outside 0..{len(world_from_body) - 1}. Is it of another run?")
-    try:
-        kind = [EdgeKind(text) for text in table["kind"].to_pylist()]
-    except ValueError as error:
-        raise ResultError(f"{path}: {error}. Kinds: {', '.join(EdgeKind)}.") from None
+    kind = _members(table, "kind", EdgeKind, path)
     graph = PoseGraph(world_from_body, a, b, read_poses(table, ""), _matrices(table, "information"), kind)
     return graph, _values(table, "weight"), _values(table, "residual")
 
@@ -356,7 +358,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, odometry: Odometry, met
         **_pose_values("", trajectory.world_from_body),
         **_pose_values("odom_", odometry.odom_from_body),
     }
-    _write(path, "trajectory", TRAJECTORY, columns, metadata)
+    _write(path, "trajectory", _table(TRAJECTORY, columns), metadata)
 
 
 def read_trajectory(path: Path) -> tuple[Trajectory, Odometry]:
@@ -366,52 +368,14 @@ def read_trajectory(path: Path) -> tuple[Trajectory, Odometry]:
     return Trajectory(stamp_ns, read_poses(table, "")), Odometry(stamp_ns, read_poses(table, "odom_"), None)
 
 
-def write_descriptors(
-    path: Path, keyframes: Keyframes, batches: Iterable[pa.Array], descriptor: pa.DataType, metadata: TableMetadata
-) -> None:
-    """descriptors.parquet from batches of any length, in the order of the keyframes, one group in memory at a time.
-
-    The bytes do not depend on how the descriptors were batched. Raises ResultError where their number differs from
-    that of the keyframes.
-    """
-    schema = _with_metadata(descriptors_schema(descriptor), "descriptors", metadata)
-    written = 0
-    with replacing(path) as stream, table_writer(stream, schema, compression="zstd") as writer:
-        for group in _regrouped(batches, DESCRIPTORS_PER_GROUP):
-            rows = np.arange(written, written + len(group), dtype=np.int32)
-            written += len(group)
-            if written > len(keyframes.stamp_ns):
-                break
-            arrays = [pa.array(rows), pa.array(keyframes.stamp_ns[rows], pa.int64()), group]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), DESCRIPTORS_PER_GROUP)
-        if written != len(keyframes.stamp_ns):
-            raise ResultError(
-                f"{path}: {written} descriptors came for {len(keyframes.stamp_ns)} keyframes; each keyframe has one."
-            )
-
-
-def _regrouped(batches: Iterable[pa.Array], size: int) -> Iterator[pa.Array]:
-    """The values in arrays of `size`, the last one shorter."""
-    waiting: list[pa.Array] = []
-    count = 0
-    for batch in batches:
-        waiting.append(batch)
-        count += len(batch)
-        if count < size:
-            continue
-        joined = pa.concat_arrays(waiting)
-        whole = count - count % size
-        for start in range(0, whole, size):
-            yield _own(joined.slice(start, size))
-        waiting = [joined.slice(whole)]
-        count -= whole
-    if count:
-        yield _own(pa.concat_arrays(waiting))
-
-
-def _own(array: pa.Array) -> pa.Array:
-    """A copy that starts at offset 0, so that what is written does not depend on what it was a slice of."""
-    return pa.concat_arrays([array, array.slice(0, 0)])
+def write_descriptors(path: Path, keyframes: Keyframes, descriptors: pa.Array, metadata: TableMetadata) -> None:
+    """descriptors.parquet, in the order of the keyframes. Raises ResultError where not each of them has one."""
+    count = len(keyframes.stamp_ns)
+    if len(descriptors) != count:
+        raise ResultError(f"{path}: {len(descriptors)} descriptors came for {count} keyframes; each keyframe has one.")
+    arrays = [pa.array(np.arange(count, dtype=np.int32)), pa.array(keyframes.stamp_ns, pa.int64()), descriptors]
+    table = pa.Table.from_arrays(arrays, schema=descriptors_schema(descriptors.type))
+    _write(path, "descriptors", table, metadata, DESCRIPTORS_PER_GROUP)
 
 
 def read_descriptors(path: Path) -> tuple[pa.Array, str]:
@@ -455,18 +419,30 @@ def read_metadata(path: Path) -> dict[str, str]:
         return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
 
 
-def _write(path: Path, name: str, schema: pa.Schema, columns: dict[str, Any], metadata: TableMetadata) -> None:
-    _write_table(path, name, pa.Table.from_arrays(_arrays(schema, columns), schema=schema), metadata)
+def placed_table(columns: Sequence[Any]) -> pa.Table:
+    """The table PLACED of values (R,) for each column in order."""
+    arrays = [pa.array(values, field.type) for values, field in zip(columns, PLACED, strict=True)]
+    return pa.Table.from_arrays(arrays, schema=PLACED)
 
 
-def _arrays(schema: pa.Schema, columns: dict[str, Any]) -> list[pa.Array]:
-    return [_array(columns[column.name], column) for column in schema]
+def write_placed(path: Path, table: pa.Table, metadata: TableMetadata) -> None:
+    """Where the views of a log are in a map; `metadata` is that of the map."""
+    _write(path, "placed", table, metadata, None)
 
 
-def _write_table(path: Path, name: str, table: pa.Table, metadata: TableMetadata) -> None:
-    table = table.cast(_with_metadata(table.schema, name, metadata))
+def _table(schema: pa.Schema, columns: dict[str, Any]) -> pa.Table:
+    return pa.Table.from_arrays([_array(columns[column.name], column) for column in schema], schema=schema)
+
+
+def _write(
+    path: Path, name: str, table: pa.Table, metadata: TableMetadata, rows_per_group: int | None = ROWS_PER_GROUP
+) -> None:
     with replacing(path) as stream:
-        write_table(stream, table, ROWS_PER_GROUP, compression="zstd")
+        write_table(stream, _with_header(table, name, metadata, {}), rows_per_group, compression="zstd")
+
+
+def _with_header(table: pa.Table, name: str, metadata: TableMetadata, more: dict[str, str]) -> pa.Table:
+    return table.replace_schema_metadata({**metadata.record(), "vplog.table": name, **more})
 
 
 def _array(values: Any, column: pa.Field) -> pa.Array:
@@ -480,10 +456,6 @@ def _array(values: Any, column: pa.Field) -> pa.Array:
     rows = np.ascontiguousarray(values, np.float64).reshape(-1, column.type.list_size)
     unknown = pa.array(np.isnan(rows).all(1)) if column.nullable else None
     return pa.FixedSizeListArray.from_arrays(pa.array(rows.reshape(-1)), type=column.type, mask=unknown)
-
-
-def _with_metadata(schema: pa.Schema, name: str, metadata: TableMetadata) -> pa.Schema:
-    return schema.with_metadata({**metadata.record(), "vplog.table": name})
 
 
 def _read(path: Path, name: str, schema: pa.Schema) -> pa.Table:
@@ -536,6 +508,14 @@ def read_poses(table: pa.Table, prefix: str) -> Floats:
 def _values(table: pa.Table, name: str) -> np.ndarray:
     """A column as an array of its own, which may be written to."""
     return np.array(table[name].to_numpy())
+
+
+def _members(table: pa.Table, name: str, kind: type[T], path: Path | str) -> list[T]:
+    """A column of the values of an enumeration. Raises ResultError where one is none of them."""
+    try:
+        return [kind(text) for text in table[name].to_pylist()]
+    except ValueError as error:
+        raise ResultError(f"{path}: {error}. {name.capitalize()}s: {', '.join(kind)}.") from None
 
 
 def _lists(table: pa.Table, name: str) -> list[np.ndarray]:

@@ -61,23 +61,16 @@ class Solved:
     """The ledger, judged."""
     refined: Refined
     fixes: Fixes | None
-    """GPS, where it was asked for."""
+    """Of GPS, with `gps.use`."""
     trajectory: Trajectory
     noise_source: str
-    """Of the odometry's noise, as `edge_covariance` names it."""
+    """Source of the odometry's noise, as `edge_covariance` names it."""
     warnings: list[str]
 
 
 @step("solve")
 def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
     """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
-    solved = _solve(odometry, keyframes, closures, gps, settings)
-    for warning in solved.warnings:
-        _log.warning(warning)
-    return solved
-
-
-def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
     solution = solve_gated(graph, settings)
@@ -94,13 +87,16 @@ def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gp
     if fixes is not None:
         solution = keep_odometry_if_further(graph, solution, fixes)
     refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
+    warnings = doubts + repairs + (fixes.warnings if fixes else [])
+    for warning in warnings:
+        _log.warning(warning)
     return Solved(
         judge(closures, graph, refined, rows),
         refined,
         fixes,
         correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body),
         source,
-        doubts + repairs + (fixes.warnings if fixes else []),
+        warnings,
     )
 
 
@@ -136,7 +132,7 @@ def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) ->
     Residuals before are to the odometry as it was assumed to be, those after to the odometry as it turned out.
     """
     solution = refined.solution
-    loops = np.array([kind == EdgeKind.LOOP for kind in graph.kind], bool)
+    loops = is_loop(graph)
     before, after, weight = (np.full(len(closures), np.nan) for _ in range(3))
     before[rows] = consistency.residual_before(graph)[loops]
     after[rows] = consistency.residual_sigma(refined.graph, solution.world_from_body)[loops]

@@ -20,11 +20,20 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.cache.checked_file import AbsentError, DamagedError, check_file, content_of, file_name, sealed
 from vplog.cache.code_hash import code_of
 from vplog.cache.feature_shards import Extracted, packed
 from vplog.cache.input_hashes import files_of
-from vplog.cache.stage_cache import StageCache, finished_parts, inputs_of, key_of
+from vplog.cache.stage_cache import (
+    AbsentError,
+    DamagedError,
+    check_file,
+    content_of,
+    file_name,
+    finished_parts,
+    inputs_of,
+    key_of,
+    sealed,
+)
 from vplog.cache.steps import step
 from vplog.data import Keyframes
 from vplog.errors import LogError, ResultError
@@ -37,7 +46,7 @@ from vplog.storage.scratch import replacing
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from vplog.cache.stage_cache import Inputs
@@ -50,7 +59,7 @@ if TYPE_CHECKING:
     from vplog.stages import Log
 
     Decoded = tuple[int, Frame | None, Features | None, str]
-    """Of `extract_frames`: stamp, frame, features, and why there are none."""
+    """Stamp, frame, features, and why there are none, as `extract_frames` gives them."""
 
 _log = logging.getLogger(__name__)
 _UNCALIBRATED = (
@@ -87,7 +96,7 @@ class Part:
     topics: logs.TopicChoice
     pipeline: Extraction
     stamp_ns: tuple[int, ...]
-    """Of its keyframes, increasing."""
+    """Stamps of its keyframes, increasing."""
     number: int
     key: str
     """sha256 over all that its content depends on."""
@@ -115,15 +124,7 @@ def parts_of(
 
 def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
     """The parts that the cache does not hold, or not whole."""
-
-    def held(part: Part) -> bool:
-        try:
-            check_file(cache / part.file, part.key)
-        except (AbsentError, DamagedError):
-            return False
-        return True
-
-    return [part for part in parts if not held(part)]
+    return [part for part in parts if not _is_held(cache, part)]
 
 
 def compute_part(part: Part, execution: Execution = Execution()) -> bytes:
@@ -154,8 +155,7 @@ def put_part(cache: Path, part: Part, data: bytes) -> None:
 
 def stored_features(cache: Path) -> Extracted | None:
     """The features of a finished run's keyframes by their rows; None where the cache does not hold them all."""
-    names = finished_parts(cache)
-    found = Extracted()
+    names, found = finished_parts(cache), Extracted()
     try:
         for name in names:
             check_file(cache / name)
@@ -244,7 +244,7 @@ def extract(
     """
     cache = steps.cache
     parts = cut(cache.drive, topics, settings, keyframes, cache.inputs)
-    missing = [part for part in parts if not _held(cache, part)]
+    missing = [part for part in parts if not (cache.keep and _is_held(cache.folder, part, cache.damaged))]
     total = sum(len(part.stamp_ns) for part in parts)
     done = total - sum(len(part.stamp_ns) for part in missing)
     # one stream over all that is missing: workers do not wait at the end of a part
@@ -255,6 +255,7 @@ def extract(
     found = Extracted()
     for part in parts:
         found.add(cache.folder / part.file)
+        cache.use(part.file)
     _count(log, found.undecodable)
     if len(found) < 2:
         why = f" The first: {found.lost[0]}" if found.lost else ""
@@ -271,11 +272,11 @@ def decoded(keyframes: Keyframes, found: Extracted) -> Keyframes:
     return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows])
 
 
-def _held(cache: StageCache, part: Part) -> bool:
-    """Whether the cache holds the part whole."""
-    path, found = cache.folder / part.file, Extracted()
-    if not cache.keep:
-        return False
+def _is_held(
+    cache: Path, part: Part, damaged: Callable[[Path, Exception], object] = lambda _path, _error: None
+) -> bool:
+    """Whether the cache holds the part whole; `damaged` gets the file that is not."""
+    path, found = cache / part.file, Extracted()
     try:
         check_file(path, part.key)
         found.add(path)
@@ -284,9 +285,8 @@ def _held(cache: StageCache, part: Part) -> bool:
     except AbsentError:
         return False
     except DamagedError as error:
-        cache.damaged(path, error)
+        damaged(path, error)
         return False
-    cache.use(part.file)
     return True
 
 

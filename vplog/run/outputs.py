@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import about_gps
 from vplog.run.report import write_report
+from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,15 +34,6 @@ if TYPE_CHECKING:
     from vplog.stages import Log, PlaceState
 
 
-class Pictured(Protocol):
-    """The settings of what a run shows, as the pipeline has them."""
-
-    @property
-    def verify(self) -> VerifySettings: ...
-    @property
-    def pictures(self) -> PictureSettings: ...
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """All that a finished run knows."""
@@ -51,7 +43,7 @@ class Run:
     camera: Camera
     keyframes: Keyframes
     features: Extracted
-    """Of the keyframes, as long as the stage cache is there."""
+    """Features of the keyframes, as long as the stage cache is there."""
     library: Path | None
     """The folder of the library given; None where the references are of the drive's own keyframes."""
     references: list[Reference]
@@ -80,7 +72,8 @@ class Run:
 def write(
     folder: Path,
     run: Run,
-    pipeline: Pictured,
+    verify: VerifySettings,
+    pictures: PictureSettings,
     header: tables.TableMetadata,
     *,
     steps: Steps,
@@ -88,15 +81,16 @@ def write(
 ) -> None:
     """Write the tables, the trajectory, the graph and result.mcap of a run into its folder."""
     log, keyframes, trajectory, poses = run.log, run.keyframes, run.solved.trajectory, run.solution.world_from_body
-    previews, gps = run.features.pictures, log.gps()
-    inputs = ClosureInputs(previews.image, run.features.__getitem__, run.camera, run.state, run.places)
+    picture, gps = run.features.picture, log.gps()
+    inputs = ClosureInputs(
+        lambda row: decode_image(picture(row)), run.features.__getitem__, run.camera, run.state, run.places
+    )
     shown = finished_picture(
-        inputs, previews, run.closures, run.references, pipeline.verify, pipeline.pictures, gps=gps,
+        inputs, picture if run.features.has_pictures else None, run.closures, run.references, verify, pictures, gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
     )  # fmt: skip
-    column = [run.state.to_arrow(run.places)]
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, run.state.arrow_type, header)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, run.state.to_arrow(run.places), header)
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vplog.cache.codecs import columns_codec, descriptors_codec
 from vplog.cache.steps import step
+from vplog.data import SharedReferences
 from vplog.loops.propose import Proposals, candidate_stops, propose
 from vplog.places.sequence import rank_places
 from vplog.stages import BoxState
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from vplog.cache.feature_shards import Extracted
-    from vplog.data import Closures, Keyframes
+    from vplog.data import Closures, Int32s, Keyframes
     from vplog.execution.execution import Execution
     from vplog.loops.propose import ProposeSettings
     from vplog.places.sequence import SequenceSettings
@@ -51,7 +54,12 @@ def find_candidates(
 
 def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:
     """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
-    if not isinstance(state, BoxState):
-        return closures
-    found = state.shared(descriptors, closures.query, closures.match)
+    found = shared_of(state, descriptors, closures.query, closures.match)
     return replace(closures, shared_references=found.references, shared_overlap=found.overlap)
+
+
+def shared_of(state: PlaceState, descriptors: Sequence[Any], query: Int32s, match: Int32s) -> SharedReferences:
+    """The references that explain both places of each pair of rows; none where the recogniser has no boxes."""
+    if isinstance(state, BoxState):
+        return state.shared(descriptors, query, match)
+    return SharedReferences([np.empty(0, np.uint16)] * len(query), [np.empty(0, np.float32)] * len(query))

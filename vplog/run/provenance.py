@@ -1,4 +1,4 @@
-"""The run folder's own account: what was run, on what, and what was said on the way."""
+"""Provenance of a run in its run.json: log, library, settings, versions; and how log and library are opened again."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ if TYPE_CHECKING:
 OWN_LIBRARY = "the drive's own keyframes"
 """Where the library of a run is from to which none was given."""
 
-
 _NO_QUERY = " URLs are kept without their query, which may hold a token."
 
 
-def stored_log(text: str, whose: str, again: str) -> Path:
-    """A log by where a record says it is. Raises LogError, which ends with how to give it `again`, where it is gone or
-    cannot be asked for, as a signed link without its signature."""
+def stored_log(text: str, name: str, again: str) -> Path:
+    """The log at a path or URL of a record. Raises LogError, which begins with `name` and ends with how to give it
+    `again`, where it is gone or cannot be opened, as a signed link without its signature."""
     path = located(text)
     try:
         if path.exists():
@@ -41,7 +40,7 @@ def stored_log(text: str, whose: str, again: str) -> Path:
     except OSError as error:
         why = f"cannot be opened ({reason(error)})"
     no_query = _NO_QUERY if text.startswith("http") else ""
-    raise LogError(f"{whose} {path} {why}.{no_query} {again}")
+    raise LogError(f"{name} {path} {why}.{no_query} {again}")
 
 
 def reopened(
@@ -74,7 +73,7 @@ def library_of(library: Path | None) -> str:
 
 def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
     """What run.json says of the logs of several drives."""
-    return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)} if drives else {}
+    return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)}
 
 
 @contextmanager
@@ -82,10 +81,10 @@ def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
     """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
     library = folder / "library"
     if not (library / "library.json").is_file():
-        told = account.get("library")
-        if not isinstance(told, dict) or not isinstance(told.get("from"), str):
+        about = account.get("library")
+        if not isinstance(about, dict) or not isinstance(about.get("from"), str):
             raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
-        library = located(told["from"])
+        library = located(about["from"])
     with local_copy(library) as here:
         yield here
 
@@ -93,7 +92,7 @@ def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
 def head(
     pipeline: Settings, path: Path | Sequence[Path], threads: int, topics: logs.TopicChoice | None = None
 ) -> dict[str, Any]:
-    """What run.json says of what was asked for, and of the machine."""
+    """Settings, log, topics, versions and threads of a run, as run.json has them."""
     files = [str(file.resolve()) for file in files_of(path)]
     return {
         "format": run_record.FORMAT,

@@ -208,7 +208,7 @@ def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
 
 
 def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, execution: Execution) -> list[Ints]:
-    """Stamps of the references of each log that explain the frames of all best; equally many of each are seen."""
+    """Stamps of the references of each log that explain the frames of all best; equally many of each are compared."""
     each = -(-frames_needed(pipeline.library.size) // len(opened))
     descriptors, owners, seen_ns = [], [], []
     for number, log in enumerate(opened):

@@ -9,20 +9,16 @@ import numpy as np
 
 from vplog.data import Trajectory
 from vplog.figures.run_figures import earth_of
-from vplog.geometry import geodesy, se3
+from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
-from vplog.results.report.content import Content
-from vplog.results.report.page import page
+from vplog.results.report.page import Content, Tracks, page
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Floats, Keyframes
-    from vplog.results.mcap_read import Found
-    from vplog.results.report.content import Judged
-    from vplog.results.shown import Earth
+    from vplog.results.report.page import Judged
 
 
 def write_report(
@@ -66,22 +62,6 @@ def outcome_of(folder: Path, spacing: int) -> Outcome:
     return Outcome(float(np.linalg.norm(moved, axis=1).max()), int(used.sum()), places)
 
 
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """Where a run was, before and after."""
-
-    keyframes: Keyframes
-    world_from_body: Floats
-    """(N, 4, 4) of the keyframes, solved."""
-    before: Trajectory
-    """The odometry, laid on the first solved keyframe."""
-    after: Trajectory
-    found: Found
-    """What result.mcap holds beside."""
-    earth: Earth | None
-    """Where the trajectory is on earth, None without satellite fixes."""
-
-
 def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
     """Raises ResultError where a file of the run is missing or damaged."""
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
@@ -97,19 +77,5 @@ def gather(
 ) -> Content:
     """All that the page tells. Raises ResultError where a file of the run is missing or damaged."""
     tracks = gather_tracks(folder, record)
-    fixes_m = None
-    if tracks.found.gps is not None and tracks.earth is not None:
-        world_from_enu = se3.inverse(tracks.earth.enu_from_world)
-        fixes_m = se3.transform(world_from_enu, geodesy.local_enu(tracks.found.gps).enu_m)
-    return Content(
-        record=record,
-        keyframes=tracks.keyframes,
-        world_from_body=tracks.world_from_body,
-        closures=tables.read_closures(folder / "closures.parquet"),
-        before=tracks.before,
-        after=tracks.after,
-        pictures=tracks.found.pictures or pictures or {},
-        references=tracks.found.references,
-        fixes_m=fixes_m,
-        judged=judged,
-    )
+    closures = tables.read_closures(folder / "closures.parquet")
+    return Content(record, tracks, closures, tracks.found.pictures or pictures or {}, judged)

@@ -8,10 +8,10 @@ from glob import escape
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from vplog import logs
-from vplog.cache.checked_file import CACHE_FILES, ENDING
-from vplog.cache.input_hashes import bytes_of, files_of, hash_inputs
+from vplog.cache.input_hashes import bytes_of, hash_inputs
+from vplog.cache.stage_cache import CACHE_FILES, ENDING
 from vplog.errors import ResultError, SettingsError, was_interrupted
+from vplog.logs import TopicChoice
 from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
 from vplog.results.staging import staged
@@ -20,10 +20,8 @@ from vplog.storage.folders import check_regular
 from vplog.storage.remote_path import located, stands_for
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
-
-    from vplog.settings import Settings
 
 _RUN_FILES = (
     "run.json", "report.html", "result.mcap", "graph.g2o", "trajectory.tum", "keyframes.parquet", "descriptors.parquet",
@@ -38,29 +36,27 @@ _RUN_FILES = (
 @contextmanager
 def begun(
     out: Path,
-    pipeline: Settings,
-    path: Path | Sequence[Path],
-    threads: int,
+    head: dict[str, Any],
+    files: Sequence[Path],
     library: Path | None = None,
-    topics: logs.TopicChoice | None = None,
-    drives: Mapping[str, Path] | None = None,
+    topics: TopicChoice | None = None,
+    drives: Collection[str] = (),
     *,
     resumable: bool = True,
     force: bool = False,
 ) -> Iterator[Path]:
     """A folder for the results of a run, which become those of `out` when the block ends well (vplog/results/staging).
 
-    What the run is asked for is in the cache of `out` until then if it is `resumable`, and stays there if stages were
-    kept. `drives` are the logs of a run of several by name, of which `path` is the first. Raises SettingsError where
-    `out` holds other things, or without `force` the run of another log.
+    The run's request is in the cache of `out` until then if it is `resumable`, and stays there if stages were kept:
+    `head` is what provenance.head says of it, `files` are its logs, `drives` the names of those of a run of several.
+    Raises SettingsError where `out` holds other things, or without `force` the run of another log.
     """
-    files, cache, request = list(drives.values()) if drives else files_of(path), out / CACHE, out / REQUEST
-    asked = {
-        **provenance.head(pipeline, path, threads),
+    cache, request = out / CACHE, out / REQUEST
+    record = {
+        **head,
         "finished": False,
-        "topics": (topics or logs.TopicChoice()).model_dump(mode="json"),
+        "topics": (topics or TopicChoice()).model_dump(mode="json"),
         "library": {"from": provenance.library_of(library)},
-        **provenance.logs_of(files if drives else ()),
     }
 
     def begin() -> list[str]:
@@ -70,14 +66,14 @@ def begun(
             raise SettingsError(f"{out} is a drive of the run or map in {above}. Choose another folder with -o.")
         if not force:
             _check_same_logs(out, files)
-        return _results_in(out, library, drives or {}, resumable)
+        return _results_in(out, library, drives, resumable)
 
     with staged(out, begin) as made, stands_for(made, out):
         before = set() if request.is_file() else set(cache.rglob(f"*{ENDING}"))
         try:
             if resumable:
                 cache.mkdir(exist_ok=True)
-                run_record.write_run_json(request, asked)
+                run_record.write_run_json(request, record)
             yield made
         except BaseException as error:
             kept = set(cache.rglob(f"*{ENDING}")) - before if resumable else ()
@@ -94,7 +90,7 @@ def begun(
 
 
 def _what_is_kept(out: Path, kept: Collection[Path]) -> str:
-    """Of a run that was interrupted, and the command that resumes it."""
+    """Stages and bytes that an interrupted run leaves, and the command that resumes it."""
     stages = ", ".join(sorted({file.name.split("-")[0] for file in kept}))
     return (
         f"{sum(file.stat().st_size for file in kept) / 1e6:.1f} MB of results of stages ({stages}) are kept in "
@@ -106,7 +102,7 @@ def _resume(out: Path) -> str:
     return f"vplog run --resume -o {shlex.quote(str(out))}"
 
 
-def _results_in(out: Path, library: Path | None, drives: Mapping[str, Path], resumable: bool) -> list[str]:
+def _results_in(out: Path, library: Path | None, drives: Collection[str], resumable: bool) -> list[str]:
     """Glob patterns of what an earlier run may have left in `out` that is not of a new one of these drives.
 
     A library that the new run is given stays, and the cache of each of its drives if it is `resumable`. Raises

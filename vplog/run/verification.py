@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from vplog.data import Camera, Ints, Keyframes
     from vplog.execution.execution import Execution
     from vplog.loops.propose import Proposals
-    from vplog.loops.verify import Drive, VerifySettings
+    from vplog.loops.verify import VerifySettings
 
 _PART_CANDIDATES = 1000
 """Candidates of a part: 5 to 10 s of one core, as a part of the keyframes."""
@@ -53,7 +54,8 @@ def calibrate(
     keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings, *, execution: Execution
 ) -> float:
     """By what share of a rotation the calibration is wrong at most."""
-    return calibration_share(_drive(keyframes, camera, features, settings), execution)
+    drive = drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
+    return calibration_share(drive, execution)
 
 
 @step("verify", lambda *_: closures_codec(), items=lambda proposals, *_: len(proposals.query))
@@ -68,12 +70,8 @@ def verify_part(
     execution: Execution,
 ) -> Closures:
     """The ledger of some candidates."""
-    drive = _drive(keyframes, camera, features, settings)
+    drive = drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
     return verify_between(proposals, drive, drive, execution, share)
-
-
-def _drive(keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings) -> Drive:
-    return drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
 
 
 def _parts(match: np.ndarray) -> list[Ints]:
@@ -91,9 +89,6 @@ def merged(parts: Sequence[Closures], rows: Sequence[Ints]) -> Closures:
     columns = {}
     for field in fields(Closures):
         values = [getattr(part, field.name) for part in parts]
-        if isinstance(values[0], np.ndarray):
-            columns[field.name] = np.concatenate(values)[place]
-        else:
-            joined = [value for part in values for value in part]
-            columns[field.name] = [joined[at] for at in place.tolist()]
+        joined = np.concatenate(values) if isinstance(values[0], np.ndarray) else list(chain.from_iterable(values))
+        columns[field.name] = joined[place] if isinstance(joined, np.ndarray) else [joined[at] for at in place.tolist()]
     return Closures(**columns)

@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Closures, SharedReferences, Verdict
+from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import verify_between
 from vplog.places.sequence import rank_places
+from vplog.run.place_recognition import shared_of
 from vplog.run.verification import merged
-from vplog.stages import BoxState, index_of_part
+from vplog.stages import index_of_part
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Mapping, Sequence
 
-    from vplog.data import Bools, Int32s, Ints
+    from vplog.data import Bools, Int32s, Ints, SharedReferences
     from vplog.graph.joint import JoinSettings
     from vplog.loops.verify import Drive
     from vplog.pipeline import Pipeline
@@ -142,8 +143,9 @@ def likely_pairs(
     for later, candidates in found.items():
         own = places(later)
         for earlier in likely_drives(candidates, settings):
-            proposals = candidates.of(earlier)
-            pairs.append(DrivePair(later, earlier, proposals, shared_of(proposals, state, own, places(earlier))))
+            proposals, others = candidates.of(earlier), places(earlier)
+            both, query = [*others, *own], proposals.query + np.int32(len(others))
+            pairs.append(DrivePair(later, earlier, proposals, shared_of(state, both, query, proposals.match)))
     return pairs
 
 
@@ -186,17 +188,6 @@ def closures_between(
             others[best] = False
             look(np.flatnonzero(others))
     return merged([ledger for _, ledger in looks], [rows for rows, _ in looks])
-
-
-def shared_of(
-    proposals: Proposals, state: PlaceState, later: Sequence[Any], earlier: Sequence[Any]
-) -> SharedReferences:
-    """The references that explain both places of each candidate; none where the recogniser has no boxes."""
-    if not isinstance(state, BoxState):
-        nothing = [np.empty(0, np.uint16)] * len(proposals.query), [np.empty(0, np.float32)] * len(proposals.query)
-        return SharedReferences(*nothing)
-    both = [*earlier, *later]  # the two drives' places one after the other
-    return state.shared(both, proposals.query + np.int32(len(earlier)), proposals.match)
 
 
 def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences) -> Closures:

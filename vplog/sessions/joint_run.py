@@ -69,20 +69,11 @@ def run_joint(
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
         odometry_of(log)
+    head = {**provenance.head(pipeline, paths[0], execution.threads), **provenance.logs_of(paths)}
     watch = Watch()
     with ExitStack() as stack:
         made = stack.enter_context(
-            begun(
-                out,
-                pipeline,
-                paths[0],
-                execution.threads,
-                library,
-                topics,
-                drives_at,
-                resumable=cache.use,
-                force=cache.force,
-            )
+            begun(out, head, paths, library, topics, drives_at, resumable=cache.use, force=cache.force)
         )
         caches = out / CACHE if cache.use else made / CACHE
         if not cache.use:
@@ -108,8 +99,7 @@ def run_joint(
             write_ledgers(made / "joins.parquet", [alone.solved for alone in drives], ledgers, header)
             _write_maps(made, drives, joined, header)
         account = {
-            **provenance.head(pipeline, paths[0], execution.threads),
-            **provenance.logs_of(paths),
+            **head,
             "finished": True,
             "library": {"hash": state.hash, "from": provenance.library_of(library)},
             **_account(drives, ledgers, joined),

@@ -10,7 +10,7 @@ import numpy as np
 
 from vplog.data import Verdict
 from vplog.figures.canvas import as_text, drawn
-from vplog.results.evenly import evenly
+from vplog.results.report.charts import evenly
 
 if TYPE_CHECKING:
     from pathlib import Path

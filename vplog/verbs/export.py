@@ -16,8 +16,8 @@ from vplog.storage.scratch import replacing
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.results.shown import Earth
-    from vplog.run.report import Tracks
+    from vplog.results.geo import Earth
+    from vplog.results.report.page import Tracks
 
 FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
 

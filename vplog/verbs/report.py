@@ -17,7 +17,7 @@ from vplog.geometry import se3
 from vplog.pipeline import Pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
-from vplog.results.report.content import Judged
+from vplog.results.report.page import Judged
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
 from vplog.storage.remote_path import original

@@ -18,6 +18,7 @@ from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice
 from vplog.pipeline import Pipeline
 from vplog.places.bobb import BobbSettings
+from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,7 +78,7 @@ def test_every_experiment_on_two_drives(
     for one in done.values():
         assert one["figures"]
         assert all((out / file).stat().st_size > 1000 for file in one["figures"])
-    assert json.loads((out / "study.json").read_text()) == found
+    assert read_run_json(out / "study.json") == found
 
     # every ordered pair and method once; the worst seed is never better than the mean
     rows = done["pairs"]["rows"]
@@ -133,7 +134,7 @@ def test_every_experiment_on_two_drives(
     assert "bobb_paper:partitions=5" in said.out
     assert "agreement_floor=1" in said.out
     assert {file.name: file.stat().st_mtime_ns for file in out.iterdir() if file.name != "study.json"} == before
-    assert without_seconds(json.loads((out / "study.json").read_text())) == without_seconds(found)
+    assert without_seconds(read_run_json(out / "study.json")) == without_seconds(found)
 
 
 def find(rows: list[dict[str, Any]], method: str, query: str) -> dict[str, Any]:
@@ -154,7 +155,7 @@ def test_bytes_do_not_depend_on_threads_and_the_interrupted_goes_on(
         if file.name != "study.json":
             assert file.read_bytes() == (outs[1] / file.name).read_bytes(), file.name
     # trials outlive a study that was cut short, and damage to their file costs only time
-    trials = json.loads((outs[0] / "trials.json").read_text())
+    trials = read_run_json(outs[0] / "trials.json")
     (outs[0] / "study.json").unlink()
     key = next(iter(trials))
     trials[key]["r_at_1"] = -1.0

@@ -29,6 +29,7 @@ from vplog.maps.merge import merge_maps
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
+from vplog.results.run_record import read_run_json
 from vplog.sessions.inter_session import candidates_among, likely_drives, no_candidates, proposed_in, with_proposals
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def test_the_halves_of_a_drive_are_one_component(whole: Path, drive: Drive) -> N
     [component] = components_of(whole)
     assert component["drives"] == ["after", "before"]
     folder = whole / "joint" / component["folder"]
-    told = json.loads((folder / "component.json").read_text())
+    told = read_run_json(folder / "component.json")
     assert [(tie["query_drive"], tie["match_drive"]) for tie in told["joins"]] == [("before", "after")]
     assert told["joins"][0]["kept"] >= 3
     assert json.loads((whole / "joint.json").read_text())["alone"] == ["drive"]

@@ -6,7 +6,6 @@ What a trial found is remembered by all that it depends on, so a study that was 
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass, field
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
@@ -14,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from vplog.benchmark.method_scores import describe_traversal, score_table, search, stored_bytes
 from vplog.benchmark.traversals import candidate_stops, extract_traversal
 from vplog.data import Reference
-from vplog.errors import LogError
+from vplog.errors import LogError, ResultError
 from vplog.evaluate import retrieval
 from vplog.execution.execution import Execution
 from vplog.features.store import FeatureStore
 from vplog.places.library_files import references_hash
 from vplog.places.reference_choice import LibrarySettings, choose
-from vplog.results.run_record import canonical_json, write_run_json
+from vplog.results.run_record import canonical_json, read_run_json, write_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -194,11 +193,10 @@ class Bench:
     def _remember(self) -> dict[str, dict[str, Any]]:
         if self._done is None:
             try:
-                found = json.loads(self.remembered.read_text(encoding="utf-8"))
-            except (OSError, ValueError, RecursionError):  # none yet, or no use: all is tried again
+                found = read_run_json(self.remembered)
+            except ResultError:  # none yet, or no use: all is tried again
                 found = {}
-            entries = found.items() if isinstance(found, dict) else ()
-            self._done = {key: value for key, value in entries if _is_whole(value)}
+            self._done = {key: value for key, value in found.items() if _is_whole(value)}
         return self._done
 
 

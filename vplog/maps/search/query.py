@@ -19,7 +19,6 @@ from vplog.maps.storage.damage import left_out, reading_drive, without_damaged
 from vplog.pipeline import Pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import tables
-from vplog.results.placed import placed_table, write_placed
 from vplog.run.keyframes import select_keyframes
 from vplog.stages import CodedState
 from vplog.storage.remote_path import RemotePath
@@ -82,7 +81,7 @@ def query_map(
         warnings += left_out(store)
     if out is not None:
         pipeline = pipeline.model_copy(update={"sequence": settings})
-        write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
+        tables.write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
     return {
         "map": str(root),
         "log": str(path),
@@ -240,7 +239,7 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) 
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
         stamp[number == one] = known[rows]
     names = [drives[one] for one in numbers]
-    return placed_table(
+    return tables.placed_table(
         [
             query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,
             answers.score[there], answers.support[there],

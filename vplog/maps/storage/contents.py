@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.maps.storage.remote_map import Mirror
-    from vplog.results.shown import Earth
+    from vplog.results.geo import Earth
 
     T = TypeVar("T")
 
@@ -238,7 +238,7 @@ class Store:
         known = library is None or (isinstance(library, str) and HASH.fullmatch(library))
         if not known or not isinstance(settings, dict):
             raise ResultError(f"{path} lacks a valid library or settings. Write it again: vplog batch LOG -o {self}")
-        return Head(library, _without_retired(settings))
+        return Head(library, settings)
 
     def sound_head(self) -> Head:
         """`head`, where map.json is damaged as the drives have it: their library and, where all have the same, their
@@ -278,15 +278,6 @@ class Store:
         run_record.write_run_json(path, record, checksum=name != "failures.json")  # whose keys are drives
         if self.mirror is not None:
             write_json(self.mirror, name)
-
-
-def _without_retired(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of an older vplog without those that are gone and were off: `verify.direction`."""
-    verify = settings.get("verify")
-    direction = verify.get("direction") if isinstance(verify, dict) else None
-    if not (isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False):
-        return settings
-    return {**settings, "verify": {name: value for name, value in verify.items() if name != "direction"}}
 
 
 def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:

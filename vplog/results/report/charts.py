@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.results.evenly import evenly
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from vplog.data import Floats
 
@@ -42,6 +42,11 @@ class Chart:
     texts: list[Label]
     """x, y, text-anchor and words of each label."""
     size: tuple[str, str] = (f"{_WIDTH:.0f}", f"{_HEIGHT:.0f}")
+
+
+def evenly(rows: NDArray[Any], most: int) -> NDArray[Any]:
+    """At most so many rows (N, ...), evenly, the first and the last among them."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
 def trajectory_map(

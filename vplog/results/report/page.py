@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.data import Verdict
+from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
-from vplog.results.report import TAKEN, charts
-from vplog.results.report.ledger import ledger
+from vplog.results.report import charts
 
 if TYPE_CHECKING:
-    from vplog.results.report.content import Content, Judged
+    from vplog.data import Bools, Closures, Floats, Keyframes, Trajectory
+    from vplog.results.geo import Earth
+    from vplog.results.mcap_read import Found
 
+_TAKEN = (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY)
+"""Verdicts of closures that the solve used, at least in part."""
+_MOST_ROWS = 20_000
+"""Rows of the ledger in the page: 1.5 MB. Accepted ones first, then by score; the table file has them all."""
 _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
 _MOST_PICTURE_BYTES = 6_000_000
@@ -31,6 +38,57 @@ _FIGURES = (
 """Heading, error, figure and digits of the rows of the table of the truth."""
 
 
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A run compared with the truth."""
+
+    name: str
+    """The truth as it was given."""
+    scores: dict[str, Any]
+    """The record of `vplog evaluate --json`."""
+    words: list[str] = field(default_factory=list)
+    """Sentences on the closures and their criteria."""
+    path: Floats | None = None
+    """(T, 3) m, the truth in the frame of the trajectory; None where the truth is the log's own GPS."""
+    true: Bools | None = None
+    """(C,) candidates that are true: by their pose, or by place where they have none."""
+    known: Bools | None = None
+    """(C,) candidates that the truth covers finely enough to judge."""
+    curves: dict[str, Floats] = field(default_factory=dict)
+    """By what candidates are ranked: (P, 3) recall, precision and the value there, by falling value."""
+    at_place: Bools | None = None
+    """(C,) candidates whose two frames show one place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Where a run was, before and after."""
+
+    keyframes: Keyframes
+    world_from_body: Floats
+    """(N, 4, 4) of the keyframes, solved."""
+    before: Trajectory
+    """The odometry, laid on the first solved keyframe."""
+    after: Trajectory
+    found: Found
+    """What result.mcap holds beside."""
+    earth: Earth | None
+    """Where the trajectory is on earth, None without satellite fixes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """A finished run."""
+
+    record: dict[str, Any]
+    """What run.json holds."""
+    tracks: Tracks
+    closures: Closures
+    pictures: dict[int, bytes]
+    """JPEG of a candidate closure by its row."""
+    judged: Judged | None = None
+
+
 def page(content: Content) -> str:
     """The whole report: the same text for the same run, but for its timings."""
     record, closures, judged = content.record, content.closures, content.judged
@@ -40,7 +98,7 @@ def page(content: Content) -> str:
     return render(
         "report.html",
         record=record,
-        drive=content.keyframes.drive,
+        drive=content.tracks.keyframes.drive,
         tiles=_tiles(content),
         warnings=_list(record.get("warnings")),
         losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
@@ -52,7 +110,7 @@ def page(content: Content) -> str:
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
         candidates=len(closures),
         examples=examples,
-        ledger=ledger(content, [one["row"] for one in examples]),
+        ledger=_ledger(content, [one["row"] for one in examples]),
         distributions=_distributions(content),
         references=_references(content),
         stages=_stages(mapping(record.get("stages"))),
@@ -61,11 +119,11 @@ def page(content: Content) -> str:
 
 def _tiles(content: Content) -> list[tuple[str, str]]:
     """The drive in seven numbers, each with what it counts."""
-    path_m = float(np.linalg.norm(np.diff(content.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
-    stamps = content.after.stamp_ns
+    path_m = float(np.linalg.norm(np.diff(content.tracks.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
+    stamps = content.tracks.after.stamp_ns
     totals = mapping(content.record.get("totals"))
     return [
-        (figure(len(content.keyframes.stamp_ns)), "keyframes"),
+        (figure(len(content.tracks.keyframes.stamp_ns)), "keyframes"),
         (f"{figure(path_m)} m", "path"),
         (f"{figure((int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0)} s", "of drive"),
         (figure(len(content.closures)), "candidates"),
@@ -77,7 +135,7 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
 
 def _loss(loss: dict[str, Any], content: Content) -> list[str]:
     """A row of what could not be read: how much, when, and why."""
-    start_ns = int(content.keyframes.stamp_ns[0]) if len(content.keyframes.stamp_ns) else 0
+    start_ns = int(content.tracks.keyframes.stamp_ns[0]) if len(content.tracks.keyframes.stamp_ns) else 0
     ends = [end for span in _list(loss.get("spans_ns")) for end in span]
     when = f"{(min(ends) - start_ns) / 1e9:.1f} to {(max(ends) - start_ns) / 1e9:.1f}" if ends else "-"
     why = f"{loss.get('reason', '')}: {loss['detail']}" if loss.get("detail") else loss.get("reason", "")
@@ -86,7 +144,7 @@ def _loss(loss: dict[str, Any], content: Content) -> list[str]:
 
 def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
     """The legend and the map of the trajectory."""
-    closures, judged, position = content.closures, content.judged, content.world_from_body[:, :3, 3]
+    closures, judged, position = content.closures, content.judged, content.tracks.world_from_body[:, :3, 3]
     accepted, false = closures.of(Verdict.ACCEPTED), np.zeros(len(closures), bool)
     if judged is not None and judged.true is not None and judged.known is not None:
         false = accepted & judged.known & ~judged.true
@@ -97,12 +155,16 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
         ("false", "accepted closures that are false", closures.lines(position, false)),
     ]
     paths = [
-        ("before", "odometry", content.before.world_from_body[:, :3, 3]),
-        ("after", "optimised", content.after.world_from_body[:, :3, 3]),
+        ("before", "odometry", content.tracks.before.world_from_body[:, :3, 3]),
+        ("after", "optimised", content.tracks.after.world_from_body[:, :3, 3]),
     ]
     if judged is not None and judged.path is not None:
         paths.insert(0, ("truth", "truth", judged.path))
-    dots = [] if content.fixes_m is None else [("gps", "GPS fixes", content.fixes_m)]
+    gps, earth = content.tracks.found.gps, content.tracks.earth
+    dots = []
+    if gps is not None and earth is not None:
+        fixes_m = se3.transform(se3.inverse(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
+        dots = [("gps", "GPS fixes", fixes_m)]
     legend = [(kind, name) for kind, name, points in (*dots, *paths, *segments) if len(points)]
     drawn = ([(kind, points) for kind, _, points in group] for group in (paths, dots, segments))
     return legend, charts.trajectory_map(*drawn)
@@ -133,17 +195,60 @@ def _examples(content: Content) -> list[dict[str, Any]]:
         left -= len(jpeg)
         verdict = closures.verdict[row]
         one = {"row": row, "jpeg": jpeg, "verdict": verdict.value}
-        one |= {"kind": "accepted" if verdict in TAKEN else "rejected"}
+        one |= {"kind": "accepted" if verdict in _TAKEN else "rejected"}
         one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
         examples.append(one)
     return examples
+
+
+def _ledger(content: Content, pictures: list[int]) -> dict[str, Any] | None:
+    """Columns and rows as JSON, None without candidates; `pictures` are the rows that have one in the page."""
+    if not len(content.closures):
+        return None
+    closures = content.closures
+    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*_TAKEN)))
+    columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
+    return {
+        "columns": list(columns),
+        "rows": list(map(list, zip(*columns.values(), strict=True))),
+        "pictures": pictures,
+        "kept": [verdict.value for verdict in _TAKEN],
+    }
+
+
+def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
+    """Values of these rows by the name of their column; those of the truth beside the verdict, in view on a phone."""
+    closures, judged = content.closures, content.judged
+    columns: dict[str, list[Any]] = {"row": rows, "verdict": [closures.verdict[row].value for row in rows]}
+    if judged is not None and judged.true is not None and judged.known is not None:
+        true = np.where(judged.true, "yes", "no")[rows].tolist()
+        columns["true"] = [one if known else None for one, known in zip(true, judged.known[rows], strict=True)]
+        if judged.at_place is not None:
+            columns["same place"] = ["yes" if one else None for one in judged.at_place[rows].tolist()]
+    reverse = closures.reverse_inliers[rows].tolist()
+    return columns | {
+        **{name: getattr(closures, name)[rows].tolist() for name in ("query", "match", "rank")},
+        "score": _rounded(closures.score[rows], 4),
+        **{name: getattr(closures, name)[rows].tolist() for name in ("support", "matches", "inliers")},
+        "reverse inliers": [value if value >= 0 else None for value in reverse],
+        "spread": _rounded(closures.spread[rows], 3),
+        "metres": _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2),
+        "sigma before": _rounded(closures.residual_before[rows], 2),
+        "sigma after": _rounded(closures.residual_after[rows], 2),
+        "weight": _rounded(closures.weight[rows], 3),
+    }
+
+
+def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
+    """What JSON can hold: null where a value is not known."""
+    return [round(value, digits) if np.isfinite(value) else None for value in values.astype(np.float64).tolist()]
 
 
 def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     """What accepted and rejected candidates differ in, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
-    taken = closures.of(*TAKEN)
+    taken = closures.of(*_TAKEN)
     shown = []
     for label, values, name, least in (
         ("score", closures.score, "", None),
@@ -167,7 +272,7 @@ def _references(content: Content) -> dict[str, Any] | None:
     order = sorted(range(len(used)), key=lambda number: (-used[number], number))
     split = min(_MOST_USED, (len(order) + 1) // 2)
     ends = (("Most used", order[:split]), ("Least used", order[max(split, len(order) - _MOST_USED) :]))
-    jpegs, coverage = content.references, mapping(library.get("coverage"))
+    jpegs, coverage = content.tracks.found.references, mapping(library.get("coverage"))
     return {
         "count": len(used),
         "explained": coverage.get("explained") if coverage.get("frames") else None,

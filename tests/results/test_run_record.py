@@ -1,0 +1,99 @@
+"""Records hold what they were written with, or say that they do not; settings that are gone stop no reader."""
+
+from __future__ import annotations
+
+import json
+import random
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.results.example import make_run
+from tests.run.test_run_folder import written
+from vplog.errors import ResultError, SettingsError
+from vplog.logs import TopicChoice
+from vplog.pipeline import Pipeline
+from vplog.results.run_record import read_finished_run, read_run_json, write_run_json
+from vplog.results.tables import TableMetadata, write_closures, write_keyframes
+from vplog.run.provenance import OWN_LIBRARY, head
+from vplog.run.run_folder import begun
+from vplog.verbs.resume import resume_request
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+
+def older(settings: dict[str, Any], keep: bool = False) -> dict[str, Any]:
+    """The settings as a vplog had them that knew directions without metres."""
+    return {**settings, "verify": {**settings["verify"], "direction": {"keep": keep, "rounds": 1000}}}
+
+
+def write_run(folder: Path, **changed: Any) -> dict[str, Any]:
+    """A finished run with the tables that `explain` needs, and its record."""
+    known, about = make_run(3), TableMetadata({}, "")
+    write_keyframes(folder / "keyframes.parquet", known.keyframes, known.solution.world_from_body, about)
+    write_closures(folder / "closures.parquet", known.closures, known.keyframes, about)
+    log = written(folder / "a.mcap", b"a log")
+    account = {**head(Pipeline(), log, 1, TopicChoice()), "finished": True, "library": {"from": OWN_LIBRARY}}
+    account |= {"solution": {"reason": "It converged."}, **changed}
+    write_run_json(folder / "run.json", account)
+    return account
+
+
+def test_no_flipped_bit_of_a_run_json_is_believed(tmp_path: Path) -> None:
+    known, chance, path = write_run(tmp_path), random.Random(7), tmp_path / "run.json"
+    data, refused = path.read_bytes(), 0
+    for _ in range(200):
+        flipped = bytearray(data)
+        flipped[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path.write_bytes(flipped)
+        try:
+            found = read_run_json(path)
+        except ResultError as error:
+            assert str(path) in str(error)
+            refused += 1
+        else:  # a flip in the name of the checksum leaves a field that nobody reads
+            assert {**found, **known} == found
+    assert refused > 190
+
+
+def test_a_record_without_a_checksum_is_read(tmp_path: Path) -> None:
+    """An older vplog wrote it, or an editor."""
+    write_run_json(tmp_path / "run.json", {"finished": True, "log": "a"})
+    text = json.loads((tmp_path / "run.json").read_text())
+    del text["record_sha256"]
+    (tmp_path / "run.json").write_text(json.dumps(text))
+    assert read_finished_run(tmp_path) == {"finished": True, "log": "a"}
+
+
+def test_the_request_of_an_unfinished_run_has_a_checksum(tmp_path: Path) -> None:
+    out, log = tmp_path / "out", written(tmp_path / "a.mcap", b"a log")
+    with pytest.raises(KeyboardInterrupt), begun(out, head(Pipeline(), log, 1), [log]):
+        (out / ".cache" / "extract-0.stage").write_text("a result")
+        raise KeyboardInterrupt
+    request = out / ".cache" / "run.json"
+    request.write_text(request.read_text().replace('"rotation_deg": 10.0', '"rotation_deg": 11.0'))
+    with pytest.raises(ResultError, match="checksum"):
+        resume_request(out)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_setting_that_is_gone_and_was_off_stops_no_reader(
+    keep: bool, tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    """Of a finished run and of one to resume; one that was on cannot be had any more, and is named."""
+    settings = older(Pipeline().model_dump(mode="json"), keep)
+    account = write_run(tmp_path, settings=settings)
+    explained = verb("explain", tmp_path, "--closure", "0", "--no-picture", "--json")
+    (tmp_path / ".cache").mkdir()
+    write_run_json(tmp_path / ".cache" / "run.json", {**account, "finished": False})
+    if keep:
+        assert "direction is no setting" in explained.error
+        with pytest.raises(SettingsError, match="direction is no setting"):
+            resume_request(tmp_path)
+    else:
+        assert explained.json["closure"] == 0
+        assert resume_request(tmp_path).pipeline == Pipeline()
