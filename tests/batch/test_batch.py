@@ -35,7 +35,7 @@ from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store
-from vplog.maps.storage.drive_ids import drive_names
+from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.run.reference_library import build_library
 
@@ -153,7 +153,7 @@ def test_what_is_missing_or_changed_is_done_again(
     told = run_batch(logs[:1], whole, changed)
     assert [(one["state"], one["error"]) for one in told["drives"]] == [("failed", "not now")]
     assert asked == ["drive"]
-    monkeypatch.setattr("vplog.maps.storage.drive_ids.code_hash", lambda: "other code")
+    monkeypatch.setattr("vplog.maps.storage.layout.code_hash", lambda: "other code")
     assert run_batch(logs, whole, pipeline)["failed"] == 2
     assert asked[1:] == ["drive", "drive-2"]
     assert {**files(whole), "map.json": 0, "failures.json": 0}.keys() == {
@@ -433,7 +433,7 @@ def test_a_join_that_fails_takes_no_fates_along(
     assert "bad: failed, 0.0 s: " in said.err
     assert "1 of 3 drives failed" in said.err
     assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
-    monkeypatch.setattr("vplog.maps.storage.drive_ids.code_hash", lambda: "other code")
+    monkeypatch.setattr("vplog.maps.storage.layout.code_hash", lambda: "other code")
     found = run_batch([bad], root, load_pipeline("default", QUICK), join=False)
     assert "Another version of vplog or its packages made 2 of the drives" in found["warnings"][0]
 

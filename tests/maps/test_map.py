@@ -16,7 +16,7 @@ from tests.maps.runs import put_rows
 from vplog.execution.execution import Execution
 from vplog.maps.search.query import search
 from vplog.maps.storage import map_store
-from vplog.maps.storage.drive_ids import drive_names
+from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables

@@ -22,8 +22,8 @@ from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.maps.import_places import ALONE
 from vplog.maps.joining.join import join as join_drives
 from vplog.maps.joining.join import load_places
-from vplog.maps.storage import drive_ids, map_store
-from vplog.maps.storage.damage import left_out
+from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.contents import left_out
 from vplog.maps.storage.layout import drive_record, folder_name
 from vplog.pipeline import load_pipeline, pipeline_from
 from vplog.storage.remote_path import RemotePath, located
@@ -143,7 +143,7 @@ def run_batch(
         inputs, errors = known_hashes(
             dict(zip(given, paths, strict=True)), topics, store.root / NAME, threads, progress
         )
-        drives = drive_ids.drive_names(
+        drives = layout.drive_names(
             [_name(path) for path in paths], list(map(shown, given)), {**_failed(store), **known}, inputs
         )
         alike = _alike(pipeline, topics, digest) | maker.result()
@@ -151,7 +151,7 @@ def run_batch(
         urls = dict(zip(drives, given, strict=True))
         for drive, content in zip(drives, inputs, strict=True):
             about, log = {"drive": drive, "inputs": content, **alike}, shown(urls[drive])
-            about |= {"key": drive_ids.key_of(about), "log": log}
+            about |= {"key": layout.key_of(about), "log": log}
             if why := errors.get(urls[drive]):
                 done[drive] = Drive(drive, log, "failed", error=why)
                 tell(done[drive])
@@ -365,7 +365,7 @@ def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, A
     """
     return {
         "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file"}),
-        "settings": drive_ids.key_of(pipeline.model_dump(mode="json")),
+        "settings": layout.key_of(pipeline.model_dump(mode="json")),
         "library": library,
     }
 

@@ -16,7 +16,8 @@ from vplog.execution.execution import Execution
 from vplog.maps.import_places import ALONE
 from vplog.maps.merge import in_order
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import reading_drive, without_damaged
+from vplog.maps.storage.contents import without_damaged
+from vplog.maps.storage.damage import reading_drive
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record

@@ -13,7 +13,7 @@ from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.timing import peak_memory_mb
-from vplog.maps.storage import drive_ids
+from vplog.maps.storage import layout
 from vplog.pipeline import CacheOptions, Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.results import run_record
@@ -71,7 +71,7 @@ class Outcome:
 
 def made_by() -> dict[str, Any]:
     """Code and packages of this machine, as drive.json has them: a drive is computed where they are the batch's."""
-    return {"code": drive_ids.code_hash(), "versions": provenance.head(Pipeline(), Path(), 1)["versions"]}
+    return {"code": layout.code_hash(), "versions": provenance.head(Pipeline(), Path(), 1)["versions"]}
 
 
 def compute_drive(task: Task) -> Outcome:
@@ -89,7 +89,7 @@ def compute_drive(task: Task) -> Outcome:
             error = f"{task.about['log']} changed while it was read. Run again when it is complete."
         else:
             if done.keyframes.drive != task.drive:
-                drive_ids.name_keyframes(task.folder / "keyframes.parquet", task.drive)
+                layout.name_keyframes(task.folder / "keyframes.parquet", task.drive)
             run_record.write_run_json(task.folder / "drive.json", task.about)
             counts = done.record["counts"]
             found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}

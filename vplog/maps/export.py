@@ -11,7 +11,7 @@ import numpy as np
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.geo_bounds import earth_as_plain, earth_of_run, inside
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import left_out, without_damaged
+from vplog.maps.storage.contents import left_out, without_damaged
 from vplog.results import tables
 from vplog.results.geo import on_earth
 from vplog.results.places_map import about_run, names_of, read_places, write_map, write_places

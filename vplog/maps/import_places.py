@@ -18,7 +18,7 @@ from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.loops.verify import no_closures
 from vplog.maps.geo_bounds import earth_as_plain, earth_from_plain
-from vplog.maps.storage import drive_ids, map_store
+from vplog.maps.storage import layout, map_store
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.places_map import about_map, read_drives
@@ -64,7 +64,7 @@ def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[st
         _write_run(made, places, taken, about, kind)
         earth = earth_as_plain(earth_from_plain(record["earth"]), places.world_from_body)
         record = {**record, "drive": taken, "earth": earth}
-        run_record.write_run_json(made / "drive.json", {**record, "key": drive_ids.key_of(record | {"earth": None})})
+        run_record.write_run_json(made / "drive.json", {**record, "key": layout.key_of(record | {"earth": None})})
         map_store.publish(store, taken, made)
         yield places.drive
 
@@ -76,7 +76,7 @@ def _record(path: Path, about: AboutMap, drive: str, told: dict[str, Any]) -> di
         "log": f"{_where(path)}#{drive}",
         "inputs": inputs if isinstance(inputs, dict) else {},
         "topics": topics if isinstance(topics, dict) else {},
-        "settings": drive_ids.key_of(about.settings),
+        "settings": layout.key_of(about.settings),
         "library": about.library,
         "earth": told.get("earth"),
         ALONE: path.name,

@@ -11,9 +11,9 @@ from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
 from vplog.maps.import_places import ALONE
 from vplog.maps.joining.joint_record import components_in, replaced_since
-from vplog.maps.storage import drive_ids, map_store
-from vplog.maps.storage.damage import damaged_files, left_out, without_damaged
-from vplog.maps.storage.map_store import other_library
+from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.contents import left_out, other_library, without_damaged
+from vplog.maps.storage.damage import damaged_files
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
@@ -67,7 +67,7 @@ def _damaged_table(path: Path) -> list[str]:
 
 def _describe(store: Store) -> dict[str, Any]:
     head, problems, abouts = store.head(), list[str](), store.drives()
-    now, other = (drive_ids.key_of(head.settings), drive_ids.code_hash()), []
+    now, other = (layout.key_of(head.settings), layout.code_hash()), []
     for drive, about in abouts.items():
         if about["library"] != head.library:
             problems.append(other_library(store, drive, about["library"], head.library))

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.maps.import_places import ALONE, drives_of_file, library_of_file, take_places
 from vplog.maps.joining.drive_pairs import KEPT
-from vplog.maps.storage import drive_ids, map_store
-from vplog.maps.storage.damage import DamagedDriveError, damaged_files, left_out
+from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.contents import left_out
+from vplog.maps.storage.damage import DamagedDriveError, damaged_files
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive
@@ -149,7 +150,7 @@ class _There:
         return drive, drive in self._alone
 
     def free_name(self, drive: str, log: str) -> str:
-        return drive_ids.free_name(drive, log, self._names)
+        return layout.free_name(drive, log, self._names)
 
 
 def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any] | None:
@@ -179,8 +180,8 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
 
     other.read(drive, copied, ())
     if taken != drive:
-        drive_ids.name_keyframes(made / "keyframes.parquet", taken)
-    run_record.write_run_json(made / "drive.json", record if taken == drive else drive_ids.renamed(record, taken))
+        layout.name_keyframes(made / "keyframes.parquet", taken)
+    run_record.write_run_json(made / "drive.json", record if taken == drive else layout.renamed(record, taken))
     _link_kept(other, drive, store, taken)
     map_store.publish(store, taken, made)
     other.forget(drive)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import left_out
+from vplog.maps.storage.contents import left_out
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

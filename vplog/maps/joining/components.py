@@ -21,7 +21,7 @@ from vplog.cache.code_hash import code_of
 from vplog.errors import ResultError
 from vplog.graph.build import parts
 from vplog.maps.storage.damage import reading_drive
-from vplog.maps.storage.drive_ids import key_of
+from vplog.maps.storage.layout import key_of
 from vplog.results import g2o, run_record, tables
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 

@@ -18,8 +18,7 @@ from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.joining.drive_features import CameraTrust, camera_trust, keep_features, opened_drive
-from vplog.maps.storage.drive_ids import key_of
-from vplog.maps.storage.layout import folder_name, quoted
+from vplog.maps.storage.layout import folder_name, key_of, quoted
 from vplog.results import run_record, tables
 from vplog.sessions.inter_session import closures_between, with_shared
 from vplog.storage.scratch import replacing

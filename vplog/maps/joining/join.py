@@ -19,7 +19,7 @@ from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
 from vplog.maps.joining.join_order import is_up_to_date, read_drives, settled_ties
 from vplog.maps.joining.solve_components import solve_groups
-from vplog.maps.storage.damage import left_out, without_damaged
+from vplog.maps.storage.contents import left_out, without_damaged
 from vplog.maps.storage.map_store import reading, writing
 from vplog.pipeline import Pipeline
 from vplog.sessions.inter_session import likely_pairs

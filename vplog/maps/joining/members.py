@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vplog import logs
 from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import LogError, ResultError
-from vplog.maps.storage.drive_ids import key_of
+from vplog.maps.storage.layout import key_of
 from vplog.maps.storage.map_store import folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables

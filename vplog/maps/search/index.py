@@ -22,9 +22,9 @@ import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
+from vplog.maps.storage.contents import other_library
 from vplog.maps.storage.damage import DamagedDriveError, reading_drive
 from vplog.maps.storage.layout import ADD_AGAIN
-from vplog.maps.storage.map_store import other_library
 from vplog.results import tables
 from vplog.storage.parquet_limits import check_file
 
@@ -105,8 +105,8 @@ def _in_cache(store: Store) -> bool:
 
 def content_of(store: Store, drive: str, key: str) -> Content:
     """What a drive holds now; on an object store as its manifest says. Raises ResultError."""
-    if store.mirror is not None and (mark := store.mirror.digest(drive, "descriptors.parquet")):
-        return Content(drive, key, mark)
+    if store.mirror is not None and (mark := store.mirror.manifests[drive]["files"].get("descriptors.parquet")):
+        return Content(drive, key, mark["sha256"])
     with reading_drive(drive):
         return Content(drive, key, _footer_hash(_descriptors(store, drive)))
 

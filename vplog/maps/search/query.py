@@ -15,7 +15,8 @@ from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import update_index
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import left_out, reading_drive, without_damaged
+from vplog.maps.storage.contents import left_out, without_damaged
+from vplog.maps.storage.damage import reading_drive
 from vplog.pipeline import Pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import tables

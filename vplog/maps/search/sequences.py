@@ -17,8 +17,8 @@ from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.maps.search.index import as_described
 from vplog.maps.search.top_k import NONE, Answers, answers_of, merge, no_answers
+from vplog.maps.storage.contents import other_library
 from vplog.maps.storage.damage import reading_drive
-from vplog.maps.storage.map_store import other_library
 from vplog.places.sequence import rank_places
 from vplog.results import tables
 from vplog.stages import index_of_part
