@@ -200,7 +200,7 @@ def test_an_index_is_made_of_the_sound_drives(tmp_path: Path) -> None:
     flip(store.file(drives[1], "descriptors.parquet"))
 
     def update() -> list[Any]:
-        return update_index(store, store.drives(), state.hash, state)[0]
+        return update_index(store, store.drives(), state)[0]
 
     parts = without_damaged(store, update)
     assert list(store.damaged) == [drives[1]]

@@ -52,14 +52,14 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
 
 
 class RayEngine:
-    """The cluster that this process is connected to."""
+    """The cluster that this process is connected to; it computes drives elsewhere and brings their run folders here."""
 
     def __init__(self, ray: Any, head: Head, is_ours: bool) -> None:
         from vplog.batch import ray_tasks
 
         self._is_ours = is_ours
         self._ray, self._head, self._tasks, self._shares_disk = ray, head, ray_tasks, False
-        self.executor = RayExecutor(ray, head, ray_tasks.call)
+        self.executor = RayExecutor(ray, head, ray_tasks.call)  # a core each
         # a process of its own for each drive, so that memory is given back
         self._drive = ray.remote(max_calls=1, max_retries=0)(ray_tasks.call)
         self._part = ray.remote(num_cpus=1)(ray_tasks.compute_remote_part)
@@ -67,13 +67,16 @@ class RayEngine:
 
     @property
     def cores(self) -> int:
+        """Cores of all machines together."""
         return max(int(sum(self._of_nodes("CPU"))), 1)
 
     @property
     def widest(self) -> int:
+        """Cores of the largest machine: one drive runs on one."""
         return max(int(max(self._of_nodes("CPU"))), 1)
 
     def at_once(self, threads: int) -> int:
+        """Drives with so many threads each that keep it busy."""
         return max(sum(int(cores) // threads for cores in self._of_nodes("CPU")), 1)
 
     def start(self, task: Task) -> Future[Outcome]:
@@ -98,7 +101,7 @@ class RayEngine:
         return [(part, self._part.remote(part, wanted)) for part in missing]
 
     def take(self, task: Task, outcome: Outcome) -> None:
-        """Write the files from their pieces."""
+        """Write the run folder from its pieces. Raises BrokenExecutor where they are lost, and ResultError."""
         remote = cast("RemoteOutcome", outcome)
         places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
         for folder, files in places:

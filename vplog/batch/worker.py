@@ -1,4 +1,4 @@
-"""One drive of a batch, computed by a worker: what it is told, and what it tells."""
+"""One drive of a batch, computed by a worker: its task and its outcome."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from vplog.run import provenance
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vplog.logs import TopicChoice
 
 
@@ -42,7 +44,7 @@ class Task:
     cache: Path | None = None
     """Where what an attempt had done stays when it ends before its time; None to keep nothing."""
     keep_cache: bool = False
-    """Whether that is wanted of a drive that is finished, too."""
+    """Whether it stays of a drive that is finished, too."""
     in_parts: bool = False
     """Whether its frames are extracted on all machines at once: it is longer than all other drives together."""
 
@@ -66,7 +68,26 @@ class Outcome:
     accepted: int = 0
     """Closures within it."""
     warnings: tuple[str, ...] = ()
-    """What the run had to say."""
+    """Those of the run, as losses of its log."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What became of one log in a batch; `seconds` to `warnings` as in the Outcome of the last attempt."""
+
+    drive: str
+    log: str
+    state: str
+    """`computed`, `unchanged` or `failed`."""
+    attempts: int = 0
+    """0 where nothing was to be done, or could be."""
+    seconds: float = 0.0
+    worker: str = ""
+    peak_memory_mb: float = 0.0
+    error: str = ""
+    keyframes: int = 0
+    accepted: int = 0
+    warnings: Sequence[str] = ()
 
 
 def made_by() -> dict[str, Any]:

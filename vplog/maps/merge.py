@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.maps.import_places import ALONE, drives_of_file, library_of_file, take_places
 from vplog.maps.joining.drive_pairs import KEPT
 from vplog.maps.storage import layout, map_store
@@ -20,19 +21,17 @@ from vplog.results.places_map import places_by_drive
 from vplog.storage.remote_path import local_copy, original
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from vplog.maps.storage.map_store import Store
 
-    Progress = Callable[[str, int, int], None]
-
 
 def merge_maps(
-    sources: Sequence[Path], target: Path, progress: Progress = lambda *_: None, chosen: Sequence[str] = ()
+    sources: Sequence[Path], target: Path, execution: Execution = Execution(), chosen: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; what became of
-    each. Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
+    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; the fate of each.
+    Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
 
     Maps in the order given, the drives of each in order of their IDs. One whose log is in the map already, by its
     content, is left out; one whose ID is taken gets a number. Each is in whole or not at all, so a merge that was
@@ -44,16 +43,16 @@ def merge_maps(
         raise SettingsError("A map is given twice. Give each once.")
     with ExitStack() as stack:
         here = [stack.enter_context(local_copy(one)) if one.is_file() else one for one in sources]
-        return _merge(here, target, progress, chosen)
+        return _merge(here, target, execution, chosen)
 
 
-def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Sequence[str]) -> dict[str, Any]:
+def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: Sequence[str]) -> dict[str, Any]:
     library = _check_libraries(sources, target)
     _check_chosen(sources, chosen)
     fate, warnings = list[dict[str, Any]](), list[str]()
     with map_store.writing(target) as store:
         there = _There(store.drives())
-        for number, source in enumerate(sources):
+        for number, source in enumerate(sources, start=1):
             if source.is_file():
                 fate += _take_file(store, source, there, chosen)
                 continue
@@ -63,7 +62,7 @@ def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Se
                 for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
                     taken = _take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}")
                     fate += [] if taken is None else [taken]
-                    progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
+                    execution.progress(f"merge {number} of {len(sources)}", len(fate), len(fate))
                 warnings += left_out(other)
         return {"map": str(store), "library": library, "drives": fate, "warnings": left_out(store) + warnings}
 
@@ -156,10 +155,10 @@ class _There:
 def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any] | None:
     """One drive; what became of it, None where it is damaged. A whole one comes in place of its places alone."""
     drive = record["drive"]
-    told = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
+    entry = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
     same, alone = there.same(record)
     if same is not None and (not alone or ALONE in record):
-        return {**told, "as": same, "state": "there already"}
+        return {**entry, "as": same, "state": "there already"}
     try:
         whole = other.whole(drive)  # of a store, files that have their sha256
         wrong = damaged_files(whole) if other.mirror is None else []
@@ -186,7 +185,7 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
     map_store.publish(store, taken, made)
     other.forget(drive)
     there.add(taken, record)
-    return {**told, "as": taken, "state": "taken"}
+    return {**entry, "as": taken, "state": "taken"}
 
 
 def _link_kept(other: Store, drive: str, store: Store, taken: str) -> None:
