@@ -42,13 +42,8 @@ if TYPE_CHECKING:
 _FREE_BYTES = 10**10
 """Of the map's disk that stay free of what would only be quicker to have: what a drive of several hours needs while it
 is computed, at 0.3 MB a keyframe."""
-_OTHER = (
-    "{what} made {count} of the drives that were in the map before. Give their logs too, to compute them again; the "
-    "first is {first}."
-)
 _CODE = ("code", "versions")
 """Fields of drive.json that name the program that made it."""
-_ALIKE = "{first} and {second} are the same recording, byte for byte: it is in the map as {drives}."
 
 
 def settings_for(root: Path, name: str | None = None, assignments: Sequence[str] = ()) -> Pipeline:
@@ -195,7 +190,8 @@ def _same(fate: Sequence[Drive], inputs: Sequence[dict[str, str]]) -> list[str]:
         if content and one.state != "failed" and "://" not in one.log:  # of those the bytes are not known
             alike.setdefault(tuple(sorted(content.values())), []).append(one)
     return [
-        _ALIKE.format(first=these[0].log, second=these[1].log, drives=" and ".join(one.drive for one in these))
+        f"{these[0].log} and {these[1].log} are the same recording, byte for byte: it is in the map as "
+        f"{' and '.join(one.drive for one in these)}."
         for these in alike.values()
         if len(these) > 1
     ]
@@ -208,7 +204,10 @@ def _mixed(others: Sequence[dict[str, Any]], alike: dict[str, Any]) -> list[str]
     for what, names in (("Other settings", ["settings"]), ("Another version of vplog or its packages", _CODE)):
         other = [about["log"] for about in made if any(about.get(name) != alike[name] for name in names)]
         if other:
-            warnings.append(_OTHER.format(what=what, count=len(other), first=other[0]))
+            warnings.append(
+                f"{what} made {len(other)} of the drives that were in the map before. Give their logs too, to compute "
+                f"them again; the first is {other[0]}."
+            )
     return warnings
 
 
@@ -291,8 +290,8 @@ def _place(path: Path) -> str:
 
 
 def _name(path: Path) -> str:
-    """What a log is called: its file without the ending, or its folder."""
-    with suppress(OSError):  # what cannot be asked for is said of the log elsewhere
+    """The name of a log: its file without the ending, or its folder."""
+    with suppress(OSError):  # its own run says why it cannot be read
         if path.is_dir():
             return path.name if path.name not in ("", "..") else path.resolve().name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem

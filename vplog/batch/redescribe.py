@@ -117,11 +117,11 @@ def _made(library: Path, pipeline: Pipeline, execution: Execution) -> Iterator[t
 
 
 def _bring_caches(root: Path, target: Path) -> None:
-    """What the stages of the drives kept, under their new map too, where both are folders of one file system."""
-    kept = root / ".cache"
-    if not kept.is_dir() or "://" in str(target) or (target / ".cache").exists():
+    """Link the caches of the drives' stages into their new map, where both are folders of one file system."""
+    caches = root / ".cache"
+    if not caches.is_dir() or "://" in str(target) or (target / ".cache").exists():
         return
     try:
-        shutil.copytree(kept, target / ".cache", symlinks=True, copy_function=os.link)
+        shutil.copytree(caches, target / ".cache", symlinks=True, copy_function=os.link)
     except (OSError, shutil.Error):  # it only spares work
         shutil.rmtree(target / ".cache", ignore_errors=True)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MapQuery:
-    """What is looked for in a map, and with what."""
+    """A query of a map, and what it is answered with."""
 
     top: int = 10
     """Places for each view."""
@@ -209,7 +209,7 @@ def search(
 
 
 def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
-    """What to do where a window of views is longer than drives: of what is usual in them there is too little."""
+    """A warning where a window of views is longer than drives: they have too few places for its statistics."""
     short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
     if not short:
         return []

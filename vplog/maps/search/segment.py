@@ -106,7 +106,7 @@ def write_segment(folder: Path, segment: Segment) -> Path:
 
 
 def _blocks(segment: Segment) -> Iterator[bytes | memoryview]:
-    """What its file holds, but for the checksum."""
+    """The bytes of its file, but for the checksum."""
     header = segment.header
     yield (start := _MAGIC + len(header).to_bytes(8, "little") + header)
     at = len(start)

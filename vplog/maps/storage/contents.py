@@ -220,7 +220,7 @@ class Store:
         """Log and error of each drive that failed when it was last tried, by ID."""
         path = self.root / "failures.json"
         found = run_record.read_run_json(path) if path.exists() else {}
-        if any(not isinstance(told, dict) or not isinstance(told.get("error"), str) for told in found.values()):
+        if any(not isinstance(one, dict) or not isinstance(one.get("error"), str) for one in found.values()):
             raise ResultError(f"{path} is damaged. Move it away: the next batch tries what failed again.")
         return found
 
@@ -330,7 +330,7 @@ def _drive_of(folder: Path) -> str:
 
 
 def _identity(run: Path) -> tuple[int, int, int] | None:
-    """Of the folder that has the name now; None where there is none."""
+    """Identity of the folder that has the name now; None where there is none."""
     try:
         found = (run / "drive.json").stat()
     except OSError:

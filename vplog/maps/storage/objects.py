@@ -9,7 +9,7 @@ from email.utils import parsedate_to_datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from vplog.storage.remote_path import names_below, s3_place
+from vplog.storage.remote_path import s3_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -104,11 +104,6 @@ def files_below(path: RemotePath) -> dict[str, datetime]:
     system, place = path.place
     found = system.get_file_info(FileSelector(place, allow_not_found=True, recursive=True))
     return {one.path[len(place) + 1 :]: one.mtime for one in found if one.type == FileType.File}
-
-
-def folders_in(path: RemotePath) -> list[str]:
-    """Names right below this prefix that have objects below, in order. Raises OSError."""
-    return sorted(name for name, is_folder in names_below(path).items() if is_folder)
 
 
 def decides(path: RemotePath) -> bool:

@@ -34,7 +34,7 @@ from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, folder_name, sound_record
 from vplog.results import run_record
 from vplog.storage.folders import is_below
-from vplog.storage.remote_path import reason
+from vplog.storage.remote_path import names_below, reason
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -88,7 +88,8 @@ class Mirror:
             for name in ("map.json", "failures.json", "removed.json"):
                 if (data := objects.get(remote / name)) is not None:
                     (local / name).write_bytes(data)
-            folders = [name for name in objects.folders_in(remote / "runs") if name.startswith("drive=")]
+            runs = names_below(remote / "runs")
+            folders = sorted(name for name, has_below in runs.items() if has_below and name.startswith("drive="))
             with ThreadPoolExecutor(_REQUESTS) as pool:
                 list(pool.map(self._open, folders))
 

@@ -175,8 +175,9 @@ def remove(mirror: Mirror, drive: str) -> None:
         objects.remove(remote / "runs" / named / "drive.json")
         mirror.manifests.pop(drive, None)
         objects.remove(remote / "runs" / named)
-        for name in objects.folders_in(remote):
-            objects.remove(remote / name / named)
+        for name, has_below in sorted(names_below(remote).items()):
+            if has_below:
+                objects.remove(remote / name / named)
     for folder in mirror.local.glob(f"*/{named}"):
         shutil.rmtree(folder)
 
