@@ -166,7 +166,7 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
         shutil.rmtree(made, ignore_errors=True)
         try:
             ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-            shutil.copytree(other.whole(drive), made, symlinks=True, copy_function=_linked, ignore=ignored)
+            shutil.copytree(other.whole(drive), made, symlinks=True, copy_function=layout.link, ignore=ignored)
         except (OSError, shutil.Error) as error:
             raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
 
@@ -189,7 +189,7 @@ def _link_kept(other: Store, drive: str, store: Store, taken: str) -> None:
             try:
                 target.mkdir(parents=True, exist_ok=True)
                 (target / name).unlink(missing_ok=True)
-                _linked(str(source / name), str(target / name))
+                layout.link(source / name, target / name)
             except OSError as error:
                 raise ResultError(f"Cannot copy {source / name}: {error.strerror or error}.") from None
 
@@ -230,12 +230,3 @@ def in_order(drives: Iterable[str]) -> list[str]:
         return (named[1], int(named[2])) if named else (drive, 1)
 
     return sorted(drives, key=numbered)
-
-
-def _linked(source: str, target: str) -> str:
-    """Give a file a second name, or copy it: no writer of a map changes a file, each replaces it."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
-    return target

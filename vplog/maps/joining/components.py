@@ -102,17 +102,11 @@ def groups_of(order: Sequence[str], keys: dict[str, str], ties: Sequence[Tie], p
     )
     code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
     found = []
-    for one, count in enumerate(np.bincount(number, minlength=1)):
-        if count < 2:
-            continue
+    for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
         drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
         inside = set(drives)
-        own = tuple(
-            sorted(
-                (tie for tie in ties if tie.later in inside and tie.earlier in inside),
-                key=lambda tie: (at[tie.later], at[tie.earlier]),
-            )
-        )
+        between = [tie for tie in ties if {tie.later, tie.earlier} <= inside]
+        own = tuple(sorted(between, key=lambda tie: (at[tie.later], at[tie.earlier])))
         made_from = {
             "drives": [[drive, keys[drive]] for drive in drives],
             "ledgers": [[tie.later, tie.earlier, tie.key] for tie in own],
@@ -186,17 +180,11 @@ def _ledger(tie: Tie) -> Closures:
 
 def _record(group: Group, drives: Sequence[str], joins: Sequence[dict[str, Any]], refined: Refined) -> dict[str, Any]:
     """component.json."""
-    solution = refined.solution
+    names = ("error_before", "error_after", "iterations", "converged", "reason")
     return {
         "drives": drives,
         "joins": joins,
-        "solution": {
-            "error_before": solution.error_before,
-            "error_after": solution.error_after,
-            "iterations": solution.iterations,
-            "converged": solution.converged,
-            "reason": solution.reason,
-        },
+        "solution": {name: getattr(refined.solution, name) for name in names},
         "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
         "made_from": group.key,
     }
@@ -211,7 +199,8 @@ def solve_groups(
     folder, solved = store.root / "joint", []
     for done, group in enumerate(groups):
         execution.progress("solve together", done, len(groups))
-        if not _is_there(folder, known.get(group.key)):
+        components = known.get(group.key, {}).get("components")
+        if components is None or not all((folder / one["folder"] / "component.json").is_file() for one in components):
             known[group.key] = _solved(store, group, pipeline, drives.library)
         solved.append(known[group.key])
     execution.progress("solve together", len(groups), len(groups))
@@ -235,12 +224,6 @@ def _joint(store: Store) -> dict[str, Any]:
         raise
     except VplogError:  # damaged: it is written again
         return {}
-
-
-def _is_there(folder: Path, known: dict[str, Any] | None) -> bool:
-    return known is not None and all(
-        (folder / component["folder"] / "component.json").is_file() for component in known["components"]
-    )
 
 
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:

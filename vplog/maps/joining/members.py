@@ -46,6 +46,13 @@ if TYPE_CHECKING:
 _BLOCK = 16
 """Keyframes extracted together where one was not announced: its neighbours are needed next, and to read a log again
 costs as much as several."""
+_CAMERA: dict[str, Callable[[Any], Any]] = {
+    "name": str, "distortion_model": str, "width": int, "height": int, "disparity_zero_px": float, "baseline_m": float,
+    "matrix": lambda rows: np.array(rows, np.float64).reshape(3, 3),
+    "distortion": lambda values: np.array(values, np.float64).reshape(-1),
+    "body_from_camera": lambda rows: np.array(rows, np.float64).reshape(4, 4),
+}  # fmt: skip
+"""Fields of a camera, from plain values."""
 _FRONT = ("keyframes", "features", "stereo", "places")
 """Settings that a drive's keyframes, features and places depend on; what follows them is not asked for here."""
 
@@ -253,17 +260,7 @@ class ReextractedFeatures:
 def camera_from(values: dict[str, Any]) -> Camera:
     """The camera of plain values. Raises ResultError where the values are not one."""
     try:
-        matrix, body_from_camera = values["matrix"], np.array(values["body_from_camera"], np.float64).reshape(4, 4)
-        return Camera(
-            name=str(values["name"]),
-            matrix=None if matrix is None else np.array(matrix, np.float64).reshape(3, 3),
-            distortion_model=str(values["distortion_model"]),
-            distortion=np.array(values["distortion"], np.float64).reshape(-1),
-            width=int(values["width"]),
-            height=int(values["height"]),
-            body_from_camera=body_from_camera,
-            baseline_m=None if values["baseline_m"] is None else float(values["baseline_m"]),
-            disparity_zero_px=float(values["disparity_zero_px"]),
-        )
+        known = {name: kind(values[name]) for name, kind in _CAMERA.items() if values[name] is not None}
+        return Camera(**{"matrix": None, "baseline_m": None, **known})
     except (KeyError, TypeError, ValueError) as error:
         raise ResultError(f"A camera in MAP/joins is damaged: {error}. Move that folder away, and run again.") from None

@@ -111,9 +111,8 @@ def _footer_hash(path: Path) -> str:
             stream.seek(size - 8 - length)
             return hashlib.sha256(stream.read(length)).hexdigest()
     except OSError as error:
-        raise ResultError(
-            f"{path} cannot be read: {error.strerror or error}. Check its permissions, or {ADD_AGAIN}"
-        ) from None
+        why = error.strerror or error
+        raise ResultError(f"{path} cannot be read: {why}. Check its permissions, or {ADD_AGAIN}") from None
 
 
 def _open_all(store: Store, state: CodedState) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
@@ -157,18 +156,15 @@ def _plan(
     """Which parts are put into new ones, and the drives of each new one, in order of IDs."""
     absorbed, total = [], sum(places[one] for one in missing)
     for part in sorted(parts, key=lambda part: part.places):
-        mostly_gone = 2 * part.places < len(part.segment)
-        small = part.places <= min(total, CAPACITY // 2)
-        if mostly_gone or small:
+        if 2 * part.places < len(part.segment) or part.places <= min(total, CAPACITY // 2):  # mostly gone, or small
             absorbed.append(part)
             total += part.places
             counts = np.diff(part.segment.first).tolist()
             alive = zip(part.segment.contents, counts, part.numbers.tolist(), strict=True)
             places |= {one: count for one, count, number in alive if number >= 0}
-    groups: list[list[Content]] = []
-    held = CAPACITY + 1
+    groups, held = list[list[Content]](), 0
     for one in sorted(places):
-        if held + places[one] > CAPACITY:
+        if not groups or held + places[one] > CAPACITY:
             groups.append([])
             held = 0
         groups[-1].append(one)
@@ -213,13 +209,9 @@ def read_column(store: Store, drive: str, state: PlaceState) -> pa.Array:
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:
-    """Who has them open keeps them. A file that cannot be removed does no harm."""
-    parts = list(store.index.glob(".*.part"))
-    for path in [*paths, *parts]:
-        try:
-            if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
+    """Remove segments, and parts of writers that were killed. Who has a file open keeps it, and one that cannot be
+    removed does no harm."""
+    for path in [*paths, *store.index.glob(".*.part")]:
+        with suppress(OSError):  # its writer has just renamed it, or it is a folder
+            if path.suffix != ".part" or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
                 path.unlink(missing_ok=True)
-        except (FileNotFoundError, IsADirectoryError):  # whoever wrote it has just renamed it; or it is none of ours
-            continue
-        except OSError:
-            return

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import SettingsError
-from vplog.maps.storage.layout import HASH, sha256_of
+from vplog.maps.storage.layout import HASH, link, sha256_of
 from vplog.storage.remote_path import s3_place
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Cache:
         try:
             part.unlink(missing_ok=True)
             os.utime(cached)
-            _link(cached, part)
+            link(cached, part)
             if sha256_of(part) == digest:
                 part.replace(target)
                 return True
@@ -75,7 +75,7 @@ class Cache:
 
     def keep(self, digest: str, source: Path) -> None:
         """Keep a file that has this sha256. Where that fails it is fetched again another time."""
-        _replace(self.root / "objects" / digest, lambda part: _link(source, part))
+        _replace(self.root / "objects" / digest, lambda part: link(source, part))
 
     def take_library(self, digest: str, target: Path) -> bool:
         """Link the files of a library into a folder; False where one is missing."""
@@ -163,13 +163,3 @@ def _users() -> Path | None:
         return Path.home() / ".cache" / "vplog"
     except RuntimeError:  # a user without a home
         return None
-
-
-def _link(source: Path, target: Path) -> None:
-    """One file under two names; a copy where the file system has no such links. Raises OSError."""
-    try:
-        os.link(source, target)
-    except FileNotFoundError:
-        raise
-    except OSError:
-        shutil.copyfile(source, target)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import PurePath
@@ -80,6 +82,18 @@ def write_changed(path: Path, record: dict[str, Any], checksum: bool = True) -> 
         pass
     run_record.write_run_json(path, record, checksum=checksum)
     return True
+
+
+def link(source: str | Path, target: str | Path) -> str | Path:
+    """Give a file a second name, or copy it where the file system has no hard links; the name. No writer of a map
+    changes a file, each replaces it. Raises OSError."""
+    try:
+        os.link(source, target)
+    except FileNotFoundError:
+        raise
+    except OSError:
+        shutil.copyfile(source, target)
+    return target
 
 
 def sha256_of(path: Path) -> str:
