@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from vplog.batch.batch import Drive
+    from vplog.batch.worker import Drive
     from vplog.benchmark.compare import Comparison
     from vplog.execution.execution import Progress
     from vplog.execution.process_pool import OwnProcesses
@@ -334,6 +334,7 @@ def batch(
         )
     with limited(threads), drive_processes(engine, jobs, len(paths)) as processes, ExitStack() as stack:
         from vplog.batch.batch import run_batch, settings_for
+        from vplog.batch.engine import BatchOptions
 
         root = located(map)
         if pipeline is None or isinstance(pipeline, str):
@@ -341,10 +342,8 @@ def batch(
         else:
             chosen = _pipeline(pipeline, settings)
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        return run_batch(
-            paths, root, chosen, references, parts, jobs, threads, progress, engine=engine, address=address,
-            retries=retries, join=join, keep_cache=keep_cache, tell=tell, processes=processes,
-        )  # fmt: skip
+        options = BatchOptions(jobs, engine, address, retries, processes, join, keep_cache, tell)
+        return run_batch(paths, root, chosen, references, parts, Execution(threads, progress), options)
 
 
 @contextmanager
@@ -404,18 +403,16 @@ class Map:
         engine, address: who searches, as in `batch`.
         cache, cache_gb: folder and size of the cache of a map by URL.
         """
-        from vplog.batch.engine import opened
-        from vplog.maps.search.query import query_map
+        from vplog.batch.engine import BatchOptions, opened
+        from vplog.maps.search.query import MapQuery, query_map
         from vplog.maps.storage.download_cache import cache_in
         from vplog.storage.remote_path import RemotePath, located
 
         threads = threads or available()
         downloads = cache_in(cache, cache_gb) if isinstance(self.place, RemotePath) else None
-        with limited(threads), opened(engine, address, 1, threads) as workers:
-            found = query_map(
-                self.place, located(log), _topics(topics), top, sequence, None if out is None else located(out),
-                threads, progress, workers.executor, downloads,
-            )  # fmt: skip
+        with limited(threads), opened(BatchOptions(engine=engine, address=address), threads) as workers:
+            query = MapQuery(top, sequence, None if out is None else located(out), workers.executor, downloads)
+            found = query_map(self.place, located(log), _topics(topics), query, Execution(threads, progress))
         return Answers(found)
 
 

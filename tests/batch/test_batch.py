@@ -17,7 +17,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import duckdb
 import pytest
@@ -26,7 +26,7 @@ from mcap.writer import Writer
 
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
-from vplog.batch.engine import LocalEngine, computed
+from vplog.batch.engine import BatchOptions, LocalEngine, computed
 from vplog.batch.worker import Outcome, Task
 from vplog.demo import SMALL, make_drive
 from vplog.demo.record import IMAGE
@@ -35,7 +35,7 @@ from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store
-from vplog.maps.storage.drive_ids import drive_names
+from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.run.reference_library import build_library
 
@@ -153,7 +153,7 @@ def test_what_is_missing_or_changed_is_done_again(
     told = run_batch(logs[:1], whole, changed)
     assert [(one["state"], one["error"]) for one in told["drives"]] == [("failed", "not now")]
     assert asked == ["drive"]
-    monkeypatch.setattr("vplog.maps.storage.drive_ids.code_hash", lambda: "other code")
+    monkeypatch.setattr("vplog.maps.storage.layout.code_hash", lambda: "other code")
     assert run_batch(logs, whole, pipeline)["failed"] == 2
     assert asked[1:] == ["drive", "drive-2"]
     assert {**files(whole), "map.json": 0, "failures.json": 0}.keys() == {
@@ -194,7 +194,7 @@ def test_a_damaged_drive_is_computed_again_and_stops_no_other(
     said = [*told["warnings"], *(told["joined"] or {}).get("warnings", [])]
     if damage in ("gone", "record"):  # the other damages are found by who reads the file
         assert sum("drive-2 is damaged and left out" in line for line in said) == 1
-    told = run_batch(logs, root, pipeline, join=False)
+    told = run_batch(logs, root, pipeline, options=BatchOptions(join=False))
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged"), ("drive-2", "failed")]
     assert asked == ["drive-2"]
     assert any("drive-2 is damaged and left out" in line for line in told["warnings"])
@@ -282,7 +282,8 @@ def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path:
     })  # fmt: skip
     topics, pipeline = TopicChoice(), load_pipeline("default")
     tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
-    ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in computed(engine, tasks, 2, 2)}
+    found = computed(cast("LocalEngine", engine), tasks, BatchOptions(2))
+    ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in found}
     assert ended == {
         "unlucky": ("", 3),
         "bad": ("No such topic.", 1),
@@ -316,7 +317,7 @@ def computed_by(
     engine = LocalEngine(processes, 1)
     monkeypatch.setattr(engine, "start", lambda _: processes.submit(function, *args))
     task = Task("drive", "log", Path(), Path(), load_pipeline("default"), TopicChoice(), 1, {})
-    [(_, outcome, _)] = computed(engine, [task], 1, 0)
+    [(_, outcome, _)] = computed(engine, [task], BatchOptions(1, retries=0))
     return outcome
 
 
@@ -399,7 +400,9 @@ def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path
     cut, again = tmp_path / "cut.mcap", tmp_path / "again.mcap"
     for bad in (cut, again):
         bad.write_bytes(logs[0].read_bytes()[:200])
-    told = run_batch([moved, logs[0], cut, again], root, load_pipeline("default", QUICK), join=False)
+    told = run_batch(
+        [moved, logs[0], cut, again], root, load_pipeline("default", QUICK), options=BatchOptions(join=False)
+    )
     assert (told["failed"], len(told["warnings"])) == (2, 1)
     told["drives"] = told["drives"][:2]
     # the path decides which is the known one, so the copy is another drive
@@ -433,8 +436,8 @@ def test_a_join_that_fails_takes_no_fates_along(
     assert "bad: failed, 0.0 s: " in said.err
     assert "1 of 3 drives failed" in said.err
     assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
-    monkeypatch.setattr("vplog.maps.storage.drive_ids.code_hash", lambda: "other code")
-    found = run_batch([bad], root, load_pipeline("default", QUICK), join=False)
+    monkeypatch.setattr("vplog.maps.storage.layout.code_hash", lambda: "other code")
+    found = run_batch([bad], root, load_pipeline("default", QUICK), options=BatchOptions(join=False))
     assert "Another version of vplog or its packages made 2 of the drives" in found["warnings"][0]
 
 
@@ -503,12 +506,12 @@ def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:
 def test_engines_that_are_not_there_are_said(logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = load_pipeline("default", QUICK)
     with pytest.raises(SettingsError, match="Engines: local, ray"):
-        run_batch(logs, tmp_path / "map", pipeline, engine="slurm")
+        run_batch(logs, tmp_path / "map", pipeline, options=BatchOptions(engine="slurm"))
     with pytest.raises(SettingsError, match="Add --engine ray"):
-        run_batch(logs, tmp_path / "map", pipeline, address="10.0.0.1:6379")
+        run_batch(logs, tmp_path / "map", pipeline, options=BatchOptions(address="10.0.0.1:6379"))
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(SettingsError, match=r"pip install 'vplog\[ray\]'"):
-        run_batch(logs, tmp_path / "map", pipeline, engine="ray")
+        run_batch(logs, tmp_path / "map", pipeline, options=BatchOptions(engine="ray"))
 
 
 def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from vplog.batch import log_hashes
 from vplog.batch.log_hashes import known_hashes
+from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
 from vplog.logs.formats.mcap_file import MAGIC
 from vplog.results.run_record import read_run_json
@@ -44,7 +45,7 @@ def logs(tmp_path: Path) -> dict[str, Path]:
 
 
 def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dict[str, str]], dict[str, str]]:
-    return known_hashes(logs, TopicChoice.model_validate(beside), record, 2)
+    return known_hashes(logs, TopicChoice.model_validate(beside), record, Execution(2))
 
 
 def log(text: str) -> bytes:
@@ -188,6 +189,6 @@ def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatc
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        known_hashes({"large": large}, TopicChoice(), tmp_path / ".inputs.json", 2, interrupt)
+        known_hashes({"large": large}, TopicChoice(), tmp_path / ".inputs.json", Execution(2, interrupt))
     assert told[-1][0] == "check (MB)"
     assert 0 < told[-1][1] < told[-1][2] == 10**7

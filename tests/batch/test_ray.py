@@ -20,6 +20,7 @@ import pytest
 from tests.batch.test_batch import OPTIONS, QUICK, TINY, tables
 from vplog.batch import ray_cluster, ray_engine
 from vplog.batch.batch import run_batch
+from vplog.batch.engine import BatchOptions
 from vplog.batch.ray_cluster import Head
 from vplog.batch.ray_engine import translated
 from vplog.demo import SMALL, make_drive
@@ -56,7 +57,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def alone(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map that four jobs on this machine make."""
     root = tmp_path_factory.mktemp("alone") / "map"
-    assert run_batch(logs, root, load_pipeline("default", SETTINGS), jobs=4, threads=4)["failed"] == 1
+    told = run_batch(logs, root, load_pipeline("default", SETTINGS), None, None, Execution(4), BatchOptions(4))
+    assert told["failed"] == 1
     return root
 
 
@@ -105,7 +107,8 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     killed: list[int] = []
     watch = threading.Thread(target=kill_one_at_work, args=(places, killed), daemon=True)
     watch.start()
-    told = run_batch([first_log, bad_log, second_log], root, pipeline, library, engine="ray", address=cluster.address)
+    options = BatchOptions(engine="ray", address=cluster.address)
+    told = run_batch([first_log, bad_log, second_log], root, pipeline, library, options=options)
     watch.join(300)
     assert killed
     assert [one["state"] for one in told["drives"]] == ["computed", "failed", "computed"], told
@@ -116,7 +119,9 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     assert json.loads((root / "failures.json").read_text())["bad"]["attempts"] == bad["attempts"]
     assert all(one["peak_memory_mb"] > 50 for one in (first, second))
 
-    told = run_batch([first_log, second_log, long_log], root, pipeline, engine="ray", address=cluster.address)
+    told = run_batch(
+        [first_log, second_log, long_log], root, pipeline, options=BatchOptions(engine="ray", address=cluster.address)
+    )
     assert [one["state"] for one in told["drives"]] == ["unchanged", "unchanged", "computed"]
     stages = read_run_json(root / "runs" / "drive=third" / "run.json")["stages"]
     assert stages["extract"]["parts"] == stages["extract"]["parts_reused"] >= 2
@@ -127,7 +132,7 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     monkeypatch.setattr(ray_engine, "_PROBE_S", 600.0)  # a machine that is slow to tell is not refused here
     monkeypatch.setattr(ray_engine, "made_by", lambda: {"code": "other", "versions": {}})
     with pytest.raises(SettingsError, match="has vplog's code"):
-        run_batch(logs, root, pipeline, engine="ray", address=cluster.address)
+        run_batch(logs, root, pipeline, options=BatchOptions(engine="ray", address=cluster.address))
 
 
 def test_a_cluster_that_wants_a_token_or_has_no_cpus_is_said(
@@ -138,10 +143,10 @@ def test_a_cluster_that_wants_a_token_or_has_no_cpus_is_said(
     with monkeypatch.context() as environment:
         environment.delenv("RAY_AUTH_MODE")
         with pytest.raises(SettingsError, match=r"wants its token\. Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN"):
-            run_batch([], tmp_path / "map", pipeline, engine="ray", address=address)
+            run_batch([], tmp_path / "map", pipeline, options=BatchOptions(engine="ray", address=address))
     monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": True, "Resources": {"memory": 1e9}}])
     with pytest.raises(SettingsError, match="No machine of the Ray cluster has CPUs"):
-        run_batch([], tmp_path / "map", pipeline, engine="ray", address=address)
+        run_batch([], tmp_path / "map", pipeline, options=BatchOptions(engine="ray", address=address))
 
 
 @pytest.mark.parametrize(
@@ -191,7 +196,9 @@ def test_a_killed_batch_leaves_no_workers_behind_and_goes_on(logs: list[Path], a
         while left := workers_of(place):
             assert time.monotonic() < ended, left
             time.sleep(0.1)
-    told = run_batch(logs[:1], root, load_pipeline("default", SETTINGS), jobs=2, threads=2, join=False)
+    told = run_batch(
+        logs[:1], root, load_pipeline("default", SETTINGS), None, None, Execution(2), BatchOptions(2, join=False)
+    )
     assert told["failed"] == 0
     assert tables(root) == {
         name: digest
@@ -219,7 +226,7 @@ def test_an_address_without_a_cluster_is_said_soon(tmp_path: Path, monkeypatch: 
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         with pytest.raises(SettingsError, match=f"No Ray cluster answers at 127.0.0.1:{port}"):
-            run_batch([], tmp_path / "map", pipeline, engine="ray", address=f"127.0.0.1:{port}")
+            run_batch([], tmp_path / "map", pipeline, options=BatchOptions(engine="ray", address=f"127.0.0.1:{port}"))
     for address, why in ((f"127.0.0.1:{port}", "No Ray cluster answers"), ("ray://head:10001", "HOST:PORT")):
         with pytest.raises(SettingsError, match=why):
-            run_batch([], tmp_path / "map", pipeline, engine="ray", address=address)
+            run_batch([], tmp_path / "map", pipeline, options=BatchOptions(engine="ray", address=address))

@@ -104,7 +104,7 @@ def write_drive(store: Store, first: int, places: Places, state: BobbState) -> N
 
 
 def _parts(store: Store, state: BobbState, threads: int) -> list[Part]:
-    return update_index(store, store.drives(), state.hash, state, threads)[0]
+    return update_index(store, store.drives(), state, Execution(threads))[0]
 
 
 def _building(store: Store, state: BobbState, count: int, threads: int) -> Figure:
@@ -150,7 +150,7 @@ def are_exact(store: Store, state: BobbState, parts: Sequence[Part], asked: list
             rows = np.lexsort((np.arange(len(scores)), -scores))[:BEST]
             more = [(-float(scores[row]), number, int(row)) for row in rows if scores[row] > 0]
             best[at] = sorted(best[at] + more)[:BEST]
-    found = best_places(parts, state, asked, BEST, 1)
+    found = best_places(parts, state, asked, BEST, Execution())
     columns = (-found.score, found.drive, found.keyframe)
     told = [list(zip(*(part[at].tolist() for part in columns), strict=True)) for at in range(len(asked))]
     return told == best
@@ -166,14 +166,14 @@ def _cold(store: Store, state: BobbState, asked: list[Place]) -> float:
                 os.fsync(stream.fileno())
                 os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         parts = _parts(store, state, 1)
-        spent.append(wall(lambda v=view, p=parts: best_places(p, state, [v], BEST, 1)))
+        spent.append(wall(lambda v=view, p=parts: best_places(p, state, [v], BEST, Execution())))
         del parts
     return round(1000 * statistics.median(spent), 1)
 
 
 def _searching(state: BobbState, parts: list[Part], asked: list[Place], threads: int, told: dict[str, Any]) -> Figure:
     def one(view: Place, cores: int) -> None:
-        best_places(parts, state, [view], BEST, cores)
+        best_places(parts, state, [view], BEST, Execution(cores))
 
     count = sum(part.places for part in parts)
     with one_thread():
@@ -181,8 +181,8 @@ def _searching(state: BobbState, parts: list[Part], asked: list[Place], threads:
             one(view, 1)
         alone = [seconds(lambda v=view: one(v, 1)) for view in asked]
         on_all = [wall(lambda v=view: one(v, threads)) for view in asked]
-        together = seconds(lambda: best_places(parts, state, asked, BEST, 1))
-        together_on_all = [wall(lambda: best_places(parts, state, asked, BEST, threads)) for _ in range(3)]
+        together = seconds(lambda: best_places(parts, state, asked, BEST, Execution()))
+        together_on_all = [wall(lambda: best_places(parts, state, asked, BEST, Execution(threads))) for _ in range(3)]
     facts = {
         "places": count,
         "one_thread_ms": round(1000 * statistics.median(alone), 2),

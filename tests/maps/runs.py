@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from tests.results.example import COUNT, make_run
 from vplog.geometry import tum
-from vplog.maps.storage import drive_ids, map_store
+from vplog.maps.storage import layout, map_store
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def write_run(
     run_record.write_run_json(folder / "run.json", {"finished": True, "settings": {"seed": seed}, "gps": gps})
     made_from = {"drive": drive, "inputs": {"log": f"sha256 of {seed}"}, "library": library, "topics": {}}
     log = f"/logs/{seed}/{drive.partition('-')[0]}.mcap"
-    run_record.write_run_json(folder / "drive.json", {**made_from, "key": drive_ids.key_of(made_from), "log": log})
+    run_record.write_run_json(folder / "drive.json", {**made_from, "key": layout.key_of(made_from), "log": log})
     return folder
 
 

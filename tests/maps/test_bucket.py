@@ -20,7 +20,8 @@ from tests.maps.runs import LIBRARY, PLACES, make_map, put, put_library, seeds
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.info import describe_map
 from vplog.maps.storage import lease_lock, map_store, objects, remote_map, upload
-from vplog.maps.storage.damage import UnreachableError, without_damaged
+from vplog.maps.storage.contents import without_damaged
+from vplog.maps.storage.damage import UnreachableError
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 from tests.maps.runs import LIBRARY, OTHER_LIBRARY, make_map, put, seeds
 from vplog.errors import ResultError
 from vplog.maps.merge import merge_maps
-from vplog.maps.storage import drive_ids, map_store
+from vplog.maps.storage import layout, map_store
 from vplog.results import run_record
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def test_drives_come_as_they_are_and_those_whose_name_is_taken_get_a_number(verb
     for drive, record in store.drives().items():
         assert set(pq.read_table(store.run(drive) / "keyframes.parquet")["drive"].to_pylist()) == {drive}
         made_from = {name: record[name] for name in ("drive", "inputs", "library", "topics")}
-        assert record["key"] == drive_ids.key_of(made_from), (
+        assert record["key"] == layout.key_of(made_from), (
             "which is that of a batch, so that it leaves the drive as it is"
         )
     assert "6 drives" not in verb("map", "info", both).out

@@ -17,7 +17,8 @@ from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.search.index import update_index
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import damaged_files, left_out, without_damaged
+from vplog.maps.storage.contents import left_out, without_damaged
+from vplog.maps.storage.damage import damaged_files
 from vplog.maps.storage.layout import drive_record
 from vplog.maps.storage.map_store import Store, folder_name
 from vplog.pipeline import load_pipeline
@@ -199,7 +200,7 @@ def test_an_index_is_made_of_the_sound_drives(tmp_path: Path) -> None:
     flip(store.file(drives[1], "descriptors.parquet"))
 
     def update() -> list[Any]:
-        return update_index(store, store.drives(), state.hash, state)[0]
+        return update_index(store, store.drives(), state)[0]
 
     parts = without_damaged(store, update)
     assert list(store.damaged) == [drives[1]]

@@ -188,7 +188,7 @@ def test_no_flip_in_a_part_of_an_index_is_silent(tmp_path: Path) -> None:
     settings = BobbSettings(references=4, windows_along=2)
     state, store = made_up_library(settings, 30), Store(tmp_path)
     write_drive(store, 0, make_places(40, settings, 0, 30, 40), state)
-    [part], _ = update_index(store, store.drives(), state.hash, state)
+    [part], _ = update_index(store, store.drives(), state)
     assert part.path is not None
     assert silent(part.path, open_segment, 0) == []
 

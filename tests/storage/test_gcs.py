@@ -15,7 +15,7 @@ from vplog.errors import ResultError
 from vplog.maps.storage import map_store, objects
 from vplog.storage import gcs
 from vplog.storage.gcs import google_file_system, plain
-from vplog.storage.remote_path import google_system, local_copy, local_output, located
+from vplog.storage.remote_path import google_system, local_copy, local_output, located, names_below
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -74,10 +74,10 @@ def test_a_folder_comes_back_as_it_went(server: str, tmp_path: Path) -> None:
     with local_copy(place) as copy:
         assert {str(file.relative_to(copy)): file.read_bytes() for file in copy.rglob("*") if file.is_file()} == files
     assert [path.name for path in place.iterdir()] == ["a", "deep", "run.json"]
-    assert objects.folders_in(place) == ["deep"]
+    assert [name for name, below in names_below(place).items() if below] == ["deep"]
     objects.remove(place / "deep")
-    assert objects.names_in(place) == ["a", "run.json"]
-    assert objects.names_in(place / "none") == []
+    assert sorted(names_below(place)) == ["a", "run.json"]
+    assert not names_below(place / "none")
 
 
 def test_a_map_grows_and_shrinks(server: str) -> None:

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
-from vplog.batch.worker import Outcome, Task, compute_drive
+from vplog.batch.worker import Drive, Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
-    T = TypeVar("T")
+    from vplog.batch.ray_engine import RayEngine
+
+    Engine: TypeAlias = "LocalEngine | RayEngine"
 
 ENGINES = ("local", "ray")
 RETRIES = 2
@@ -24,77 +27,51 @@ RETRIES = 2
 _KILLED = "Its process was killed, as for want of memory. Make room or use fewer --jobs, and run again."
 
 
-class Engine(Protocol):
-    """Computes drives elsewhere and brings their run folders here."""
+@dataclass(frozen=True)
+class BatchOptions:
+    """Who computes the drives of a batch, and what is done beside. The map depends on `join` alone."""
 
-    @property
-    def executor(self) -> Executor | None:
-        """Runs functions of modules on other machines, a core each; None where there are none. A future raises
-        BrokenExecutor, with one line, where process or machine died, so that the same may end well another time."""
-        ...
-
-    @property
-    def cores(self) -> int:
-        """Of all machines together."""
-        ...
-
-    @property
-    def widest(self) -> int:
-        """Cores of the largest machine: one drive runs on one."""
-        ...
-
-    def at_once(self, threads: int) -> int:
-        """Drives with so many threads each that keep it busy."""
-        ...
-
-    def start(self, task: Task) -> Future[Outcome]:
-        """Begin a drive."""
-        ...
-
-    def helpers(self, threads: int) -> Executor | None:
-        """For tasks of so many threads that read and write the map; None where they are done here as fast."""
-        ...
-
-    def take(self, task: Task, outcome: Outcome) -> None:
-        """Have the finished run folder in `task.folder`. Raises BrokenExecutor where it is lost, ResultError."""
-        ...
+    jobs: int | None = None
+    """Drives at once: one on this machine where not given, over Ray as many as it has cores for."""
+    engine: str = "local"
+    address: str | None = None
+    """HOST:PORT of a Ray cluster; None: one of this machine for the time of the batch."""
+    retries: int = RETRIES
+    processes: OwnProcesses | None = None
+    """Those of this machine that the caller has begun; else there is one more than `jobs`."""
+    join: bool = True
+    """Whether closures join what the map has at the end."""
+    keep_cache: bool = False
+    """Whether results of stages stay in MAP/.cache, so that other settings do not need the images again."""
+    tell: Callable[[Drive], None] = lambda _: None
+    """Called with each drive as it ends."""
 
 
 @contextmanager
-def opened(
-    name: str,
-    address: str | None,
-    jobs: int,
-    threads: int,
-    folder: Path | None = None,
-    processes: OwnProcesses | None = None,
-) -> Iterator[Engine]:
-    """The engine of this name, for a writer of a map with this folder; what it started ends with the block.
-
-    `processes` are those of this machine that a caller has begun; there is one more than `jobs` otherwise. Raises
-    SettingsError where there is no such engine.
-    """
-    if name not in ENGINES:
-        raise SettingsError(f"No engine {name!r}. Engines: {', '.join(ENGINES)}.")
-    if name == "ray":
+def opened(options: BatchOptions, threads: int, folder: Path | None = None) -> Iterator[Engine]:
+    """The engine of these options, for a writer of a map with this folder; what it started ends with the block. Raises
+    SettingsError where there is no such engine."""
+    if options.engine not in ENGINES:
+        raise SettingsError(f"No engine {options.engine!r}. Engines: {', '.join(ENGINES)}.")
+    if options.engine == "ray":
         from vplog.batch.ray_engine import ray_engine
 
-        with ray_engine(address, threads, folder) as engine:
+        with ray_engine(options.address, threads, folder) as engine:
             yield engine
         return
-    if address is not None:
-        raise SettingsError(f"--address {address} is that of a Ray cluster. Add --engine ray.")
-    with nullcontext(processes) if processes is not None else OwnProcesses(jobs + 1) as own:
+    if options.address is not None:
+        raise SettingsError(f"--address {options.address} is that of a Ray cluster. Add --engine ray.")
+    processes = options.processes
+    with nullcontext(processes) if processes is not None else OwnProcesses((options.jobs or 1) + 1) as own:
         yield LocalEngine(own, threads)
 
 
-def computed(
-    engine: Engine, tasks: Sequence[Task], jobs: int | None, retries: int
-) -> Iterator[tuple[Task, Outcome, int]]:
-    """Every drive when it is finished or given up, how, and at which attempt; `jobs` of them at once, where given.
+def computed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -> Iterator[tuple[Task, Outcome, int]]:
+    """Every drive when it is finished or given up, its outcome, and at which attempt.
 
     One that died is tried again when the others have had their turn: whatever it lacked may be there then.
     """
+    jobs = options.jobs or 1 if options.engine == "local" else options.jobs
     waiting = deque((task, 1) for task in tasks)
     running: dict[Future[Outcome], tuple[Task, int]] = {}
     while waiting or running:
@@ -105,7 +82,7 @@ def computed(
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             task, attempt = running.pop(future)
             outcome = _brought(engine, task, future)
-            if outcome.may_pass and attempt <= retries:
+            if outcome.may_pass and attempt <= options.retries:
                 waiting.append((task, attempt + 1))
             else:
                 yield task, outcome, attempt
@@ -145,8 +122,7 @@ class LocalEngine:
         return self._processes.submit(compute_drive, task)
 
     def helpers(self, threads: int) -> Executor | None:
-        """This process has the threads itself."""
-        return None
+        """None: this process has the threads itself."""
 
     def take(self, task: Task, outcome: Outcome) -> None:
         """No-op: the folder is local."""

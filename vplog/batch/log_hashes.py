@@ -1,4 +1,4 @@
-"""What the logs of a batch are: their sha256, which is known of those that have not changed since the last one."""
+"""sha256 of the logs of a batch, which is known of those that have not changed since the last one."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
+    from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
-
-    Progress = Callable[[str, int, int], None]
 
 NAME = ".inputs.json"
 """In the map: hidden, as it tells of the logs on this machine and nothing of the map."""
@@ -32,24 +31,24 @@ _MOST_BYTES = 10**9
 """Longest record that is read: a million logs of several files."""
 
 _TELL_EVERY_S = 0.2
-"""How often it is said how far reading has come."""
+"""Interval of progress."""
 
 Hashes = dict[str, str]
 
 
 def known_hashes(
-    logs: Mapping[str, Path], topics: TopicChoice, record: Path, threads: int, progress: Progress = lambda *_: None
+    logs: Mapping[str, Path], topics: TopicChoice, record: Path, execution: Execution
 ) -> tuple[list[Hashes], dict[str, str]]:
     """sha256 of the files of each log and of those beside it, by name, in order; by log one line where they cannot be
     read, or are no log.
 
-    A file whose length and times are those of the record, a file that is made and kept up to date, is not read. The
-    record is only to save time: one that cannot be read is made anew, one that cannot be written is done without.
-    Ctrl-C ends it within a block, and `progress` tells of MB read.
+    A file whose length and times are those of the record, a file that is made and updated here, is not read. A record
+    that cannot be read is made again, one that cannot be written is done without. Ctrl-C ends it within a block;
+    progress is in MB read.
     """
     beside = [file for file in (topics.odometry_file, topics.calibration_file) if file is not None]
     known = _read(record)
-    seen: dict[str, dict[str, Any]] = {}
+    current: dict[str, dict[str, Any]] = {}
     done, total, stop = [0] * len(logs), [0] * len(logs), Event()
 
     def one(path: Path, number: int) -> Hashes:
@@ -57,7 +56,7 @@ def known_hashes(
             return hash_inputs(path)
         name, look = str(path.absolute()), look_of(path)
         if name in known and known[name]["look"] == look:
-            seen[name] = known[name]
+            current[name] = known[name]
             return known[name]["hashes"]
 
         def read(count: int) -> None:
@@ -67,10 +66,10 @@ def known_hashes(
 
         if path not in beside:
             all_logs.check(path)  # a folder of other things may hold anything
-        asked, total[number] = time.time(), total[number] + bytes_of(path)
+        began, total[number] = time.time(), total[number] + bytes_of(path)
         hashes = hash_inputs(path, read)
-        if look_of(path) == look and changed_s(path) < asked - _SETTLED_S:
-            seen[name] = {"look": look, "hashes": hashes}
+        if look_of(path) == look and changed_s(path) < began - _SETTLED_S:
+            current[name] = {"look": look, "hashes": hashes}
         return hashes
 
     def of_log(path: Path, number: int) -> Hashes | str:
@@ -82,20 +81,22 @@ def known_hashes(
             return f"Cannot read {error.filename or path}: {error.strerror or error}."
         return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, path, number) for number, path in enumerate(logs.values())]
         try:
             while wait(waiting, _TELL_EVERY_S).not_done:
-                progress("check (MB)", sum(done) // 10**6, sum(total) // 10**6)
+                execution.progress("check (MB)", sum(done) // 10**6, sum(total) // 10**6)
         except BaseException:
             stop.set()
             pool.shutdown(cancel_futures=True)
             raise
         answers = dict(zip(logs, (one.result() for one in waiting), strict=True))
         if sum(done):
-            progress("check (MB)", sum(done) // 10**6, sum(done) // 10**6)
-    if any(known.get(name) != about for name, about in seen.items()):
-        _write(record, {**known, **seen})
+            execution.progress("check (MB)", sum(done) // 10**6, sum(done) // 10**6)
+    if any(known.get(name) != about for name, about in current.items()):
+        every = {name: about for name, about in sorted({**known, **current}.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
+        with suppress(ResultError):
+            write_run_json(record, every, checksum=True)
     errors = {log: answer for log, answer in answers.items() if isinstance(answer, str)}
     return [{} if isinstance(answer, str) else answer for answer in answers.values()], errors
 
@@ -112,10 +113,3 @@ def _read(record: Path) -> dict[str, dict[str, Any]]:
         return all(isinstance(part, dict) and all(isinstance(text, str) for text in part.values()) for part in parts)
 
     return {name: about for name, about in known.items() if sound(about)}
-
-
-def _write(record: Path, known: dict[str, dict[str, Any]]) -> None:
-    """Of all logs that are still there."""
-    there = {name: about for name, about in sorted(known.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
-    with suppress(ResultError):
-        write_run_json(record, there, checksum=True)

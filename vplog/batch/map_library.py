@@ -14,7 +14,7 @@ from vplog.places.reference_choice import PAPER_SIZE, evenly
 from vplog.run.reference_library import build_library, check_library
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from vplog.data import Ints
@@ -23,15 +23,13 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
 
-    Progress = Callable[[str, int, int], None]
-
 _TRIED = 8
 """Frames of a log that are decoded before it is relied on: one that does is enough."""
 
 
 def map_library(
-    store: Store, paths: Sequence[Path], given: Path | None, pipeline: Pipeline, topics: TopicChoice, threads: int,
-    progress: Progress,
+    store: Store, paths: Sequence[Path], given: Path | None, pipeline: Pipeline, topics: TopicChoice,
+    execution: Execution,
 ) -> str:  # fmt: skip
     """The hash of the map's library, which is put into the map where it has none yet.
 
@@ -53,17 +51,15 @@ def map_library(
                 f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
             )
         if known is None:
-            digest = pipeline.places.load(given, Execution(threads)).hash  # held against what it says of itself
+            digest = pipeline.places.load(given, Execution(execution.threads)).hash  # checked against its record
             try:
                 shutil.copytree(given, made, symlinks=True)
             except (OSError, shutil.Error) as error:
                 shutil.rmtree(made, ignore_errors=True)
-                told = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error
-                raise ResultError(f"Cannot copy the library {given} into {store}: {told}.") from None
+                why = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error
+                raise ResultError(f"Cannot copy the library {given} into {store}: {why}.") from None
     elif known is None:
-        digest = build_library(
-            _that_can_be_read(paths, topics), made, pipeline, topics, Execution(threads, progress)
-        ).hash
+        digest = build_library(_decodable(paths, topics), made, pipeline, topics, execution).hash
     else:
         check_library(store.library(known), pipeline)
         digest = known
@@ -74,12 +70,9 @@ def map_library(
     return digest
 
 
-def _that_can_be_read(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
-    """The first logs, as many as a library has references, without those of which no frame can be had: their own run
-    says why.
-
-    Raises LogError of the first where there is no other.
-    """
+def _decodable(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
+    """The first logs that have a frame that decodes, as many as a library has references. The others' own runs say what
+    is wrong with them. Raises the error of the first where there is none."""
     sound, first = [], None
     for path in paths:
         try:
@@ -98,15 +91,15 @@ def _that_can_be_read(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
 
 
 def _decodes(log: Log, stamps: Ints) -> bool:
-    """Whether one of a few frames does, over the whole drive. Raises LogError where none does."""
-    why: VplogError | None = None
+    """Whether one of a few frames does, over the whole drive. Raises the first error where none does."""
+    first = None
     for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
         try:
             encoded.decode()
         except VplogError as error:
-            why = why or error
+            first = first or error
         else:
             return True
-    if why is not None:
-        raise why
+    if first is not None:
+        raise first
     return False

@@ -28,7 +28,7 @@ _ANSWER_S = 30.0
 _LOST_S = 30.0
 """Until a head that takes no connections counts as lost. Ray ends this process after twice that."""
 _RAY_WAITS = "RAY_gcs_rpc_server_reconnect_timeout_s"
-"""What sets for how long Ray waits, as for a head that starts again by itself."""
+"""Environment variable: for how long Ray waits, as for a head that starts again by itself."""
 _ENVIRONMENT = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Of workers, as cli.py has it for the batch itself: another number of BLAS threads could give other last bits."""
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
@@ -86,8 +86,8 @@ class Head:
     def watch(self, ended: threading.Event) -> None:
         """Until the end. A head that was never reached this way is not missed."""
         heard, place = float("inf"), self._address.rpartition(":")
-        told = os.environ.get(_RAY_WAITS, "")
-        patience_s = max(_LOST_S, int(told) / 2 if told.isdecimal() else 0)
+        wait = os.environ.get(_RAY_WAITS, "")
+        patience_s = max(_LOST_S, int(wait) / 2 if wait.isdecimal() else 0)
         while not ended.wait(_LOST_S / 10):
             with suppress(OSError, ValueError):
                 socket.create_connection((place[0].strip("[]"), int(place[2])), _CONNECT_S).close()
@@ -183,7 +183,7 @@ def _connect(ray: Any, address: str, **more: Any) -> None:
     except BaseException as error:  # of many kinds, by what is wrong and by version; the end of this process is one
         what = "start a Ray cluster here" if address == "local" else f"join the Ray cluster at {address}"
         if getattr(error, "code", None) == signal.SIGTERM and callable(ends):
-            ends(signal.SIGTERM, None)  # Ray's own handler was asked in place of ours
+            ends(signal.SIGTERM, None)  # Ray's own handler was called in place of ours
         text = " ".join(str(error).split())[:400] or type(error).__name__
         raise SettingsError(f"Cannot {what}: {text}") from None
     finally:

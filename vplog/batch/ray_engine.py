@@ -1,33 +1,39 @@
 """A Ray cluster as the engine of a batch: drives as Ray tasks, on machines that share nothing but the logs.
 
 The library goes once into Ray's object store, and from there once to each machine. A drive's run folder is made on the
-worker's own disk and comes back in pieces. This module is imported where Ray is asked for.
+worker's own disk and comes back in pieces. This module is imported only with `--engine ray`, and by Ray's workers.
 """
 
 from __future__ import annotations
 
+import platform
 import secrets
 from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import vplog
 from vplog.batch.ray_cluster import connected, watched_head
-from vplog.batch.worker import Outcome, Task, made_by
+from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
-from vplog.run.feature_extraction import missing_parts, parts_of
+from vplog.results import run_record
+from vplog.run.feature_extraction import compute_part, missing_parts, parts_of, put_part
+from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
-from vplog.storage.scratch import packed, write_pieces
+from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from vplog.batch.ray_cluster import Head
-    from vplog.batch.ray_tasks import RemoteOutcome
     from vplog.run.feature_extraction import Part
+    from vplog.storage.scratch import Bytes
 
+    Files = tuple[tuple[str, tuple[Any, ...]], ...]
+
+_OTHER = "{} has another vplog, or other packages, than the machine of the batch. Install the same there."
 _PROBE_S = 60.0
 """Until the machines of a cluster have told what they run; a slower one is asked again with each drive."""
 _DRIVE_BYTES = 2**30
@@ -52,28 +58,28 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
 
 
 class RayEngine:
-    """The cluster that this process is connected to."""
+    """The cluster that this process is connected to; it computes drives elsewhere and brings their run folders here."""
 
     def __init__(self, ray: Any, head: Head, is_ours: bool) -> None:
-        from vplog.batch import ray_tasks
-
-        self._is_ours = is_ours
-        self._ray, self._head, self._tasks, self._shares_disk = ray, head, ray_tasks, False
-        self.executor = RayExecutor(ray, head, ray_tasks.call)
+        self._ray, self._head, self._is_ours, self._shares_disk = ray, head, is_ours, False
+        self.executor = RayExecutor(ray, head)  # a core each
         # a process of its own for each drive, so that memory is given back
-        self._drive = ray.remote(max_calls=1, max_retries=0)(ray_tasks.call)
-        self._part = ray.remote(num_cpus=1)(ray_tasks.compute_remote_part)
+        self._drive = ray.remote(max_calls=1, max_retries=0)(call)
+        self._part = ray.remote(num_cpus=1)(compute_remote_part)
         self._library: tuple[Path, Any] | None = None
 
     @property
     def cores(self) -> int:
+        """Cores of all machines together."""
         return max(int(sum(self._of_nodes("CPU"))), 1)
 
     @property
     def widest(self) -> int:
+        """Cores of the largest machine: one drive runs on one."""
         return max(int(max(self._of_nodes("CPU"))), 1)
 
     def at_once(self, threads: int) -> int:
+        """Drives with so many threads each that keep it busy."""
         return max(sum(int(cores) // threads for cores in self._of_nodes("CPU")), 1)
 
     def start(self, task: Task) -> Future[Outcome]:
@@ -86,7 +92,7 @@ class RayEngine:
         if self._is_ours:  # nobody else's tasks are there, and the system shares out the cores, the last drive has all
             task = replace(task, threads=self.widest)
         parts = self._parts(task) if task.in_parts and self.cores > self.widest else []
-        return self.executor.follow(drive.remote(self._tasks.compute_remote_drive, task, self._library[1], parts))
+        return self.executor.follow(drive.remote(compute_remote_drive, task, self._library[1], parts))
 
     def _parts(self, task: Task) -> list[tuple[Part, Any]]:
         """The parts of a drive that are to be extracted, and the task of each, which gives its bytes."""
@@ -98,7 +104,7 @@ class RayEngine:
         return [(part, self._part.remote(part, wanted)) for part in missing]
 
     def take(self, task: Task, outcome: Outcome) -> None:
-        """Write the files from their pieces."""
+        """Write the run folder from its pieces. Raises BrokenExecutor where they are lost, and ResultError."""
         remote = cast("RemoteOutcome", outcome)
         places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
         for folder, files in places:
@@ -109,13 +115,13 @@ class RayEngine:
         """Tasks over all machines, if each of them sees the map."""
         if not self._shares_disk or self._head.is_lost:
             return None
-        return RayExecutor(self._ray, self._head, self._tasks.call, min(threads, self.widest))
+        return RayExecutor(self._ray, self._head, min(threads, self.widest))
 
     def look_for(self, folder: Path) -> None:
         """Whether all machines see a folder of this one."""
-        sign, content = folder / "seen", secrets.token_hex(16)
+        sign, content = folder / "visible", secrets.token_hex(16)
         sign.write_text(content, encoding="utf-8")
-        answers = self._on_every_node(self._tasks.is_here, str(sign), content)
+        answers = self._on_every_node(is_here, str(sign), content)
         self._shares_disk = all(self._answer(answer) is True for answer in answers)
         sign.unlink()
 
@@ -125,7 +131,7 @@ class RayEngine:
             raise SettingsError(
                 "No machine of the Ray cluster has CPUs, as with `ray start --num-cpus 0`. Add one that has some."
             )
-        own, answers = made_by(), self._on_every_node(self._tasks.about_node)
+        own, answers = made_by(), self._on_every_node(about_node)
         for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
             found, same = self._answer(answer), f"Install the same there: vplog {vplog.__version__}."
             if isinstance(found, self._ray.exceptions.RayTaskError):
@@ -133,10 +139,10 @@ class RayEngine:
             if isinstance(found, BaseException):  # it has just left
                 continue
             where, other = found
-            for name, told in {**own["versions"], "vplog's code": own["code"]}.items():
+            for name, ours in {**own["versions"], "vplog's code": own["code"]}.items():
                 theirs = {**other["versions"], "vplog's code": other["code"]}[name]
-                if theirs != told:
-                    raise SettingsError(f"{where} has {name} {theirs[:12]}, and this machine {told[:12]}. {same}")
+                if theirs != ours:
+                    raise SettingsError(f"{where} has {name} {theirs[:12]}, and this machine {ours[:12]}. {same}")
 
     def _on_every_node(self, function: Callable[..., Any], *args: Any) -> dict[Any, str]:
         """A task on every machine, whatever else it does; each with the machine's name."""
@@ -149,7 +155,7 @@ class RayEngine:
         }
 
     def _answer(self, answer: Any) -> Any:
-        """What a task gave, or its error."""
+        """The result of a task, or its error."""
         try:
             return self._ray.get(answer, timeout=_PROBE_S)
         except self._ray.exceptions.RayError as error:
@@ -172,7 +178,7 @@ class RayEngine:
 class RayExecutor(Executor):
     """Ray tasks as `concurrent.futures` has them, with so many cores each."""
 
-    def __init__(self, ray: Any, head: Head, call: Callable[..., Any], cores: int = 1) -> None:
+    def __init__(self, ray: Any, head: Head, cores: int = 1) -> None:
         self._head, self._task = head, ray.remote(num_cpus=cores)(call)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -212,3 +218,92 @@ def translated(error: BaseException) -> BaseException:
         if isinstance(error, kind):
             return BrokenExecutor(f"{text}, and run again.")
     return error
+
+
+@dataclass(frozen=True)
+class RemoteOutcome(Outcome):
+    """How an attempt ended on another machine."""
+
+    files: Files = ()
+    """Name of every file of the run folder, drive.json last, and its pieces in the object store."""
+    cache: Files = ()
+    """Those of the cache of stages, where it is wanted and the batch cannot see it."""
+
+
+def call(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Any function of a module as a Ray task."""
+    return function(*args, **kwargs)
+
+
+def about_node() -> tuple[str, dict[str, Any]]:
+    """The name of this machine, and the code and packages that it would compute with."""
+    return node_name(), made_by()
+
+
+def is_here(file: str, content: str) -> bool:
+    """Whether this machine sees a file that the batch has written."""
+    try:
+        return Path(file).read_text(encoding="utf-8") == content
+    except (OSError, ValueError):
+        return False
+
+
+def node_name() -> str:
+    """The machine, and the start of its number in the cluster: several nodes may be on one machine."""
+    import ray
+
+    return f"{platform.node()}/{ray.get_runtime_context().get_node_id()[:6]}"
+
+
+def compute_remote_part(part: Part, wanted: dict[str, Any]) -> bytes:
+    """A stretch of a drive's frames. `wanted` is what the batch computes with. Raises VplogError."""
+    if made_by() != wanted:
+        raise VplogError(_OTHER.format(node_name()))
+    return compute_part(part)
+
+
+def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tuple[Part, Any]]) -> RemoteOutcome:
+    """A drive with everything on this machine's own disk; its run folder goes into the object store.
+
+    Parts that other tasks compute are waited for, one after the other, while Ray lends out this task's cores.
+    """
+    import ray
+    from ray import exceptions
+
+    where = node_name()
+    if any(task.about[name] != value for name, value in made_by().items()):
+        return RemoteOutcome(_OTHER.format(where), worker=where)
+    try:
+        with scratch("run") as folder:
+            place, made = unpacked(library, f"library-{task.about['library']}"), folder / "run"
+            cache = task.cache or folder / "cache"
+            for part, data in parts:
+                with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here
+                    put_part(cache, part, ray.get(data))
+            outcome = compute_drive(replace(task, folder=made, library=place, cache=cache))
+            ended = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
+            if outcome.error:
+                return RemoteOutcome(**ended)
+            _name_library(made, task.library)
+            stages = _given_back(cache) if task.keep_cache and task.cache is None else ()
+            return RemoteOutcome(**ended, files=_given_back(made), cache=stages)
+    except VplogError as error:
+        return RemoteOutcome(str(error), worker=where)
+    except OSError as error:
+        why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
+        return RemoteOutcome(why, may_pass=True, worker=where)
+
+
+def _name_library(made: Path, library: Path) -> None:
+    """Let run.json of a finished run name the map's library, not this machine's copy."""
+    account = run_record.read_run_json(made / "run.json")
+    account["library"]["from"] = library_of(library)
+    run_record.write_run_json(made / "run.json", account)
+
+
+def _given_back(folder: Path) -> Files:
+    """The files of a folder as pieces in the object store, drive.json last."""
+    import ray
+
+    names = sorted(files_in(folder), key=lambda name: (name == "drive.json", name))
+    return tuple((name, tuple(ray.put(piece) for piece in pieces(folder / name))) for name in names)

@@ -1,22 +1,24 @@
-"""A map made anew with another library, from the logs of its drives."""
+"""A map described again with another library, from the logs of its drives."""
 
 from __future__ import annotations
 
 import os
 import shutil
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.batch.batch import Drive, run_batch, tell_failures
-from vplog.batch.engine import RETRIES
+from vplog.batch.batch import run_batch, write_failures
+from vplog.batch.engine import BatchOptions
+from vplog.batch.worker import Drive
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.import_places import ALONE
 from vplog.maps.merge import in_order
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import reading_drive, without_damaged
+from vplog.maps.storage.contents import without_damaged
+from vplog.maps.storage.damage import reading_drive
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
@@ -26,33 +28,20 @@ from vplog.storage.remote_path import local_copy, located
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
-    from vplog.execution.process_pool import OwnProcesses
     from vplog.maps.storage.map_store import Store
-
-    Progress = Callable[[str, int, int], None]
 
 
 def redescribe_map(
-    root: Path,
-    library: Path,
-    target: Path,
-    jobs: int | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
-    *,
-    engine: str = "local",
-    address: str | None = None,
-    retries: int = RETRIES,
-    processes: OwnProcesses | None = None,
+    root: Path, library: Path, target: Path, execution: Execution = Execution(), options: BatchOptions | None = None
 ) -> dict[str, Any]:
     """The drives of a map in a new map `target`, described with another library: one on disk, or one of a log's frames.
 
-    Settings are those of the map, and of the library how places are described; topics those of each drive. Every drive
-    is run again, as a batch runs it, from what its stages kept where that is there; one whose log is gone is said and
-    stops no other. A command that was stopped goes on. Raises VplogError.
+    Settings are those of the map, but for the library's own of places; topics those of each drive. Every drive is run
+    again, as a batch runs it, from the cache of its stages where there is one; one whose log is gone fails and stops no
+    other. A command that was stopped goes on. Raises VplogError.
     """
     if str(root.resolve()) == str(target.resolve()):
         raise SettingsError(f"{root} is given as its own target. Choose another map with -o.")
@@ -75,24 +64,21 @@ def redescribe_map(
             missing[drive] = Drive(drive, log, "failed", error=str(error))
         else:
             groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
-    with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), threads, progress) as (folder, pipeline):
+    with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), execution) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
             raise SettingsError(f"{root} is described with {library} already. Give another library.")
         for number, group in enumerate(groups.values()):
             choice = logs.TopicChoice.read(topics[group[0]] or {}, f"{root}: {group[0]}/run.json")
             paths = [located(drives[drive]["log"]) for drive in group]
-            last = number + 1 == len(groups)
-            found = run_batch(
-                paths, target, pipeline, folder, choice, jobs, threads, progress,
-                engine=engine, address=address, retries=retries, join=last, processes=processes,
-            )  # fmt: skip
+            last = replace(options or BatchOptions(), join=number + 1 == len(groups))
+            found = run_batch(paths, target, pipeline, folder, choice, execution, last)
             joined, join_error = found["joined"], found["join_error"]
             fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
         digest = read_library_record(folder)["hash"]
     fate += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
     if missing and groups:  # else there is no map yet
         with map_store.writing(target) as store:
-            tell_failures(store, {drive: lost for drive, lost in missing.items() if drive not in store.drives()})
+            write_failures(store, {drive: lost for drive, lost in missing.items() if drive not in store.drives()})
     return {
         "map": str(target),
         "from": str(root),
@@ -116,7 +102,7 @@ def _drives_of(store: Store) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]
 
 
 @contextmanager
-def _made(library: Path, pipeline: Pipeline, threads: int, progress: Progress) -> Iterator[tuple[Path, Pipeline]]:
+def _made(library: Path, pipeline: Pipeline, execution: Execution) -> Iterator[tuple[Path, Pipeline]]:
     """The folder of the library, and the settings with its own of places."""
     if not library.is_file() and (library / "library.json").exists():
         with local_copy(library) as folder:
@@ -126,16 +112,16 @@ def _made(library: Path, pipeline: Pipeline, threads: int, progress: Progress) -
         return
     with scratch("made") as made:
         folder = made / "library"
-        build_library([library], folder, pipeline, logs.TopicChoice(), Execution(threads, progress))
+        build_library([library], folder, pipeline, logs.TopicChoice(), execution)
         yield folder, pipeline
 
 
 def _bring_caches(root: Path, target: Path) -> None:
-    """What the stages of the drives kept, under their new map too, where both are folders of one file system."""
-    kept = root / ".cache"
-    if not kept.is_dir() or "://" in str(target) or (target / ".cache").exists():
+    """Link the caches of the drives' stages into their new map, where both are folders of one file system."""
+    caches = root / ".cache"
+    if not caches.is_dir() or "://" in str(target) or (target / ".cache").exists():
         return
     try:
-        shutil.copytree(kept, target / ".cache", symlinks=True, copy_function=os.link)
+        shutil.copytree(caches, target / ".cache", symlinks=True, copy_function=os.link)
     except (OSError, shutil.Error):  # it only spares work
         shutil.rmtree(target / ".cache", ignore_errors=True)

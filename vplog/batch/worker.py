@@ -1,4 +1,4 @@
-"""One drive of a batch, computed by a worker: what it is told, and what it tells."""
+"""One drive of a batch, computed by a worker: its task and its outcome."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.timing import peak_memory_mb
-from vplog.maps.storage import drive_ids
+from vplog.maps.storage import layout
 from vplog.pipeline import CacheOptions, Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.results import run_record
@@ -21,6 +21,8 @@ from vplog.run import provenance
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vplog.logs import TopicChoice
 
 
@@ -42,7 +44,7 @@ class Task:
     cache: Path | None = None
     """Where what an attempt had done stays when it ends before its time; None to keep nothing."""
     keep_cache: bool = False
-    """Whether that is wanted of a drive that is finished, too."""
+    """Whether it stays of a drive that is finished, too."""
     in_parts: bool = False
     """Whether its frames are extracted on all machines at once: it is longer than all other drives together."""
 
@@ -66,12 +68,31 @@ class Outcome:
     accepted: int = 0
     """Closures within it."""
     warnings: tuple[str, ...] = ()
-    """What the run had to say."""
+    """Those of the run, as losses of its log."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What became of one log in a batch; `seconds` to `warnings` as in the Outcome of the last attempt."""
+
+    drive: str
+    log: str
+    state: str
+    """`computed`, `unchanged` or `failed`."""
+    attempts: int = 0
+    """0 where nothing was to be done, or could be."""
+    seconds: float = 0.0
+    worker: str = ""
+    peak_memory_mb: float = 0.0
+    error: str = ""
+    keyframes: int = 0
+    accepted: int = 0
+    warnings: Sequence[str] = ()
 
 
 def made_by() -> dict[str, Any]:
     """Code and packages of this machine, as drive.json has them: a drive is computed where they are the batch's."""
-    return {"code": drive_ids.code_hash(), "versions": provenance.head(Pipeline(), Path(), 1)["versions"]}
+    return {"code": layout.code_hash(), "versions": provenance.head(Pipeline(), Path(), 1)["versions"]}
 
 
 def compute_drive(task: Task) -> Outcome:
@@ -89,7 +110,7 @@ def compute_drive(task: Task) -> Outcome:
             error = f"{task.about['log']} changed while it was read. Run again when it is complete."
         else:
             if done.keyframes.drive != task.drive:
-                drive_ids.name_keyframes(task.folder / "keyframes.parquet", task.drive)
+                layout.name_keyframes(task.folder / "keyframes.parquet", task.drive)
             run_record.write_run_json(task.folder / "drive.json", task.about)
             counts = done.record["counts"]
             found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}

@@ -21,6 +21,7 @@ from vplog.cli.parser import (
     topics_of,
 )
 from vplog.cli.printing import Progress, print_result
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,9 +35,8 @@ def export_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.export import export_map as write_map
 
     with Progress(arguments) as progress:
-        found = write_map(
-            arguments.sources, arguments.output, arguments.drive, arguments.box, arguments.format, progress
-        )
+        execution, kind = Execution(progress=progress), arguments.format
+        found = write_map(arguments.sources, arguments.output, arguments.drive, arguments.box, kind, execution)
     print_result(arguments, found, printing.print_export)
 
 
@@ -45,7 +45,7 @@ def merge_maps(arguments: argparse.Namespace) -> None:
     from vplog.maps.merge import merge_maps as merge
 
     with Progress(arguments) as progress:
-        found = merge(arguments.maps, arguments.target, progress, arguments.drive)
+        found = merge(arguments.maps, arguments.target, Execution(progress=progress), arguments.drive)
     print_result(arguments, found, printing.print_merge)
 
 
@@ -54,7 +54,7 @@ def join_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.joining.join import join_map as join
 
     with Progress(arguments) as progress:
-        found = join(arguments.map, arguments.threads, progress)
+        found = join(arguments.map, Execution(arguments.threads, progress))
     print_result(arguments, found, printing.print_joined)
 
 
@@ -68,12 +68,12 @@ def remove_drives(arguments: argparse.Namespace) -> None:
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """Copy a map to another, its drives described with another library; their logs are read again."""
     with api.drive_processes(arguments.engine, arguments.jobs) as processes, Progress(arguments) as progress:
+        from vplog.batch.engine import BatchOptions
         from vplog.batch.redescribe import redescribe_map as redescribe
 
-        found = redescribe(
-            arguments.map, arguments.library, arguments.target, arguments.jobs, arguments.threads, progress,
-            engine=arguments.engine, address=arguments.address, retries=arguments.retries, processes=processes,
-        )  # fmt: skip
+        execution = Execution(arguments.threads, progress)
+        options = BatchOptions(arguments.jobs, arguments.engine, arguments.address, arguments.retries, processes)
+        found = redescribe(arguments.map, arguments.library, arguments.target, execution, options)
     wrong = f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}."
     _end(arguments, found, printing.print_redescribed, wrong)
 
@@ -138,7 +138,7 @@ def index_map(arguments: argparse.Namespace) -> None:
 
     cache = None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)
     with Progress(arguments) as progress:
-        found = update(arguments.map, arguments.threads, progress, cache)
+        found = update(arguments.map, Execution(arguments.threads, progress), cache)
     print_result(arguments, found, printing.print_index)
 
 

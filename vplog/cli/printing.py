@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from vplog.batch.batch import Drive
+    from vplog.batch.worker import Drive
     from vplog.run.report import Outcome
 
 

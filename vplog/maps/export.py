@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.errors import ResultError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import earth_as_plain, earth_of_run, inside
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import left_out, without_damaged
+from vplog.maps.storage.contents import left_out, without_damaged
 from vplog.results import tables
 from vplog.results.geo import on_earth
 from vplog.results.places_map import about_run, names_of, read_places, write_map, write_places
@@ -28,11 +29,8 @@ if TYPE_CHECKING:
     from vplog.results.geo import Earth
     from vplog.results.places_map import DrivePlaces
 
-    Progress = Callable[[str, int, int], None]
-
-
 _PLACES = ("keyframes.parquet", "descriptors.parquet")
-"""Of a run folder, where its places are and what they are."""
+"""Files of a run folder with its places: their poses and their descriptors."""
 
 
 @dataclass(frozen=True)
@@ -40,22 +38,20 @@ class _Source:
     """The drives that may be written, each read alone."""
 
     drives: dict[str, dict[str, Any]]
-    """By ID, with what the file's header says of each."""
+    """By ID, with its entry in the file's header."""
     earth: Callable[[str], Earth | None]
     """Where on earth a drive is."""
     read: Callable[[str, Callable[[Path], Any], Sequence[str]], Any]
-    """What a function makes of some files of a drive's run folder."""
+    """Calls a function with a drive's run folder, which has the files of these names."""
     forget: Callable[[str], None]
+    box: Box | None
+    kind: str
 
 
 def export_map(
-    sources: Sequence[Path],
-    path: Path,
-    drives: Sequence[str] = (),
-    box: Box | None = None,
-    kind: str = "parquet",
-    progress: Progress = lambda *_: None,
-) -> dict[str, Any]:
+    sources: Sequence[Path], path: Path, drives: Sequence[str] = (), box: Box | None = None, kind: str = "parquet",
+    execution: Execution = Execution(),
+) -> dict[str, Any]:  # fmt: skip
     """Write the places of a map (all, those of some drives, those in a box on earth) or of runs; what was written.
 
     One drive is in memory at a time. With a box or as GeoParquet a drive that has no place on earth is left out, and
@@ -66,7 +62,7 @@ def export_map(
         raise SettingsError(f"{maps[0]} is a map: export it alone, or put maps together first with `vplog map merge`.")
     if maps:
         with map_store.reading(maps[0]) as store:
-            return without_damaged(store, lambda: _export_drives(store, path, drives, box, kind, progress))
+            return without_damaged(store, lambda: _export_drives(store, path, drives, box, kind, execution))
     if drives:
         raise SettingsError("--drive chooses among the drives of a map, and what is given are runs. Leave it out.")
     with ExitStack() as stack:
@@ -78,13 +74,13 @@ def export_map(
         run = dict(zip(names_of(folders), folders, strict=True))
         source = _Source(
             {drive: about_run(folder) for drive, folder in run.items()}, lambda drive: earth_of_run(run[drive]),
-            lambda drive, of, _: of(run[drive]), lambda _: None,
+            lambda drive, of, _: of(run[drive]), lambda _: None, box, kind,
         )  # fmt: skip
-        return _write(path, source, box, kind, progress)
+        return _write(path, source, execution)
 
 
 def _export_drives(
-    store: Store, path: Path, drives: Sequence[str], box: Box | None, kind: str, progress: Progress
+    store: Store, path: Path, drives: Sequence[str], box: Box | None, kind: str, execution: Execution
 ) -> dict[str, Any]:
     _, known = map_store.one_library(store)
     unknown = [drive for drive in drives if drive not in known and drive not in store.damaged]
@@ -96,18 +92,20 @@ def _export_drives(
         for drive, record in known.items()
         if drive in drives or not drives
     }
-    written = _write(path, _Source(chosen, store.earth, store.read, store.forget), box, kind, progress)
-    return {**written, "warnings": left_out(store)}
+    source = _Source(chosen, store.earth, store.read, store.forget, box, kind)
+    return {**_write(path, source, execution), "warnings": left_out(store)}
 
 
-def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Progress) -> dict[str, Any]:
-    if box is None and kind == "parquet":
-        return {**write_places(path, source.drives, _places(source, {}, box, progress)), "left_out": []}
+def _write(path: Path, source: _Source, execution: Execution) -> dict[str, Any]:
+    box, geo = source.box, source.kind == "geoparquet"
+    if box is None and not geo:
+        return {**write_places(path, source.drives, _places(source, {}, execution)), "left_out": []}
     earths = {drive: source.earth(drive) for drive in source.drives}
-    left_out = [drive for drive in source.drives if earths[drive] is None]
-    placed = {drive: earth for drive, earth in earths.items() if earth is not None}
-    low, high, written = np.full(3, np.inf), np.full(3, -np.inf), {}
-    for drive, earth in placed.items():  # where they are comes first in a file, and takes the poses alone
+    unplaced = [drive for drive in source.drives if earths[drive] is None]
+    low, high, written = np.full(3, np.inf), np.full(3, -np.inf), dict[str, Any]()
+    for drive, earth in earths.items():  # bounds come first in a file, and take the poses alone
+        if earth is None:
+            continue
 
         def points(run: Path, earth: Earth = earth) -> Floats:
             return on_earth(earth, tables.read_keyframes(run / "keyframes.parquet")[1])
@@ -118,25 +116,25 @@ def _write(path: Path, source: _Source, box: Box | None, kind: str, progress: Pr
             written[drive] = earth
             low, high = np.minimum(low, where.min(0)), np.maximum(high, where.max(0))
     if not written:
-        nowhere = f" {len(left_out)} of {len(source.drives)} drives have no place on earth." if left_out else ""
-        asked = "in the box" if box is not None else "to write"
-        raise ResultError(f"There is no place {asked}, so {path} is not written.{nowhere}")
-    bounds = (low, high) if kind == "geoparquet" else None
+        nowhere = f" {len(unplaced)} of {len(source.drives)} drives have no place on earth." if unplaced else ""
+        wanted = "in the box" if box is not None else "to write"
+        raise ResultError(f"There is no place {wanted}, so {path} is not written.{nowhere}")
     nowhere = np.empty((0, 4, 4))
     drives = {drive: {"earth": earth_as_plain(at, nowhere), **source.drives[drive]} for drive, at in written.items()}
-    return {**write_places(path, drives, _places(source, written, box, progress), bounds), "left_out": left_out}
+    places = _places(source, written, execution)
+    return {**write_places(path, drives, places, (low, high) if geo else None), "left_out": unplaced}
 
 
-def _places(source: _Source, earths: dict[str, Earth], box: Box | None, progress: Progress) -> Iterator[DrivePlaces]:
-    """The places of drives, one drive after the other; with their points where they are told where it is."""
+def _places(source: _Source, earths: dict[str, Earth], execution: Execution) -> Iterator[DrivePlaces]:
+    """The places of drives, one drive after the other; with their points where their place on earth is given."""
     drives = list(earths or source.drives)
-    for number, drive in enumerate(drives):
+    for number, drive in enumerate(drives, start=1):
         places = source.read(drive, lambda run, drive=drive: read_places(run, drive), _PLACES)
         if earths:
             where = on_earth(earths[drive], places.world_from_body)
             places = replace(places, where=where)
-            if box is not None:
-                places = places.of(np.flatnonzero(inside(where, box)))
+            if source.box is not None:
+                places = places.of(np.flatnonzero(inside(where, source.box)))
         yield places
         source.forget(drive)
-        progress("export", number + 1, len(drives))
+        execution.progress("export", number, len(drives))

@@ -45,36 +45,34 @@ def earth_as_plain(earth: Earth | None, world_from_body: Floats) -> dict[str, An
     """As drive.json has it; with the bounds of a drive's poses (N, 4, 4), south, west, north, east in degrees."""
     if earth is None:
         return None
-    told = {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
+    record = {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
     if not len(world_from_body):
-        return told
+        return record
     where = on_earth(earth, world_from_body)[:, [1, 0]]
-    return {**told, "bounds": np.round([*where.min(0), *where.max(0)], _DECIMALS).tolist()}
+    return {**record, "bounds": np.round([*where.min(0), *where.max(0)], _DECIMALS).tolist()}
 
 
 def earth_of_made(folder: Path) -> dict[str, Any] | None:
-    """Of a finished run folder what its drive.json says. Raises ResultError."""
+    """The field `earth` of drive.json for a finished run folder. Raises ResultError."""
     earth = earth_of_run(folder)
     return None if earth is None else earth_as_plain(earth, tables.read_keyframes(folder / "keyframes.parquet")[1])
 
 
-def bounds_of(told: Any) -> list[float] | None:
-    """South, west, north, east by drive.json; None where it does not say."""
-    bounds = told.get("bounds") if isinstance(told, dict) else None
+def bounds_of(record: Any) -> list[float] | None:
+    """South, west, north, east by the field `earth` of drive.json; None where it has none."""
+    bounds = record.get("bounds") if isinstance(record, dict) else None
     return bounds if isinstance(bounds, list) and len(bounds) == 4 and all(map(is_finite, bounds)) else None
 
 
 def is_finite(value: Any) -> bool:
-    """Whether a value of a record is a number to reckon with."""
+    """Whether a value of a record is a finite number."""
     return isinstance(value, float | int) and abs(value) <= sys.float_info.max
 
 
-def earth_from_plain(told: Any) -> Earth | None:
-    """The way back; None where it tells none."""
-    if not isinstance(told, dict):
-        return None
+def earth_from_plain(record: Any) -> Earth | None:
+    """The way back; None where the record is none."""
     try:
-        origin, enu_from_world = np.array(told["origin"], np.float64), np.array(told["enu_from_world"], np.float64)
+        origin, enu_from_world = np.array(record["origin"], np.float64), np.array(record["enu_from_world"], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     if origin.shape != (3,) or enu_from_world.shape != (4, 4) or not np.isfinite(enu_from_world).all():

@@ -1,8 +1,7 @@
-"""Places of an exported file, taken into a map: drives that can be found again, and no more than that.
+"""Places of an exported file as drives of a map: they can be found again, and no more than that.
 
-What the file does not hold stays empty: such a drive has no closures and no edges, its trajectory is that of its
-keyframes, and it is joined with no other drive, for which its log would be needed. `vplog batch` with the log makes it
-a whole one.
+Such a drive has no closures and no edges, its trajectory is that of its keyframes, and it is joined with no other
+drive, for which its log would be needed. `vplog batch` with the log makes it a whole one.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.loops.verify import no_closures
 from vplog.maps.geo_bounds import earth_as_plain, earth_from_plain
-from vplog.maps.storage import drive_ids, map_store
+from vplog.maps.storage import layout, map_store
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.places_map import about_map, read_drives
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
     from vplog.results.places_map import AboutMap, DrivePlaces
 
 ALONE = "places_of"
-"""In drive.json of such a drive: the file that it is from."""
+"""Field in drive.json of such a drive: the file that it is from."""
 
 
 def library_of_file(path: Path) -> str:
@@ -43,9 +42,9 @@ def library_of_file(path: Path) -> str:
 
 
 def drives_of_file(path: Path) -> dict[str, dict[str, Any]]:
-    """Of each drive in an exported file what its drive.json will say, but for its key, in order. Raises ResultError."""
+    """drive.json of each drive in an exported file, but for its key, in order. Raises ResultError."""
     about = about_map(path)
-    return {drive: _record(path, about, drive, told) for drive, told in about.drives.items()}
+    return {drive: _record(path, about, drive) for drive in about.drives}
 
 
 def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[str]:
@@ -60,31 +59,32 @@ def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[st
         made = store.staging / f"{os.getpid()}-import-{number}"
         shutil.rmtree(made, ignore_errors=True)
         made.mkdir()
-        record = _record(path, about, places.drive, about.drives.get(places.drive, {}))
+        record = _record(path, about, places.drive)
         _write_run(made, places, taken, about)
         earth = earth_as_plain(earth_from_plain(record["earth"]), places.world_from_body)
         record = {**record, "drive": taken, "earth": earth}
-        run_record.write_run_json(made / "drive.json", {**record, "key": drive_ids.key_of(record | {"earth": None})})
+        run_record.write_run_json(made / "drive.json", {**record, "key": layout.key_of(record | {"earth": None})})
         map_store.publish(store, taken, made)
         yield places.drive
 
 
-def _record(path: Path, about: AboutMap, drive: str, told: dict[str, Any]) -> dict[str, Any]:
-    inputs, topics = told.get("inputs"), told.get("topics")
+def _record(path: Path, about: AboutMap, drive: str) -> dict[str, Any]:
+    entry = about.drives.get(drive, {})
+    inputs, topics = entry.get("inputs"), entry.get("topics")
     return {
         "drive": drive,
         "log": f"{_where(path)}#{drive}",
         "inputs": inputs if isinstance(inputs, dict) else {},
         "topics": topics if isinstance(topics, dict) else {},
-        "settings": drive_ids.key_of(about.settings),
+        "settings": layout.key_of(about.settings),
         "library": about.library,
-        "earth": told.get("earth"),
+        "earth": entry.get("earth"),
         ALONE: path.name,
     }
 
 
 def _where(path: Path) -> str:
-    """Of a copy where it was."""
+    """The path of a file, or the URL that it is a copy of."""
     known = original(path)
     return str(known.absolute() if known is path else known)
 
@@ -101,7 +101,7 @@ def _kind(store: Store, path: Path) -> pa.DataType:
 
 
 def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap) -> None:
-    """The run folder of a drive of which the places alone are known."""
+    """Write the run folder of a drive of which the places alone are known."""
     stamps, poses = places.stamp_ns, places.world_from_body
     if not np.isfinite(poses).all() or np.any(np.diff(stamps) <= 0):
         raise ResultError(f"{places.source}: {drive} has poses that are not finite, or stamps that do not increase.")

@@ -1,4 +1,4 @@
-"""What a map holds."""
+"""Drives, places and damage of a map."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
 from vplog.maps.import_places import ALONE
 from vplog.maps.joining.joint_record import components_in, replaced_since
-from vplog.maps.storage import drive_ids, map_store
-from vplog.maps.storage.damage import damaged_files, left_out, without_damaged
-from vplog.maps.storage.map_store import other_library
+from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.contents import left_out, other_library, without_damaged
+from vplog.maps.storage.damage import damaged_files
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
@@ -67,36 +67,30 @@ def _damaged_table(path: Path) -> list[str]:
 
 def _describe(store: Store) -> dict[str, Any]:
     head, problems, abouts = store.head(), list[str](), store.drives()
-    now, other = (drive_ids.key_of(head.settings), drive_ids.code_hash()), []
+    now, other = (layout.key_of(head.settings), layout.code_hash()), []
     for drive, about in abouts.items():
         if about["library"] != head.library:
             problems.append(other_library(store, drive, about["library"], head.library))
         if (about.get("settings"), about.get("code")) != now and ALONE not in about:
             other.append(about["log"])
     with ThreadPoolExecutor(_READ_AT_ONCE if store.mirror else 1) as pool:
-        drives = list(
-            pool.map(lambda drive: store.read(drive, lambda _: _drive(store, drive, abouts[drive]), ()), abouts)
-        )
+        drives = list(pool.map(lambda drive: _drive(store, drive, abouts[drive]), abouts))
     if other:
         problems.append(
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
             f"another version of vplog. `vplog batch` with their logs computes them again; the first is {other[0]}."
         )
-    problems += left_out(store)
-    problems += _left_behind(store, [*abouts, *store.damaged])
+    problems += left_out(store) + _left_behind(store, [*abouts, *store.damaged])
     places = sum(one["keyframes"] for one in drives)
     stored = sum(one["descriptor_bytes"] for one in drives)
-    about_library = {}
+    library = {}
     try:
-        about_library = read_library_record(store.library(head.library)) if head.library else {}
+        library = read_library_record(store.library(head.library)) if head.library else {}
     except LibraryError as error:
         problems.append(f"{store} has lost its library {str(head.library)[:12]}: {error}")
     return {
         "map": str(store),
-        "library": {
-            "hash": head.library,
-            **{name: about_library.get(name) for name in ("references", "features")},
-        },
+        "library": {"hash": head.library, **{name: library.get(name) for name in ("references", "features")}},
         "places": places,
         "descriptor_bytes": stored,
         "bytes_per_place": round(stored / places, 1) if places else None,
@@ -133,9 +127,9 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
     return store.read(drive, read, ())
 
 
-def _figure(told: Any, name: str) -> float | None:
-    """One of the numbers of a record; None where it does not say."""
-    value = told.get(name) if isinstance(told, dict) else None
+def _figure(totals: Any, name: str) -> float | None:
+    """A number of the totals of run.json; None where there is none."""
+    value = totals.get(name) if isinstance(totals, dict) else None
     return value if is_finite(value) else None
 
 
@@ -157,8 +151,7 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
             f"{', '.join(replaced)} was replaced after the joint graphs were solved. Solve them again: vplog map "
             f"join {store}"
         )
-    gone = sorted({drive for one in found or [] for drive in one["drives"]} - known.keys())
-    if gone:
+    if gone := sorted({drive for one in found or [] for drive in one["drives"]} - known.keys()):
         problems.append(
             f"{', '.join(gone)} was removed and is still in the joint graphs. Solve them without it: vplog map join "
             f"{store}"
@@ -167,7 +160,7 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
 
 
 def _left_behind(store: Store, drives: list[str]) -> list[str]:
-    """Folders that are of no drive in the map, each in a sentence."""
+    """Warnings about folders that are of no drive in the map."""
     if store.mirror is not None:
         return []  # a writer there removes them
     known, root = {map_store.folder_name(drive) for drive in drives}, store.root

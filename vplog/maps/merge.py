@@ -9,29 +9,29 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.maps.import_places import ALONE, drives_of_file, library_of_file, take_places
 from vplog.maps.joining.drive_pairs import KEPT
-from vplog.maps.storage import drive_ids, map_store
-from vplog.maps.storage.damage import DamagedDriveError, damaged_files, left_out
+from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.contents import left_out
+from vplog.maps.storage.damage import DamagedDriveError, damaged_files
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive
 from vplog.storage.remote_path import local_copy, original
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from vplog.maps.storage.map_store import Store
 
-    Progress = Callable[[str, int, int], None]
-
 
 def merge_maps(
-    sources: Sequence[Path], target: Path, progress: Progress = lambda *_: None, chosen: Sequence[str] = ()
+    sources: Sequence[Path], target: Path, execution: Execution = Execution(), chosen: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; what became of
-    each. Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
+    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; the fate of each.
+    Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
 
     Maps in the order given, the drives of each in order of their IDs. One whose log is in the map already, by its
     content, is left out; one whose ID is taken gets a number. Each is in whole or not at all, so a merge that was
@@ -43,16 +43,16 @@ def merge_maps(
         raise SettingsError("A map is given twice. Give each once.")
     with ExitStack() as stack:
         here = [stack.enter_context(local_copy(one)) if one.is_file() else one for one in sources]
-        return _merge(here, target, progress, chosen)
+        return _merge(here, target, execution, chosen)
 
 
-def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Sequence[str]) -> dict[str, Any]:
+def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: Sequence[str]) -> dict[str, Any]:
     library = _check_libraries(sources, target)
     _check_chosen(sources, chosen)
     fate, warnings = list[dict[str, Any]](), list[str]()
     with map_store.writing(target) as store:
         there = _There(store.drives())
-        for number, source in enumerate(sources):
+        for number, source in enumerate(sources, start=1):
             if source.is_file():
                 fate += _take_file(store, source, there, chosen)
                 continue
@@ -62,7 +62,7 @@ def _merge(sources: Sequence[Path], target: Path, progress: Progress, chosen: Se
                 for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
                     taken = _take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}")
                     fate += [] if taken is None else [taken]
-                    progress(f"merge {number + 1} of {len(sources)}", len(fate), len(fate))
+                    execution.progress(f"merge {number} of {len(sources)}", len(fate), len(fate))
                 warnings += left_out(other)
         return {"map": str(store), "library": library, "drives": fate, "warnings": left_out(store) + warnings}
 
@@ -77,32 +77,28 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
         if not source.exists():
             raise ResultError(f"There is neither a map nor an exported file at {source}.")
         if source.is_file():
-            found = library_of_file(source)
+            found, name = library_of_file(source), original(source)
+            again = "Describe its map again (vplog map redescribe), and export that."
         else:
             with map_store.reading(source) as other:
-                found, _ = map_store.one_library(other)
+                found, name = map_store.one_library(other)[0], source
+            again = f"Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
         if wanted is None and source.is_file():
             raise LibraryError(
-                f"{original(source)} holds places without their library {found[:12]}. Name a map that has it first, or "
-                "as -o."
+                f"{name} holds places without their library {found[:12]}. Name a map that has it first, or as -o."
             )
         if wanted is None:
             wanted, whose = found, str(source)
-        if found != wanted and source.is_file():
-            raise LibraryError(
-                f"{original(source)} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their "
-                "places do not compare. Describe its map again (vplog map redescribe), and export that."
-            )
         if found != wanted:
             raise LibraryError(
-                f"{source} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do not "
-                f"compare. Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
+                f"{name} is described with library {found[:12]}, and {whose} with {wanted[:12]}: their places do not "
+                f"compare. {again}"
             )
     return str(wanted)
 
 
 def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
-    """Raises SettingsError where no map has a drive that is asked for."""
+    """Raises SettingsError where no map has one of the drives chosen."""
     known: set[str] = set()
     for source in sources if chosen else ():
         if source.is_file():
@@ -110,8 +106,7 @@ def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
             continue
         with map_store.reading(source) as other:
             known |= other.drives().keys() | other.damaged.keys()
-    unknown = [drive for drive in chosen if drive not in known]
-    if unknown:
+    if unknown := [drive for drive in chosen if drive not in known]:
         raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(in_order(known))}.")
 
 
@@ -133,32 +128,30 @@ class _There:
 
     def __init__(self, records: Mapping[str, dict[str, Any]]) -> None:
         self._by_content: dict[str, str] = {}
-        self._names: set[str] = set()
-        self._alone: set[str] = set()
+        self._alone: dict[str, bool] = {}
         for drive, record in records.items():
             self.add(drive, record)
 
     def add(self, drive: str, record: dict[str, Any]) -> None:
         self._by_content[_content(record)] = drive
-        self._names.add(drive)
-        (self._alone.add if ALONE in record else self._alone.discard)(drive)
+        self._alone[drive] = ALONE in record
 
     def same(self, record: dict[str, Any]) -> tuple[str | None, bool]:
         """The drive of this content, and whether places alone are known of it."""
         drive = self._by_content.get(_content(record))
-        return drive, drive in self._alone
+        return drive, drive is not None and self._alone[drive]
 
     def free_name(self, drive: str, log: str) -> str:
-        return drive_ids.free_name(drive, log, self._names)
+        return layout.free_name(drive, log, self._alone)
 
 
 def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any] | None:
-    """One drive; what became of it, None where it is damaged. A whole one comes in place of its places alone."""
+    """Take one drive; its fate, None where it is damaged. A whole one replaces its places alone."""
     drive = record["drive"]
-    told = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
+    entry = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
     same, alone = there.same(record)
     if same is not None and (not alone or ALONE in record):
-        return {**told, "as": same, "state": "there already"}
+        return {**entry, "as": same, "state": "there already"}
     try:
         whole = other.whole(drive)  # of a store, files that have their sha256
         wrong = damaged_files(whole) if other.mirror is None else []
@@ -173,37 +166,36 @@ def _take(store: Store, other: Store, record: dict[str, Any], there: _There, sta
         shutil.rmtree(made, ignore_errors=True)
         try:
             ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-            shutil.copytree(other.whole(drive), made, symlinks=True, copy_function=_linked, ignore=ignored)
+            shutil.copytree(other.whole(drive), made, symlinks=True, copy_function=layout.link, ignore=ignored)
         except (OSError, shutil.Error) as error:
             raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
 
     other.read(drive, copied, ())
     if taken != drive:
-        drive_ids.name_keyframes(made / "keyframes.parquet", taken)
-    run_record.write_run_json(made / "drive.json", record if taken == drive else drive_ids.renamed(record, taken))
+        layout.name_keyframes(made / "keyframes.parquet", taken)
+    run_record.write_run_json(made / "drive.json", record if taken == drive else layout.renamed(record, taken))
     _link_kept(other, drive, store, taken)
     map_store.publish(store, taken, made)
     other.forget(drive)
     there.add(taken, record)
-    return {**told, "as": taken, "state": "taken"}
+    return {**entry, "as": taken, "state": "taken"}
 
 
 def _link_kept(other: Store, drive: str, store: Store, taken: str) -> None:
-    """What closures to drives that come later are checked by, so that they need the logs no more than there."""
+    """Link what later closures are verified by, so that these need the logs no more than in the source."""
     source, target = (one.root / "joins" / folder_name(name) for one, name in ((other, drive), (store, taken)))
     for name in KEPT:
         if (source / name).is_file():
             try:
                 target.mkdir(parents=True, exist_ok=True)
                 (target / name).unlink(missing_ok=True)
-                _linked(str(source / name), str(target / name))
+                layout.link(source / name, target / name)
             except OSError as error:
                 raise ResultError(f"Cannot copy {source / name}: {error.strerror or error}.") from None
 
 
 def _take_file(store: Store, source: Path, there: _There, chosen: Sequence[str]) -> list[dict[str, Any]]:
-    """The places of an exported file; what became of each drive, as `_take` says it. Those that have more of a drive
-    come in place of others alone."""
+    """Take the places of an exported file; the fate of each drive. More places of a drive replace fewer."""
     fate, wanted, counts = [], dict[str, str](), places_by_drive(source)
     for drive, record in drives_of_file(source).items():
         if chosen and drive not in chosen:
@@ -211,20 +203,19 @@ def _take_file(store: Store, source: Path, there: _There, chosen: Sequence[str])
         same, alone = there.same(record)
         more = same is None or (alone and counts.get(drive, 0) > store.rows("descriptors", same))
         taken = same or there.free_name(drive, drive)
-        fate.append({"from": str(original(source)), "drive": drive, "as": taken, "log": record["log"]})
-        fate[-1]["state"] = "places taken" if more else "there already"
+        entry = {"from": str(original(source)), "drive": drive, "as": taken, "log": record["log"]}
+        fate.append({**entry, "state": "places taken" if more else "there already"})
         if more:
             wanted[drive] = taken
             there.add(taken, record)
     done = set(take_places(store, source, wanted))
-    lost = [drive for drive in wanted if drive not in done]
-    if lost:
+    if lost := [drive for drive in wanted if drive not in done]:
         raise ResultError(f"{source} has no place of {lost[0]}, which its header names; export it again.")
     return fate
 
 
 def _content(record: dict[str, Any]) -> str:
-    """What a drive is of: the content of its log and what of that was used; without that, all that is known of it."""
+    """The content of a drive's log and the topics used; without these, all that is known of it."""
     if record["inputs"]:
         return run_record.canonical_json([record["inputs"], record.get("topics")])
     own = ("earth", "key", "drive", "format", "files")
@@ -239,12 +230,3 @@ def in_order(drives: Iterable[str]) -> list[str]:
         return (named[1], int(named[2])) if named else (drive, 1)
 
     return sorted(drives, key=numbered)
-
-
-def _linked(source: str, target: str) -> str:
-    """The same file under another name, or a copy: no writer of a map changes a file, each replaces it."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
-    return target

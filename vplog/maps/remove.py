@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import left_out
+from vplog.maps.storage.contents import left_out
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,10 +35,10 @@ def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
 
 
 def _still_joined(store: map_store.Store, drives: Sequence[str]) -> list[str]:
-    """Of the drives that are taken out, those that the joint graphs hold until they are solved anew."""
+    """Removed drives that the joint graphs hold until they are solved again."""
     try:
         joined = {drive for one in components_in(store) or [] for drive in one["drives"]}
-    except ResultError:  # damaged: the next join writes it anew
+    except ResultError:  # damaged: the next join writes it again
         return []
     return sorted(joined & set(drives))
 

@@ -21,9 +21,10 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.joint import JoinSettings
 from vplog.maps.joining import candidate_drives as candidates
-from vplog.maps.joining import drive_pairs, solve_components
+from vplog.maps.joining import components as component_folders
+from vplog.maps.joining import drive_pairs
 from vplog.maps.joining import join as map_join
-from vplog.maps.joining.join_order import read_drives
+from vplog.maps.joining.join import read_drives
 from vplog.maps.joining.joint_record import components_in, components_of
 from vplog.maps.merge import merge_maps
 from vplog.maps.storage import map_store
@@ -65,7 +66,7 @@ def put(root: Path, joint: Path, *names: str, **changes: Any) -> None:
 
 def joined(root: Path, executor: Executor | None = None) -> dict[str, Any]:
     with map_store.writing(root) as store:
-        return map_join.join(store, PIPELINE, executor, threads=2)
+        return map_join.join(store, PIPELINE, Execution(2), executor)
 
 
 def digests(root: Path) -> dict[str, str]:
@@ -167,7 +168,7 @@ def test_what_is_killed_goes_on_to_the_same_bytes(whole: Path, copy: Path, monke
         (drive_pairs, "put_ledger"),
         (map_join, "_remember"),
         (run_record, "write_run_json"),
-        (solve_components, "write_joint"),
+        (component_folders, "write_joint"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(module, name, killed)
@@ -337,5 +338,5 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
         every = candidates.worth_a_search(store, members, later, state, PIPELINE)
         assert every == {1: range(1), 2: range(2)}
         for threads in (1, 3):
-            found = candidates.candidates_of(store, members, [2], state, few, threads)[2]
+            found = candidates.candidates_of(store, members, [2], state, few, Execution(threads))[2]
             assert set(found.drive.tolist()) == {1}

@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import Places, make_places, plain_scores
 from vplog.errors import ResultError
+from vplog.execution.execution import Execution
 from vplog.maps.search import exact as map_search
 from vplog.maps.search import index as map_index
 from vplog.maps.search import query as map_query
-from vplog.maps.search.exact import best_places
+from vplog.maps.search.exact import Answers, best_places, no_answers
 from vplog.maps.search.index import update_index
-from vplog.maps.search.query import search
+from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.segment import open_segment
 from vplog.maps.search.sequences import likely_drives
-from vplog.maps.search.top_k import Answers, no_answers
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import NOWHERE, BobbSettings, BobbState, Place
 from vplog.places.sequence import SequenceSettings
@@ -80,14 +80,14 @@ class Map:
         return sorted(scored)[:top]
 
     def update(self, threads: int = 1) -> tuple[list[map_index.Part], list[str]]:
-        return update_index(self.store, self.store.drives(), self.state.hash, self.state, threads)
+        return update_index(self.store, self.store.drives(), self.state, Execution(threads))
 
     def check(self, threads: int = 1) -> list[map_index.Part]:
         """The index says what brute force does; its parts."""
         parts, warnings = self.update(threads)
         assert not warnings
         views = self.views(8)
-        found = best_places(parts, self.state, views, TOP, threads)
+        found = best_places(parts, self.state, views, TOP, Execution(threads))
         for at, view in enumerate(views):
             assert told(found, at) == self.expected(view)
         assert sum(part.places for part in parts) == sum(map(len, self.places.values()))
@@ -121,7 +121,7 @@ def test_the_best_places_are_those_of_brute_force(made: Map, monkeypatch: pytest
     parts = made.check(threads=3)
     assert len(parts) == 3
     views = made.views(5)
-    alone = best_places(parts, made.state, views[:1], TOP, 4)
+    alone = best_places(parts, made.state, views[:1], TOP, Execution(4))
     with ProcessPoolExecutor(2) as workers:
         found = best_places(parts, made.state, views, TOP, executor=workers)
     in_memory = [replace(part, path=None) for part in parts]
@@ -193,7 +193,9 @@ def test_other_recognisers_are_searched_drive_by_drive(made: Map) -> None:
 
     views = made.views(4)
     other = cast("PlaceState", Other())
-    found, warnings = search(made.store, made.store.drives(), other, views, TOP, SequenceSettings(length=1), 2)
+    found, warnings = search(
+        made.store, made.store.drives(), other, views, MapQuery(TOP), SequenceSettings(length=1), Execution(2)
+    )
     assert not warnings
     assert [told(found, at) for at in range(4)] == [made.expected(view) for view in views]
     assert not made.store.index.exists()
@@ -263,7 +265,7 @@ def test_no_bytes_lead_beyond_the_arrays(made: Map, seed: int) -> None:
     finally:
         path.unlink()
     if len(segment.contents) == len(part.numbers):
-        found = best_places([map_index.Part(segment, None, part.numbers)], made.state, made.views(4), TOP, 1)
+        found = best_places([map_index.Part(segment, None, part.numbers)], made.state, made.views(4), TOP)
         assert found.score.shape == (4, TOP)
 
 
@@ -277,9 +279,9 @@ def test_sequences_in_a_large_map_are_those_of_the_likely_drives(
     followed = large.places["drive-000000023"]
     views = [Place(followed.references[row], followed.weights[row], followed.boxes[row]) for row in range(5, 25)]
     drives, by_five = large.store.drives(), SequenceSettings(length=5)
-    every, nothing = search(large.store, drives, state, views, 1, by_five)
+    every, nothing = search(large.store, drives, state, views, MapQuery(1), by_five)
     monkeypatch.setattr(map_query, "EXACT_PLACES", 100)
-    likely, said = search(large.store, drives, state, views, 1, by_five)
+    likely, said = search(large.store, drives, state, views, MapQuery(1), by_five)
     assert not nothing
     assert "of 40 drives" in said[0]
     assert every.drive[:, 0].tolist() == [23] * 20
@@ -298,3 +300,20 @@ def test_a_drive_is_likely_by_how_far_it_stands_out() -> None:
     many = np.arange(50, dtype=np.int32)[None]
     falling = np.linspace(1, 0.1, 50, dtype=np.float32)[None]
     assert likely_drives(Answers(many, many, falling, many), 5).tolist() == list(range(8))
+
+
+def test_a_segment_of_another_version_is_not_called_damaged(made: Map) -> None:
+    """The index is built again without it, and a warning of one line says so."""
+    [part] = made.check()
+    assert part.path is not None
+    data = part.path.read_bytes()
+    for number in (b"1", b"3"):
+        part.path.write_bytes(data.replace(b'"format":2', b'"format":' + number))
+        with pytest.raises(ResultError) as raised:
+            open_segment(part.path)
+        assert "of another version of vplog" in str(raised.value)
+        assert "damaged" not in str(raised.value)
+        _, [warning] = made.update()
+        assert warning.startswith(str(raised.value))
+        assert "\n" not in warning
+        assert part.path.read_bytes() == data

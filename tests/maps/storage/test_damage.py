@@ -112,7 +112,7 @@ def test_what_is_no_file_is_no_part_of_an_index(tmp_path: Path, kind: str) -> No
     write_drive(store, 0, make_places(40, settings, 0, 30, 40), state)
 
     def update() -> tuple[list[Any], list[str]]:
-        return update_index(store, store.drives(), state.hash, state)
+        return update_index(store, store.drives(), state)
 
     [part], _ = update()
     assert part.path is not None

@@ -16,7 +16,8 @@ import pytest
 
 from tests.maps.bucket import serving
 from tests.maps.runs import put_rows
-from vplog.maps.search.query import open_map, search
+from vplog.execution.execution import Execution
+from vplog.maps.search.query import MapQuery, open_map, search
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.download_cache import Cache, cache_in
 from vplog.maps.storage.layout import sha256_of
@@ -79,10 +80,10 @@ def fetched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def asked(root: Path, finished: Path, cache: Cache | None = None, length: int = 1) -> dict[str, list[Any]]:
     """The two best places of the map for some views of the run, as a query has them."""
     with map_store.reading(root, cache) as store:
-        drives, _, state = open_map(store, 1)
+        drives, _, state = open_map(store, Execution())
         column = tables.read_descriptors(finished / "descriptors.parquet")[0]
         views = state.from_arrow(column.cast(cast("BobbState", state).arrow_type))[::5]
-        answers, told = search(store, drives, state, views, 2, SequenceSettings(length=length))
+        answers, told = search(store, drives, state, views, MapQuery(2), SequenceSettings(length=length))
     assert not told
     return {name: values.tolist() for name, values in vars(answers).items()}
 

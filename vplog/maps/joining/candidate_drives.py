@@ -9,23 +9,20 @@ import numpy as np
 
 from vplog.execution.execution import Execution
 from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import as_described, update_index
+from vplog.maps.search.index import read_column, update_index
 from vplog.maps.search.sequences import PLACES_A_VIEW, credits_of
 from vplog.maps.storage.damage import reading_drive
-from vplog.results import tables
 from vplog.sessions.inter_session import candidates_among
 from vplog.stages import CodedState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Mapping, Sequence
+    from collections.abc import Container, Mapping, Sequence
 
     from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
     from vplog.sessions.inter_session import Candidates
     from vplog.stages import PlaceState
-
-    Progress = Callable[[str, int, int], None]
 
 _CHOICE = 3
 """Drives searched for each that may be verified. Views alone and in sequences seldom differ in which drives are alike,
@@ -36,26 +33,25 @@ _AT_ONCE = 64
 
 def places_of(store: Store, member: Member, state: PlaceState) -> Sequence[Any]:
     """The places of a drive. Raises DamagedDriveError where they are of another recogniser."""
-    path = store.file(member.drive, "descriptors.parquet")
+    column = read_column(store, member.drive, state)
     with reading_drive(member.drive):
-        column, _ = tables.read_descriptors(path)
-        return state.from_arrow(as_described(store, member.drive, column, state))
+        return state.from_arrow(column)
 
 
 def candidates_of(
     store: Store, members: Sequence[Member], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
-    threads: int = 1, progress: Progress = lambda *_: None,
+    execution: Execution = Execution(),
 ) -> dict[int, Candidates]:  # fmt: skip
     """For each new drive, by number, its best candidates in the drives of a lower number that are worth a search."""
     found: dict[int, Candidates] = {}
     counts = [min(number, most_searched(pipeline)) for number in new]
     for first in range(0, len(new), _AT_ONCE):
         block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
-        searched = worth_a_search(store, members, block, state, pipeline, threads)
-        execution = Execution(threads, progress).part(sum(counts[:first]), sum(counts))
+        searched = worth_a_search(store, members, block, state, pipeline, Execution(execution.threads))
         found |= candidates_among(
-            block, lambda number: places_of(store, members[number], state), searched, state, pipeline, execution
-        )
+            block, lambda number: places_of(store, members[number], state), searched, state, pipeline,
+            execution.part(sum(counts[:first]), sum(counts)),
+        )  # fmt: skip
     return found
 
 
@@ -66,7 +62,7 @@ def most_searched(pipeline: Pipeline) -> int:
 
 def worth_a_search(
     store: Store, members: Sequence[Member], later: Mapping[int, Sequence[Any]], state: PlaceState,
-    pipeline: Pipeline, threads: int = 1,
+    pipeline: Pipeline, execution: Execution = Execution(),
 ) -> dict[int, Container[int]]:  # fmt: skip
     """For each drive of `later`, places by number, the drives of a lower number that it is searched in: all, and where
     these are many the ones that hold most of what is like its views, each view for itself, by the map's index.
@@ -79,12 +75,12 @@ def worth_a_search(
     if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
         return searched
     about = store.drives()
-    parts, _ = update_index(store, {one.drive: about[one.drive] for one in members}, state.hash, state, threads)
+    parts, _ = update_index(store, {one.drive: about[one.drive] for one in members}, state, execution)
     for number, views in later.items():
         if number <= most:
             continue
         before = [replace(part, numbers=np.where(part.numbers < number, part.numbers, -1)) for part in parts]
-        _, drive, credit = credits_of(best_places(before, state, views, PLACES_A_VIEW, threads))
+        _, drive, credit = credits_of(best_places(before, state, views, PLACES_A_VIEW, execution))
         like = np.bincount(drive, credit, number)
         best = np.lexsort((np.arange(number), -like))[:most]
         searched[number] = set(best[like[best] > 0].tolist())

@@ -12,26 +12,54 @@ KEY stands for all that the folder is made from, so one that a new drive does no
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.cache.code_hash import code_of
-from vplog.errors import ResultError
+from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
-from vplog.maps.storage.damage import reading_drive
-from vplog.maps.storage.drive_ids import key_of
+from vplog.maps.joining.joint_record import read_joint, write_joint
+from vplog.maps.storage.damage import DamagedDriveError, reading_drive
+from vplog.maps.storage.layout import key_of
 from vplog.results import g2o, run_record, tables
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from vplog.data import Closures, Odometry
+    from vplog.execution.execution import Execution
     from vplog.graph.refine import Refined
+    from vplog.maps.joining.drive_pairs import Joins
+    from vplog.maps.joining.members import Member
+    from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
+
+
+@dataclass(frozen=True)
+class Drives:
+    """The drives of a map that may be joined, in its order."""
+
+    members: list[Member]
+    joins: list[Joins]
+    """The place of each in the order, and the drives that it was verified against."""
+    keys: dict[str, str]
+    """Keys of drive.json, by ID."""
+    apart: dict[str, str]
+    """Why others are not joined, by ID."""
+    library: str
+    number: dict[str, int]
+    """Place of each member in the order, by ID."""
+
+    def counts(self, later: int, pair: dict[str, Any]) -> bool:
+        """Whether the drive that a pair is with is there, before its own, and the one that it was then."""
+        at = self.number.get(pair["match"], later)
+        return at < later and self.members[at].key == pair["match_key"]
 
 
 @dataclass(frozen=True)
@@ -74,17 +102,11 @@ def groups_of(order: Sequence[str], keys: dict[str, str], ties: Sequence[Tie], p
     )
     code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
     found = []
-    for one, count in enumerate(np.bincount(number, minlength=1)):
-        if count < 2:
-            continue
+    for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
         drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
         inside = set(drives)
-        own = tuple(
-            sorted(
-                (tie for tie in ties if tie.later in inside and tie.earlier in inside),
-                key=lambda tie: (at[tie.later], at[tie.earlier]),
-            )
-        )
+        between = [tie for tie in ties if {tie.later, tie.earlier} <= inside]
+        own = tuple(sorted(between, key=lambda tie: (at[tie.later], at[tie.earlier])))
         made_from = {
             "drives": [[drive, keys[drive]] for drive in drives],
             "ledgers": [[tie.later, tie.earlier, tie.key] for tie in own],
@@ -158,17 +180,69 @@ def _ledger(tie: Tie) -> Closures:
 
 def _record(group: Group, drives: Sequence[str], joins: Sequence[dict[str, Any]], refined: Refined) -> dict[str, Any]:
     """component.json."""
-    solution = refined.solution
+    names = ("error_before", "error_after", "iterations", "converged", "reason")
     return {
         "drives": drives,
         "joins": joins,
-        "solution": {
-            "error_before": solution.error_before,
-            "error_after": solution.error_after,
-            "iterations": solution.iterations,
-            "converged": solution.converged,
-            "reason": solution.reason,
-        },
+        "solution": {name: getattr(refined.solution, name) for name in names},
         "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
         "made_from": group.key,
     }
+
+
+def solve_groups(
+    store: Store, drives: Drives, ties: Sequence[Tie], pipeline: Pipeline, execution: Execution
+) -> dict[str, Any]:
+    """Solve the groups that are not solved yet, and let joint.json say so; then the folders of others go."""
+    groups = groups_of([member.drive for member in drives.members], drives.keys, ties, pipeline)
+    known = {group["key"]: group for group in _joint(store).get("groups", [])}
+    folder, solved = store.root / "joint", []
+    for done, group in enumerate(groups):
+        execution.progress("solve together", done, len(groups))
+        components = known.get(group.key, {}).get("components")
+        if components is None or not all((folder / one["folder"] / "component.json").is_file() for one in components):
+            known[group.key] = _solved(store, group, pipeline, drives.library)
+        solved.append(known[group.key])
+    execution.progress("solve together", len(groups), len(groups))
+    together = {drive for group in solved for component in group["components"] for drive in component["drives"]}
+    alone = sorted([*(one.drive for one in drives.members if one.drive not in together), *drives.apart])
+    keys = {drive: drives.keys[drive] for drive in sorted(together)}
+    record = {"groups": solved, "alone": alone, "apart": drives.apart, "keys": keys}
+    if solved or (store.root / "joint.json").exists():
+        write_joint(store.root, record)
+    named = {component["folder"] for group in solved for component in group["components"]}
+    for path in folder.glob("component=*"):
+        if path.name not in named:
+            shutil.rmtree(path, ignore_errors=True)
+    return record
+
+
+def _joint(store: Store) -> dict[str, Any]:
+    try:
+        return read_joint(store.root)
+    except NewerError:
+        raise
+    except VplogError:  # damaged: it is written again
+        return {}
+
+
+def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
+    """Solve a group, and rename in its components."""
+    staging = store.staging / "joint"
+    shutil.rmtree(staging, ignore_errors=True)
+    runs = {drive: store.run(drive) for drive in group.drives}
+    try:
+        record = solve_group(group, runs, pipeline, library, staging)
+    except DamagedDriveError:  # the others are solved without it
+        raise
+    except VplogError as error:  # one group must not take the others along; it is tried again
+        return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
+    for component in record["components"]:
+        place = store.root / "joint" / component["folder"]
+        if (place / "component.json").is_file():  # of a join that was killed; its name says that it is the same
+            continue
+        place.parent.mkdir(exist_ok=True)
+        shutil.rmtree(place, ignore_errors=True)
+        put_in_place(staging / component["folder"], place)
+    shutil.rmtree(staging, ignore_errors=True)
+    return record

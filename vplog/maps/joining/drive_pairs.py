@@ -14,12 +14,9 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from vplog.cache.code_hash import code_of
-from vplog.data import Verdict
 from vplog.errors import ResultError
-from vplog.execution.execution import Execution
-from vplog.maps.joining.drive_features import CameraTrust, camera_trust, keep_features, opened_drive
-from vplog.maps.storage.drive_ids import key_of
-from vplog.maps.storage.layout import folder_name, quoted
+from vplog.maps.joining.members import CameraTrust, camera_trust, keep_features, opened_drive
+from vplog.maps.storage.layout import folder_name, key_of, quoted
 from vplog.results import run_record, tables
 from vplog.sessions.inter_session import closures_between, with_shared
 from vplog.storage.scratch import replacing
@@ -27,12 +24,12 @@ from vplog.storage.scratch import replacing
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Closures, SharedReferences
+    from vplog.data import SharedReferences
+    from vplog.execution.execution import Execution
     from vplog.loops.propose import Proposals
     from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
-
 
 _CODE = ("vplog.sessions.inter_session", "vplog.features.extraction", "vplog.features.sift", "vplog.results.tables")
 """Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
@@ -41,11 +38,13 @@ KEPT = ("camera.json", "features.parquet")
 """Files that depend on the drive alone, not on its name or the other drives."""
 _SEARCH = "vplog.maps.joining.candidate_drives"
 """The module that chooses the drives that one is searched in."""
+_PAIR = {"match": str, "match_key": str, "candidates": int, "verified": int, "ledger": str}
+"""Fields of a pair in joins.json."""
 
 
 @dataclass(frozen=True)
 class PairTask:
-    """Candidates of one drive in another to verify, as they go to another process or machine."""
+    """Candidates of one drive in another to verify, as a task for another process or machine."""
 
     later: Member
     earlier: Member
@@ -56,7 +55,7 @@ class PairTask:
     """One row for each proposal."""
     pipeline: Pipeline
     library: str
-    threads: int
+    execution: Execution
 
     @property
     def key(self) -> str:
@@ -77,14 +76,14 @@ def depends(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def compute_pair(task: PairTask) -> bytes:
-    """The table of the ledger, the same on any machine and any number of threads.
+    """The table of the ledger, the same on any machine and for any execution.
 
     Raises LogError where features have to be extracted again and a log is gone or another one.
     """
-    verify, threads = task.pipeline.verify, task.threads
+    verify, execution = task.pipeline.verify, task.execution
     with (
-        opened_drive(task.later, task.later_camera, verify, threads) as (later, of_later),
-        opened_drive(task.earlier, task.earlier_camera, verify, threads) as (earlier, of_earlier),
+        opened_drive(task.later, task.later_camera, verify, execution) as (later, of_later),
+        opened_drive(task.earlier, task.earlier_camera, verify, execution) as (earlier, of_earlier),
     ):
 
         def fetch(queries: Any, matches: Any) -> None:
@@ -92,34 +91,33 @@ def compute_pair(task: PairTask) -> bytes:
             of_earlier(matches)
 
         share = max(task.later_camera.rotation_share, task.earlier_camera.rotation_share)
-        ledger = closures_between(
-            task.proposals, later, earlier, task.pipeline.join, share, Execution(threads), fetch
-        )  # fmt: skip
+        ledger = closures_between(task.proposals, later, earlier, task.pipeline.join, share, execution, fetch)
         ledger = with_shared(ledger, task.proposals, task.shared)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
         return tables.joins_as_bytes([(later.keyframes, earlier.keyframes, ledger)], header, task.key)
 
 
-def compute_camera(member: Member, pipeline: Pipeline, threads: int) -> CameraTrust:
+def compute_camera(member: Member, pipeline: Pipeline, execution: Execution) -> CameraTrust:
     """The camera of a drive, as a task; features in the cache of its run are stored for later drives."""
     if pipeline.join.keep_features:
         keep_features(member, pipeline.verify)
-    return camera_trust(member, pipeline.verify, threads)
+    return camera_trust(member, pipeline.verify, execution)
 
 
 def folder_of(store: Store, drive: str) -> Path:
+    """MAP/joins/drive=ID."""
     return store.root / "joins" / folder_name(drive)
 
 
 def ledger_path(store: Store, later: str, earlier: str) -> Path:
+    """The table of a pair's ledger."""
     return folder_of(store, later) / f"match={quoted(earlier)}.parquet"
 
 
 def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
     """Write the table of `compute_pair` as a whole. Raises ResultError."""
-    path = ledger_path(store, task.later.drive, task.earlier.drive)
-    _make(path.parent)
-    with replacing(path) as stream:
+    _make(store, task.later.drive)
+    with replacing(ledger_path(store, task.later.drive, task.earlier.drive)) as stream:
         stream.write(data)
 
 
@@ -130,20 +128,6 @@ def is_stored(store: Store, task: PairTask) -> bool:
         return path.is_file() and tables.read_metadata(path).get("vplog.made_from") == task.key
     except ResultError:  # damaged: it is computed again
         return False
-
-
-def read_ledger(store: Store, later: str, earlier: str) -> Closures | None:
-    """The ledger of a pair; None where it has no row. Raises ResultError."""
-    return tables.read_joins(ledger_path(store, later, earlier)).get((later, earlier))
-
-
-def made_from(store: Store, later: str, earlier: str) -> str:
-    """Key of the stored ledger of a pair. Raises ResultError."""
-    return tables.read_metadata(ledger_path(store, later, earlier)).get("vplog.made_from", "")
-
-
-def verified(ledger: Closures | None) -> int:
-    return 0 if ledger is None else sum(verdict is Verdict.ACCEPTED for verdict in ledger.verdict)
 
 
 def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrust | None:
@@ -158,21 +142,14 @@ def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrus
 
 
 def put_camera(store: Store, member: Member, pipeline: Pipeline, camera: CameraTrust) -> None:
-    folder = folder_of(store, member.drive)
-    _make(folder)
+    """Store the camera of a drive. Raises ResultError."""
     record = {"drive": member.drive, **asdict(camera), "made_from": _camera_key(member, pipeline)}
-    run_record.write_run_json(folder / "camera.json", record, checksum=True)
+    run_record.write_run_json(_make(store, member.drive) / "camera.json", record, checksum=True)
 
 
 def _camera_key(member: Member, pipeline: Pipeline) -> str:
-    verify = pipeline.verify.model_dump(mode="json")
-    return key_of(
-        {
-            "member": member.key,
-            "verify": verify,
-            "code": code_of("vplog.loops.verify", "vplog.features.extraction")["code"],
-        }
-    )
+    verify, code = pipeline.verify.model_dump(mode="json"), code_of("vplog.loops.verify", "vplog.features.extraction")
+    return key_of({"member": member.key, "verify": verify, "code": code["code"]})
 
 
 @dataclass(frozen=True)
@@ -201,13 +178,13 @@ def search_key(member: Member, pipeline: Pipeline) -> str:
 
 
 def read_joins(store: Store, drive: str) -> Joins | None:
+    """joins.json; None where there is none, without pairs where these are damaged."""
     record = _read(folder_of(store, drive) / "joins.json")
     position, member, made_from, pairs = (record.get(name) for name in ("position", "member", "made_from", "pairs"))
     if not (isinstance(position, int) and isinstance(member, str) and isinstance(made_from, str)):
         return None
-    wanted = {"match": str, "match_key": str, "candidates": int, "verified": int, "ledger": str}
     if not isinstance(pairs, list) or any(
-        not isinstance(pair, dict) or any(not isinstance(pair.get(name), kind) for name, kind in wanted.items())
+        not isinstance(pair, dict) or any(not isinstance(pair.get(name), kind) for name, kind in _PAIR.items())
         for pair in pairs
     ):
         return Joins(position, member)
@@ -215,18 +192,15 @@ def read_joins(store: Store, drive: str) -> Joins | None:
 
 
 def put_joins(store: Store, drive: str, joins: Joins) -> None:
-    folder = folder_of(store, drive)
-    _make(folder)
-    run_record.write_run_json(folder / "joins.json", {"drive": drive, **asdict(joins)}, checksum=True)
+    """Write joins.json. Raises ResultError."""
+    run_record.write_run_json(_make(store, drive) / "joins.json", {"drive": drive, **asdict(joins)}, checksum=True)
 
 
 def forget(store: Store, drive: str, but: set[str]) -> None:
     """Remove the ledgers of a drive in other drives than these, and files that a killed writer left."""
     folder = folder_of(store, drive)
     known = {ledger_path(store, drive, earlier) for earlier in but}
-    for path in set(folder.glob("match=*.parquet")) - known:
-        path.unlink(missing_ok=True)
-    for path in folder.glob(".*.part"):
+    for path in [*(set(folder.glob("match=*.parquet")) - known), *folder.glob(".*.part")]:
         path.unlink(missing_ok=True)
 
 
@@ -238,8 +212,10 @@ def _read(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _make(folder: Path) -> None:
+def _make(store: Store, drive: str) -> Path:
+    folder = folder_of(store, drive)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ResultError(f"Cannot make the folder {folder}: {error.strerror}.") from None
+    return folder

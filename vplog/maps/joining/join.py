@@ -6,22 +6,27 @@ by geometry. Drives come in order of their IDs within a batch, and after all tha
 
 from __future__ import annotations
 
+import shutil
 import time
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
+from vplog.data import Verdict
+from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.tasks import each_done
 from vplog.execution.timing import Watch
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
-from vplog.maps.joining.join_order import is_up_to_date, read_drives, settled_ties
-from vplog.maps.joining.solve_components import solve_groups
-from vplog.maps.storage.damage import left_out, without_damaged
+from vplog.maps.joining.components import Drives, Tie, solve_groups
+from vplog.maps.joining.members import apart, member_of
+from vplog.maps.storage.contents import left_out, without_damaged
 from vplog.maps.storage.map_store import reading, writing
 from vplog.pipeline import Pipeline
+from vplog.results import tables
 from vplog.sessions.inter_session import likely_pairs
 
 if TYPE_CHECKING:
@@ -29,69 +34,87 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
     from pathlib import Path
 
-    from vplog.maps.joining.drive_features import CameraTrust
     from vplog.maps.joining.drive_pairs import PairTask
-    from vplog.maps.joining.join_order import Drives
+    from vplog.maps.joining.members import CameraTrust, Member
     from vplog.maps.storage.map_store import Store
     from vplog.sessions.inter_session import DrivePair
     from vplog.stages import PlaceState
-
-    Progress = Callable[[str, int, int], None]
 
 _KEEP_EVERY_S = 300.0
 """Interval at which ledgers are sent to a map on an object store, each time with a copy of those there."""
 
 
-def load_places(library: Path, pipeline: Pipeline, threads: int = 1) -> PlaceState:
+@dataclass(frozen=True)
+class _Work:
+    """What the steps of a join have in common."""
+
+    store: Store
+    drives: Drives
+    new: list[int]
+    """Numbers of the drives that are new or changed."""
+    pipeline: Pipeline
+    execution: Execution
+    executor: Executor | None
+
+    @property
+    def quiet(self) -> Execution:
+        """The threads, without progress."""
+        return Execution(self.execution.threads)
+
+
+def load_places(library: Path, pipeline: Pipeline, execution: Execution = Execution()) -> PlaceState:
     """The map's library as `join` compares places by it: what can be done while the drives are still computed.
 
-    What else is read once, as the code that joins depend on, is read along. Raises LibraryError.
+    The code hashes that joins depend on are read along, once. Raises LibraryError.
     """
     drive_pairs.depends(pipeline)
     drive_pairs.search_code()
-    return cast("PlaceState", pipeline.places.load(library, Execution(threads)))
+    return cast("PlaceState", pipeline.places.load(library, Execution(execution.threads)))
 
 
 def join(
-    store: Store,
-    pipeline: Pipeline,
-    executor: Executor | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
-    places: Callable[[], PlaceState] | None = None,
-    urls: Mapping[str, str] = MappingProxyType({}),
-) -> dict[str, Any]:
+    store: Store, pipeline: Pipeline, execution: Execution = Execution(), executor: Executor | None = None,
+    places: Callable[[], PlaceState] | None = None, urls: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, Any]:  # fmt: skip
     """Verify the pairs of drives that are new or changed, solve the groups that have them, and return the record.
     `urls` open the logs of drives given now: a map stores URLs without their queries.
 
-    The caller holds the map's lock. With an executor its processes verify, pair by pair, each with `threads`; they
-    must see the map and the logs under the same paths. Neither counts for the result. `places` gives what `load_places`
-    made of the map's library, where that was begun before. A pair that cannot be verified, as where a log is gone, is
-    left out with a reason, and tried again the next time. Raises VplogError where the map as a whole cannot be read or
-    written.
+    The caller holds the map's lock. With an executor its processes verify, pair by pair; they must see the map and the
+    logs under the same paths. It does not count for the result. `places` gives the state of `load_places`, where that
+    was begun before. A pair that cannot be verified, as where a log is gone, is left out with a reason, and tried again
+    the next time. Raises VplogError where the map as a whole cannot be read or written.
     """
-    return without_damaged(store, lambda: _join(store, pipeline, executor, threads, progress, places, urls))
-
-
-def _join(
-    store: Store, pipeline: Pipeline, executor: Executor | None, threads: int, progress: Progress,
-    places: Callable[[], PlaceState] | None, urls: Mapping[str, str],
-) -> dict[str, Any]:  # fmt: skip
-    watch = Watch()
     if store.mirror is not None:  # what joins drives goes to and from an object store as a whole
         lean = pipeline.join.model_copy(update={"keep_features": False})
         pipeline = pipeline.model_copy(update={"join": lean})
-    drives = read_drives(store, urls)
-    new = [at for at in range(len(drives.members)) if not is_up_to_date(store, drives, at, pipeline)]
+
+    def joined() -> dict[str, Any]:
+        drives = read_drives(store, urls)
+        new = [at for at in range(len(drives.members)) if not _is_up_to_date(store, drives, at, pipeline)]
+        return _join(_Work(store, drives, new, pipeline, execution, executor), places)
+
+    return without_damaged(store, joined)
+
+
+def join_map(root: Path, execution: Execution = Execution()) -> dict[str, Any]:
+    """`join` of a map as it is, with the settings of its last batch. Raises VplogError."""
+    with reading(root) as store:  # not a map: nothing is made
+        head = store.head()
+    pipeline = Pipeline.read(head.settings, f"{root}/map.json")
+    with writing(root) as store:
+        return {"map": str(root), **join(store, pipeline, execution)}
+
+
+def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any]:
+    store, drives, pipeline, watch = work.store, work.drives, work.pipeline, Watch()
     with watch.stage("search"):
-        load = places or (lambda: load_places(store.library(drives.library), pipeline, threads))
-        wanted = _search(store, drives, new, pipeline, threads, progress, load)
+        wanted = _search(work, places)
     with watch.stage("verify"):
-        computed, reasons = _verify(store, drives, new, wanted, pipeline, executor, threads, progress)
-        _remember(store, drives, new, wanted, reasons, pipeline)
-    with watch.stage("solve"), limited(threads):
-        ties = settled_ties(store, drives)
-        record = solve_groups(store, drives, ties, pipeline, progress)
+        computed, reasons = _verify(work, wanted)
+        _remember(work, wanted, reasons)
+    with watch.stage("solve"), limited(work.execution.threads):
+        ties = _settled_ties(store, drives)
+        record = solve_groups(store, drives, ties, pipeline, work.execution)
     unjoined = [f"{later} in {earlier} was left out. {reason}" for (later, earlier), reason in reasons.items()]
     for group in record["groups"]:
         unjoined += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
@@ -99,15 +122,11 @@ def _join(
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    uncalibrated = [
-        member.drive
-        for member in drives.members
-        if (known := drive_pairs.known_camera(store, member, pipeline)) is not None and known.camera["matrix"] is None
-    ]
-    if uncalibrated:
+    cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in drives.members]
+    if uncalibrated := [drive for drive, known in cameras if known is not None and known.camera["matrix"] is None]:
         unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(uncalibrated)}.")
     return {
-        "searched": [drives.members[at].drive for at in new],
+        "searched": [drives.members[at].drive for at in work.new],
         "pairs": len(ties),
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
@@ -117,49 +136,77 @@ def _join(
     }
 
 
-def _search(
-    store: Store, drives: Drives, new: Sequence[int], pipeline: Pipeline, threads: int, progress: Progress,
-    load: Callable[[], PlaceState],
-) -> list[DrivePair]:  # fmt: skip
+def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
+    """Give new drives their place in the order, which stays: a killed join goes on as it began."""
+    library = store.head().library or ""
+    members: dict[str, Member] = {}
+    reasons, known = dict[str, str](), store.drives()
+    for drive, about in known.items():
+        try:
+            member = member_of(store, {**about, "log": urls.get(drive, about["log"])})
+        except VplogError as error:
+            reasons[drive] = f"{drive} is joined with no other drive. {error}"
+            continue
+        if why := apart(member, library, about["library"]):
+            reasons[drive] = why
+        else:
+            members[drive] = member
+    stored = {drive: drive_pairs.read_joins(store, drive) for drive in members}
+    last = max((one.position for one in stored.values() if one is not None), default=-1)
+    placed = {drive: own for drive, own in stored.items() if own is not None and own.member == members[drive].key}
+    for number, drive in enumerate([drive for drive in members if drive not in placed], start=last + 1):
+        placed[drive] = drive_pairs.Joins(number, members[drive].key)
+        drive_pairs.put_joins(store, drive, placed[drive])
+    order = sorted(placed, key=lambda drive: (placed[drive].position, drive))
+    keys = {drive: about["key"] for drive, about in known.items()}
+    number = {drive: at for at, drive in enumerate(order)}
+    return Drives([members[one] for one in order], [placed[one] for one in order], keys, reasons, library, number)
+
+
+def _is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) -> bool:
+    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have."""
+    member, joins = drives.members[at], drives.joins[at]
+    return joins.made_from == drive_pairs.search_key(member, pipeline) and all(
+        drives.counts(at, pair)
+        and pair["ledger"]
+        and drive_pairs.ledger_path(store, member.drive, pair["match"]).is_file()
+        for pair in joins.pairs
+    )
+
+
+def _search(work: _Work, places: Callable[[], PlaceState] | None) -> list[DrivePair]:
     """The candidates of new drives that are worth verifying."""
-    later = [at for at in new if at]  # the first has none before it
+    store, members, pipeline = work.store, work.drives.members, work.pipeline
+    later = [at for at in work.new if at]  # the first has none before it
     if not later:
         return []
-    state = load()
-    found = candidates_of(store, drives.members, later, state, pipeline, threads, progress)
-    return likely_pairs(found, lambda at: places_of(store, drives.members[at], state), state, pipeline.join)
+    state = places() if places else load_places(store.library(work.drives.library), pipeline, work.quiet)
+    found = candidates_of(store, members, later, state, pipeline, work.execution)
+    return likely_pairs(found, lambda at: places_of(store, members[at], state), state, pipeline.join)
 
 
-def _verify(
-    store: Store,
-    drives: Drives,
-    new: Sequence[int],
-    wanted: Sequence[DrivePair],
-    pipeline: Pipeline,
-    executor: Executor | None,
-    threads: int,
-    progress: Progress,
-) -> tuple[int, dict[tuple[str, str], str]]:
+def _verify(work: _Work, wanted: Sequence[DrivePair]) -> tuple[int, dict[tuple[str, str], str]]:
     """Store the ledgers that are not there yet; how many those were, and why others could not be made, by drives."""
-    cameras, failed = _cameras(store, drives, new, wanted, pipeline, executor, threads)
+    store, members, progress = work.store, work.drives.members, work.execution.progress
+    cameras, failed = _cameras(work, wanted)
     reasons: dict[tuple[str, str], str] = {}
 
     def tasks() -> Iterator[PairTask]:
         for at, one in enumerate(wanted):
-            later, earlier = drives.members[one.later], drives.members[one.earlier]
+            later, earlier = members[one.later], members[one.earlier]
             progress("verify between drives", at, len(wanted))
             if why := failed.get(one.later, "") or failed.get(one.earlier, ""):
                 reasons[later.drive, earlier.drive] = why
                 continue
             task = drive_pairs.PairTask(
-                later, earlier, cameras[one.later], cameras[one.earlier], one.proposals, one.shared, pipeline,
-                drives.library, threads,
+                later, earlier, cameras[one.later], cameras[one.earlier], one.proposals, one.shared, work.pipeline,
+                work.drives.library, work.quiet,
             )  # fmt: skip
             if not drive_pairs.is_stored(store, task):
                 yield task
 
     computed, kept_at = 0, time.monotonic()
-    for task, data, why in each_done(drive_pairs.compute_pair, tasks(), executor):
+    for task, data, why in each_done(drive_pairs.compute_pair, tasks(), work.executor):
         if data is None:
             reasons[task.later.drive, task.earlier.drive] = why
         else:
@@ -172,28 +219,20 @@ def _verify(
     return computed, reasons
 
 
-def _cameras(
-    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair], pipeline: Pipeline,
-    executor: Executor | None, threads: int,
-) -> tuple[dict[int, CameraTrust], dict[int, str]]:  # fmt: skip
+def _cameras(work: _Work, wanted: Sequence[DrivePair]) -> tuple[dict[int, CameraTrust], dict[int, str]]:
     """Cameras of the drives that are verified, by number, and why others have none.
 
     New drives are included, paired or not, while their features are in the caches of their runs.
     """
+    store, members, pipeline = work.store, work.drives.members, work.pipeline
     paired = {at for one in wanted for at in (one.later, one.earlier)}
-    cameras: dict[int, CameraTrust] = {}
-    missing: list[int] = []
-    for at in sorted(paired | {at for at in new if drives.members[at].cache.is_dir()}):
-        known = drive_pairs.known_camera(store, drives.members[at], pipeline)
-        if known is None:
-            missing.append(at)
-        else:
-            cameras[at] = known
-    failed: dict[int, str] = {}
-    work = partial(drive_pairs.compute_camera, pipeline=pipeline, threads=threads)
-    for at, (member, camera, why) in zip(
-        missing, each_done(work, [drives.members[at] for at in missing], executor), strict=True
-    ):
+    numbers = sorted(paired | {at for at in work.new if members[at].cache.is_dir()})
+    known = {at: drive_pairs.known_camera(store, members[at], pipeline) for at in numbers}
+    cameras = {at: camera for at, camera in known.items() if camera is not None}
+    missing, failed = [at for at in numbers if at not in cameras], dict[int, str]()
+    compute = partial(drive_pairs.compute_camera, pipeline=pipeline, execution=work.quiet)
+    done = each_done(compute, [members[at] for at in missing], work.executor)
+    for at, (member, camera, why) in zip(missing, done, strict=True):
         if camera is None:
             failed[at] = why
         else:
@@ -202,39 +241,40 @@ def _cameras(
     return cameras, failed
 
 
-def _remember(
-    store: Store, drives: Drives, new: Sequence[int], wanted: Sequence[DrivePair],
-    reasons: dict[tuple[str, str], str], pipeline: Pipeline,
-) -> None:  # fmt: skip
+def _remember(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[str, str], str]) -> None:
     """Write the pairs of each new drive."""
-    of_later: dict[int, list[DrivePair]] = {at: [] for at in new}
-    for one in wanted:
-        of_later[one.later].append(one)
-    for at in new:
-        member, known = drives.members[at], []
-        for one in of_later[at]:
-            earlier = drives.members[one.earlier]
+    store, drives = work.store, work.drives
+    for at in work.new:
+        member, pairs = drives.members[at], []
+        for earlier in (drives.members[one.earlier] for one in wanted if one.later == at):
             why = reasons.get((member.drive, earlier.drive), "")
-            ledger = None if why else drive_pairs.read_ledger(store, member.drive, earlier.drive)
-            known.append({
+            path = drive_pairs.ledger_path(store, member.drive, earlier.drive)
+            ledger = None if why else tables.read_joins(path).get((member.drive, earlier.drive))
+            verdicts = () if ledger is None else ledger.verdict
+            pairs.append({
                 "match": earlier.drive,
                 "match_key": earlier.key,
-                "candidates": 0 if ledger is None else len(ledger),
-                "verified": drive_pairs.verified(ledger),
-                "ledger": "" if why else drive_pairs.made_from(store, member.drive, earlier.drive),
+                "candidates": len(verdicts),
+                "verified": sum(verdict is Verdict.ACCEPTED for verdict in verdicts),
+                "ledger": "" if why else tables.read_metadata(path).get("vplog.made_from", ""),
                 **({"reason": why} if why else {}),
             })  # fmt: skip
-        position = drives.joins[at].position
-        drives.joins[at] = drive_pairs.Joins(
-            position, member.key, drive_pairs.search_key(member, pipeline), tuple(known)
-        )
+        key = drive_pairs.search_key(member, work.pipeline)
+        drives.joins[at] = drive_pairs.Joins(drives.joins[at].position, member.key, key, tuple(pairs))
         drive_pairs.put_joins(store, member.drive, drives.joins[at])
 
 
-def join_map(root: Path, threads: int = 1, progress: Progress = lambda *_: None) -> dict[str, Any]:
-    """`join` of a map as it is, with the settings of its last batch. Raises VplogError."""
-    with reading(root) as store:  # not a map: nothing is made
-        head = store.head()
-    pipeline = Pipeline.read(head.settings, f"{root}/map.json")
-    with writing(root) as store:
-        return {"map": str(root), **join(store, pipeline, None, threads, progress)}
+def _settled_ties(store: Store, drives: Drives) -> list[Tie]:
+    """The pairs that count; the ledgers of others, as of drives that are gone, are removed."""
+    ties = []
+    for at, (member, joins) in enumerate(zip(drives.members, drives.joins, strict=True)):
+        held = [pair for pair in joins.pairs if pair["ledger"] and drives.counts(at, pair)]
+        drive_pairs.forget(store, member.drive, {pair["match"] for pair in held})
+        for pair in held:
+            path = drive_pairs.ledger_path(store, member.drive, pair["match"])
+            if pair["candidates"]:
+                ties.append(Tie(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
+    for folder in store.root.glob("joins/drive=*"):
+        if not (store.root / "runs" / folder.name).is_dir():
+            shutil.rmtree(folder, ignore_errors=True)
+    return ties

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.maps.storage.layout import write_changed
 from vplog.results import run_record
 from vplog.storage.folders import is_below
 from vplog.storage.parquet_limits import check_version
@@ -69,11 +70,5 @@ def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[
 
 
 def write_joint(root: Path, record: dict[str, Any]) -> None:
-    """Write joint.json, unless it holds the record already."""
-    record, path = run_record.plain({"format": FORMAT, **record}), root / "joint.json"
-    try:
-        if path.is_file() and run_record.read_run_json(path) == record:
-            return
-    except ResultError:  # damaged
-        pass
-    run_record.write_run_json(path, record, checksum=True)
+    """Write joint.json, unless it holds the record already. Raises ResultError."""
+    write_changed(root / "joint.json", {"format": FORMAT, **record})

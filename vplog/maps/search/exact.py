@@ -1,8 +1,8 @@
 """The best places of a map for single views, over its index: exactly those of Eq. (1) over every place.
 
-Parts are searched one after the other, each for all views at once, so that a map larger than memory is read once; what
-a view has found so far tells the next part what it need not look at. `search_shard` does it for some of the parts,
-anywhere that reads their files, and what the shards find is merged to what one search would.
+Segments are searched one after the other, each for all views at once, so that a map larger than memory is read once;
+the answers so far bound the next segment's search. `search_shard` does it for some of the segments, anywhere that reads
+their files, and the answers of shards are merged to those of one search.
 """
 
 from __future__ import annotations
@@ -14,81 +14,121 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import ResultError
+from vplog.execution.execution import Execution
 from vplog.maps.search.segment import Segment, open_segment
-from vplog.maps.search.top_k import merge, no_answers
 from vplog.places.code_search import CodeIndex
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Iterable, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
-    from vplog.data import Bytes, Int32s, Ranking
+    from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
     from vplog.maps.search.index import Part
-    from vplog.maps.search.top_k import Answers
     from vplog.places.bobb import Place
     from vplog.places.code_search import Pairing
     from vplog.stages import CodedState
 
-    Progress = Callable[[str, int, int], None]
-
+NONE = np.float32(-np.inf)
+"""Score of no answer."""
 _PARTS_A_TASK = 4
 """Some 600 MB of a large map: seconds of work for the views of a log, against a second to send and start a task."""
 
 
 @dataclass(frozen=True, eq=False)
+class Answers:
+    """The best places for Q views, best first: by falling score, then by drive, then by keyframe. Rows are filled up
+    to K with none."""
+
+    drive: Int32s
+    """(Q, K) number of the drive, in order of IDs."""
+    keyframe: Int32s
+    """(Q, K) row of the drive's keyframes."""
+    score: Float32s
+    """(Q, K), NONE where there are fewer."""
+    support: Int32s
+    """(Q, K) views of the window that agree."""
+
+    @property
+    def count(self) -> Ints:
+        """(Q,) how many of the K there are."""
+        return (self.score > NONE).sum(axis=1)
+
+
+def no_answers(views: int, top: int) -> Answers:
+    """(Q, K) none, to be written to."""
+    drive, keyframe, support = np.zeros((3, views, top), np.int32)
+    return Answers(drive, keyframe, np.full((views, top), NONE, np.float32), support)
+
+
+def answers_of(rankings: Iterable[tuple[Ranking, Int32s]], views: int, drive: int, top: int) -> Answers:
+    """Answers in one drive, from the ranking of its rows and their support for each view in order."""
+    found = no_answers(views, top)
+    found.drive[:] = drive
+    for view, (ranking, support) in enumerate(rankings):
+        count = len(ranking.rows)
+        found.keyframe[view, :count], found.score[view, :count] = ranking.rows, ranking.score
+        found.support[view, :count] = support
+    return found
+
+
+def merge(parts: Sequence[Answers], top: int) -> Answers:
+    """The best of all parts: exactly those of one search, where each part gives its own best in this order."""
+    columns = [np.concatenate([vars(part)[name] for part in parts], axis=1) for name in vars(parts[0])]
+    drive, keyframe, score, _ = columns
+    order = np.lexsort((keyframe, drive, -score), axis=1)[:, :top]
+    return Answers(*(np.take_along_axis(column, order, axis=1) for column in columns))
+
+
+@dataclass(frozen=True, eq=False)
 class Shard:
-    """Some parts of a map to search, as it goes to another process or machine."""
+    """Some segments of a map to search, as a task for another process or machine."""
 
     segments: Sequence[Segment | Path]
     """A file, or the segment itself where it is in memory alone."""
     numbers: Sequence[Int32s]
-    """Of each segment, (D,) number of its drives, -1 where one does not count."""
+    """For each segment, (D,) number of its drives, -1 where one does not count."""
     views: Sequence[Place]
     overlap: Bytes
     """(256, 256) cells that the boxes of two numbers share."""
     pairing: Pairing
     top: int
-    threads: int
+    execution: Execution
 
 
 def best_places(
-    parts: Sequence[Part],
-    state: CodedState,
-    views: Sequence[Place],
-    top: int,
-    threads: int = 1,
+    parts: Sequence[Part], state: CodedState, views: Sequence[Place], top: int, execution: Execution = Execution(),
     executor: Executor | None = None,
-    progress: Progress = lambda *_: None,
-) -> Answers:
+) -> Answers:  # fmt: skip
     """The `top` best of all places for each of Q views. With an executor its workers search, each some of the parts,
-    whose files they must see under the same path; without one `threads` do here. The same answers for any of them."""
+    whose files they must see under the same path. The same answers for any execution."""
     every = Shard(
         [part.path if part.path and executor else part.segment for part in parts],
-        [part.numbers for part in parts], views, state.overlaps(), state.pairing, top, threads,
+        [part.numbers for part in parts], views, state.overlaps(), state.pairing, top, execution,
     )  # fmt: skip
     if executor is None:
-        return search_shard(every, progress)
+        return search_shard(every)
     cuts = [slice(at, at + _PARTS_A_TASK) for at in range(0, len(parts), _PARTS_A_TASK)]
-    shards = [replace(every, segments=every.segments[cut], numbers=every.numbers[cut], threads=1) for cut in cuts]
+    every = replace(every, execution=Execution())
+    shards = [replace(every, segments=every.segments[cut], numbers=every.numbers[cut]) for cut in cuts]
     best = no_answers(len(views), top)
     try:
-        for done, found in enumerate(executor.map(search_shard, shards)):
+        for done, found in enumerate(executor.map(search_shard, shards), start=1):
             best = merge([best, found], top)
-            progress("search", done + 1, len(shards))
+            execution.progress("search", done, len(shards))
     except BrokenExecutor as error:
         raise ResultError(f"A worker was lost while it searched the map: {error}. Run the query again.") from None
     return best
 
 
-def search_shard(shard: Shard, progress: Progress = lambda *_: None) -> Answers:
+def search_shard(shard: Shard) -> Answers:
     """The best of the shard's places for each view. Raises ResultError where a segment is gone or damaged."""
     best = no_answers(len(shard.views), shard.top)
-    with ThreadPoolExecutor(shard.threads) as pool:
-        for done, (where, numbers) in enumerate(zip(shard.segments, shard.numbers, strict=True)):
+    with ThreadPoolExecutor(shard.execution.threads) as pool:
+        for done, (where, numbers) in enumerate(zip(shard.segments, shard.numbers, strict=True), start=1):
             segment = where if isinstance(where, Segment) else _open(where)
             best = merge([best, *_search_segment(segment, numbers, shard, best, pool)], shard.top)
-            progress("search", done + 1, len(shard.segments))
+            shard.execution.progress("search", done, len(shard.segments))
     return best
 
 
@@ -106,9 +146,9 @@ def _search_segment(
     segment: Segment, numbers: Int32s, shard: Shard, best: Answers, pool: ThreadPoolExecutor
 ) -> list[Answers]:
     """The best of a segment for each view: by view where they are many, else by view and stretch of blocks."""
-    index = CodeIndex.of(segment.lists, shard.overlap, shard.pairing)
+    index, threads = CodeIndex.of(segment.lists, shard.overlap, shard.pairing), shard.execution.threads
     runs = segment.first[:-1], numbers >= 0
-    pieces = 1 if len(shard.views) >= 2 * shard.threads else shard.threads
+    pieces = 1 if len(shard.views) >= 2 * threads else threads
     cuts = np.linspace(0, index.blocks, pieces + 1).astype(int).tolist()
 
     def find(task: tuple[int, int]) -> Ranking:
@@ -118,7 +158,7 @@ def _search_segment(
 
     found = [no_answers(len(shard.views), shard.top) for _ in range(pieces)]
     tasks = [(view, piece) for view in range(len(shard.views)) for piece in range(pieces)]
-    rankings = map(find, tasks) if shard.threads == 1 else pool.map(find, tasks)  # a thread takes time to start
+    rankings = map(find, tasks) if threads == 1 else pool.map(find, tasks)  # a thread takes time to start
     for (view, piece), ranking in zip(tasks, rankings, strict=True):
         count = len(ranking.rows)
         owner = np.searchsorted(segment.first, ranking.rows, side="right") - 1

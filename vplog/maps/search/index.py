@@ -1,9 +1,8 @@
 """The index of a map on disk: segments, of which each holds the places of some drives.
 
 It grows as a log-structured index does: new drives make a new segment, which takes in those not larger than itself, so
-that there are few of them and a place is written again only as often as the map doubles. A segment says whose places
-it has, by content: which ones serve is told from what lies in MAP/index alone, and no list can be out of date. The
-folder may be removed at any time.
+that there are few of them and a place is written again only as often as the map doubles. A segment names its drives by
+content, so MAP/index alone tells which segments serve. The folder may be removed at any time.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
@@ -21,27 +19,26 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
+from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
+from vplog.maps.storage.contents import other_library
 from vplog.maps.storage.damage import DamagedDriveError, reading_drive
 from vplog.maps.storage.layout import ADD_AGAIN
-from vplog.maps.storage.map_store import other_library
 from vplog.results import tables
 from vplog.storage.parquet_limits import check_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from vplog.data import Int32s
     from vplog.maps.storage.map_store import Store
-    from vplog.stages import CodedState
-
-    Progress = Callable[[str, int, int], None]
+    from vplog.stages import CodedState, PlaceState
 
 CAPACITY = 1 << 20
 """Places of a segment, unless a single drive has more: some 140 MB, and while it is made twice that in memory."""
 _LEFT_OVER_S = 86_400.0
-"""A half-written file of a process that was killed goes after a day: none takes that long."""
+"""Age of a half-written file of a process that was killed: no segment takes a day."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,28 +58,23 @@ class Part:
 
 
 def update_index(
-    store: Store,
-    drives: Mapping[str, Mapping[str, Any]],
-    library: str,
-    state: CodedState,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
+    store: Store, drives: Mapping[str, Mapping[str, Any]], state: CodedState, execution: Execution = Execution()
 ) -> tuple[list[Part], list[str]]:
-    """The parts that together have every place of the drives once, and what was wrong.
+    """The parts that together have every place of the drives once, and warnings.
 
-    What is missing is made and written; what no drive needs any more is removed. A map that cannot be written to is
-    indexed in memory. Raises ResultError or LibraryError where descriptors cannot be read or are of another library.
+    Missing segments are made and written; those that no drive needs any more are removed. A map that cannot be written
+    to is indexed in memory. Raises ResultError or LibraryError where descriptors cannot be read or are of another
+    library.
     """
-    with ThreadPoolExecutor(threads) as pool:
-        wanted = list(pool.map(lambda drive: content_of(store, drive, drives[drive]["key"]), drives))
-    known, useless, warnings = _open_all(store, library, state)
+    wanted = list(execution.map(lambda drive: content_of(store, drive, drives[drive]["key"]), drives))
+    known, useless, warnings = _open_all(store, state)
     parts, missing = _cover(known, wanted)
     absorbed, groups = _plan(parts, missing, {one: store.rows("descriptors", one.drive) for one in missing})
     parts = [part for part in parts if part not in absorbed]
     numbers = {one: number for number, one in enumerate(wanted)}
     done = 0
     for group in groups:
-        segment, path = _build(store, group, library, state, threads), None
+        segment, path = _build(store, group, state, execution), None
         try:
             path = write_segment(store.index, segment)
             segment = open_segment(path)
@@ -91,24 +83,19 @@ def update_index(
             warnings += [] if done else [f"The index is not stored, so every query builds it again. {error}"]
         parts.append(Part(segment, path, np.array([numbers[one] for one in group], np.int32)))
         done += len(group)
-        progress("index", done, sum(map(len, groups)))
+        execution.progress("index", done, sum(map(len, groups)))
     used = {part.path for part in parts}
     if all(part.path for part in parts):
         _remove([path for path in [*useless, *(path for _, path in known)] if path not in used], store)
     return parts, warnings
 
 
-def _in_cache(store: Store) -> bool:
-    """Whether the index is kept where nothing is taken on trust."""
-    return store.mirror is not None and store.mirror.cache is not None
-
-
 def content_of(store: Store, drive: str, key: str) -> Content:
-    """What a drive holds now; on an object store as its manifest says. Raises ResultError."""
-    if store.mirror is not None and (mark := store.mirror.digest(drive, "descriptors.parquet")):
-        return Content(drive, key, mark)
+    """The drive's content now; on an object store by its manifest. Raises ResultError."""
+    if store.mirror is not None and (entry := store.mirror.manifests[drive]["files"].get("descriptors.parquet")):
+        return Content(drive, key, entry["sha256"])
     with reading_drive(drive):
-        return Content(drive, key, _footer_hash(_descriptors(store, drive)))
+        return Content(drive, key, _footer_hash(store.file(drive, "descriptors.parquet")))
 
 
 def _footer_hash(path: Path) -> str:
@@ -124,35 +111,28 @@ def _footer_hash(path: Path) -> str:
             stream.seek(size - 8 - length)
             return hashlib.sha256(stream.read(length)).hexdigest()
     except OSError as error:
-        raise ResultError(
-            f"{path} cannot be read: {error.strerror or error}. Check its permissions, or {ADD_AGAIN}"
-        ) from None
+        why = error.strerror or error
+        raise ResultError(f"{path} cannot be read: {why}. Check its permissions, or {ADD_AGAIN}") from None
 
 
-def _descriptors(store: Store, drive: str) -> Path:
-    return store.file(drive, "descriptors.parquet")
-
-
-def _open_all(
-    store: Store, library: str, state: CodedState
-) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
+def _open_all(store: Store, state: CodedState) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
     """The segments that fit the library, the files that are of no use, and why the damaged ones are not."""
     known, useless, warnings = [], [], []
-    shape = state.shape
+    cached = store.mirror is not None and store.mirror.cache is not None
     for path in sorted(store.index.glob(f"*{SUFFIX}")):
         try:
             segment = open_segment(path)
-            if _in_cache(store):
+            if cached:
                 with suppress(OSError):
-                    os.utime(path)  # what was not used for longest goes first
+                    os.utime(path)  # least recently used files go first
         except FileNotFoundError:  # another process has put it into a larger one
             continue
         except ResultError as error:
             useless.append(path)
-            warnings += [] if _in_cache(store) else [f"{error} It was left out."]  # there it costs time alone
+            warnings += [] if cached else [f"{error} It was left out."]  # in a cache it costs time alone
             continue
-        fits = segment.library == library
-        if fits and (segment.lists.start.shape[0], segment.lists.boxes.shape[1]) == shape:
+        shape = (segment.lists.start.shape[0], segment.lists.boxes.shape[1])
+        if segment.library == state.hash and shape == state.shape:
             known.append((segment, path))
         else:
             useless.append(path)
@@ -176,18 +156,15 @@ def _plan(
     """Which parts are put into new ones, and the drives of each new one, in order of IDs."""
     absorbed, total = [], sum(places[one] for one in missing)
     for part in sorted(parts, key=lambda part: part.places):
-        mostly_gone = 2 * part.places < len(part.segment)
-        small = part.places <= min(total, CAPACITY // 2)
-        if mostly_gone or small:
+        if 2 * part.places < len(part.segment) or part.places <= min(total, CAPACITY // 2):  # mostly gone, or small
             absorbed.append(part)
             total += part.places
             counts = np.diff(part.segment.first).tolist()
             alive = zip(part.segment.contents, counts, part.numbers.tolist(), strict=True)
             places |= {one: count for one, count, number in alive if number >= 0}
-    groups: list[list[Content]] = []
-    held = CAPACITY + 1
+    groups, held = list[list[Content]](), 0
     for one in sorted(places):
-        if held + places[one] > CAPACITY:
+        if not groups or held + places[one] > CAPACITY:
             groups.append([])
             held = 0
         groups[-1].append(one)
@@ -195,19 +172,15 @@ def _plan(
     return absorbed, groups
 
 
-def _build(store: Store, group: Sequence[Content], library: str, state: CodedState, threads: int) -> Segment:
+def _build(store: Store, group: Sequence[Content], state: CodedState, execution: Execution) -> Segment:
     def read(one: Content) -> pa.Array:
-        path = _descriptors(store, one.drive)
-        with reading_drive(one.drive):
-            column, made_by = tables.read_descriptors(path)
-            if made_by != library:
-                raise LibraryError(other_library(store, one.drive, made_by, library))
+        column = read_column(store, one.drive, state)
         if content_of(store, one.drive, one.key) != one:
+            path = store.file(one.drive, "descriptors.parquet")
             raise ResultError(f"{path} was replaced while it was read. Run again.")
-        return as_described(store, one.drive, column, state)
+        return column
 
-    with ThreadPoolExecutor(threads) as pool:
-        columns = list(pool.map(read, group))
+    columns = list(execution.map(read, group))
     first = np.array(list(accumulate(map(len, columns), initial=0)), np.int64)
     try:
         lists = state.lists(*columns)
@@ -216,27 +189,29 @@ def _build(store: Store, group: Sequence[Content], library: str, state: CodedSta
             with reading_drive(one.drive):
                 state.lists(column)
         raise
-    return Segment(library, tuple(group), first, lists)
+    return Segment(state.hash, tuple(group), first, lists)
 
 
-def as_described(store: Store, drive: str, column: pa.Array, state: Any) -> pa.Array:
-    """A drive's descriptors in the type of the recogniser. Raises ResultError where they are of another one."""
+def read_column(store: Store, drive: str, state: PlaceState) -> pa.Array:
+    """A drive's descriptors in the type of the recogniser. Raises DamagedDriveError where they cannot be read, or are
+    of another library or recogniser."""
+    path = store.file(drive, "descriptors.parquet")
+    with reading_drive(drive):
+        column, made_by = tables.read_descriptors(path)
+        if made_by != state.hash:
+            raise LibraryError(other_library(store, drive, made_by, state.hash))
     try:
         return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:
         raise DamagedDriveError(
-            f"{_descriptors(store, drive)} is of another recogniser. Where it should not be, {ADD_AGAIN}", drive
+            f"{path} is of another recogniser. Where it should not be, {ADD_AGAIN}", drive
         ) from None
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:
-    """Who has them open keeps them. A file that cannot be removed does no harm."""
-    parts = list(store.index.glob(".*.part"))
-    for path in [*paths, *parts]:
-        try:
-            if path not in parts or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
+    """Remove segments, and parts of writers that were killed. Who has a file open keeps it, and one that cannot be
+    removed does no harm."""
+    for path in [*paths, *store.index.glob(".*.part")]:
+        with suppress(OSError):  # its writer has just renamed it, or it is a folder
+            if path.suffix != ".part" or path.stat().st_mtime < time.time() - _LEFT_OVER_S:
                 path.unlink(missing_ok=True)
-        except (FileNotFoundError, IsADirectoryError):  # whoever wrote it has just renamed it; or it is none of ours
-            continue
-        except OSError:
-            return

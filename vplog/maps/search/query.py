@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,8 @@ from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import update_index
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
 from vplog.maps.storage import map_store
-from vplog.maps.storage.damage import left_out, reading_drive, without_damaged
+from vplog.maps.storage.contents import left_out, without_damaged
+from vplog.maps.storage.damage import reading_drive
 from vplog.pipeline import Pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import tables
@@ -24,96 +25,98 @@ from vplog.stages import CodedState
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
     import pyarrow as pa
 
     from vplog.data import Ints
+    from vplog.maps.search.exact import Answers
     from vplog.maps.search.index import Part
-    from vplog.maps.search.top_k import Answers
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.map_store import Store
     from vplog.stages import Log, PlaceState
 
-    Progress = Callable[[str, int, int], None]
+
+@dataclass(frozen=True)
+class MapQuery:
+    """A query of a map, and what it is answered with."""
+
+    top: int = 10
+    """Places for each view."""
+    sequence: int | None = None
+    """Views in a window, within which lines run; 1: each view for itself; None: as the map's settings have it."""
+    out: Path | None = None
+    """Table of the answers."""
+    executor: Executor | None = None
+    """Workers that search the map, whose folder they see under the same path."""
+    cache: Cache | None = None
+    """Where the files of a map on an object store are read from, but for its manifests."""
 
 
 def query_map(
-    root: Path,
-    path: Path,
-    topics: logs.TopicChoice | None = None,
-    top: int = 10,
-    sequence: int | None = None,
-    out: Path | None = None,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
-    executor: Executor | None = None,
-    cache: Cache | None = None,
-) -> dict[str, Any]:
-    """The `top` places of the map that are most like each view of a log, in `out` too where given.
+    root: Path, path: Path, topics: logs.TopicChoice | None = None, query: MapQuery = MapQuery(),
+    execution: Execution = Execution(),
+) -> dict[str, Any]:  # fmt: skip
+    """The `top` places of the map that are most like each view of a log.
 
-    Views are chosen and described as the map's drives were, with its library. With `sequence` views in a window (None:
-    as the map's settings say; 1: each view for itself) lines run within a drive. With an executor its workers search
-    the map; they must see its folder. With a cache a map on an object store is read from there, but for its manifests.
-    Raises VplogError with one line.
+    Views are chosen and described as the map's drives were, with its library. Raises VplogError with one line.
     """
+    out = query.out
     if out is not None and not out.parent.is_dir():  # before any work
         raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
     if out is not None and out.is_dir():
         raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
-    with map_store.reading(root, cache) as store:
-        _, pipeline, state = open_map(store, threads)
+    with map_store.reading(root, query.cache) as store:
+        _, pipeline, state = open_map(store, execution)
         settings = pipeline.sequence
-        if sequence is not None:
-            settings = SequenceSettings.read({**settings.model_dump(), "length": sequence}, "--sequence")
+        if query.sequence is not None:
+            settings = SequenceSettings.read({**settings.model_dump(), "length": query.sequence}, "--sequence")
         log = logs.open(path, topics)
-        stamps, descriptors, warnings = describe_log(log, pipeline, state, threads, progress)
+        stamps, descriptors, warnings = describe_log(log, pipeline, state, execution)
 
         def look() -> tuple[list[str], Answers, list[str], pa.Table]:
             drives = map_store.one_library(store)[1]
             short = _short(store, drives, settings.length)
-            answers, told = search(store, drives, state, descriptors, top, settings, threads, progress, executor)
-            return list(drives), answers, short + told, _table(store, list(drives), answers, stamps)
+            answers, more = search(store, drives, state, descriptors, query, settings, execution)
+            return list(drives), answers, short + more, _table(store, list(drives), answers, stamps)
 
-        drives, answers, told, table = without_damaged(store, look)
+        drives, answers, more, table = without_damaged(store, look)
         warnings += left_out(store)
     if out is not None:
         pipeline = pipeline.model_copy(update={"sequence": settings})
         tables.write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
+    answered = answers.count > 0
+    best = answers.drive[answered, :1]
     return {
         "map": str(root),
         "log": str(path),
         "library": state.hash,
-        "top": top,
+        "top": query.top,
         "sequence": settings.length,
         "written": None if out is None else str(out),
         "views": len(stamps),
-        "answered": int((answers.count > 0).sum()),
-        "best_by_drive": {
-            drive: int((answers.drive[answers.count > 0, :1] == number).sum()) for number, drive in enumerate(drives)
-        },
-        "warnings": log.warnings + warnings + told,
+        "answered": int(answered.sum()),
+        "best_by_drive": {drive: int((best == number).sum()) for number, drive in enumerate(drives)},
+        "warnings": log.warnings + warnings + more,
         "answers": table.to_pylist(),
     }
 
 
-def index_map(
-    root: Path, threads: int = 1, progress: Progress = lambda *_: None, cache: Cache | None = None
-) -> dict[str, Any]:
+def index_map(root: Path, execution: Execution = Execution(), cache: Cache | None = None) -> dict[str, Any]:
     """Bring the index of a map up to its drives, which the next query would do; that of a map on an object store in
     the cache. Raises VplogError with one line."""
     if isinstance(root, RemotePath) and cache is None:
         raise ResultError(f"The index of {root} is stored in a cache only, and there is none. Name one with --cache.")
     with map_store.reading(root, cache) as store:
-        _, _, state = open_map(store, threads)
+        _, _, state = open_map(store, execution)
         if not isinstance(state, CodedState):
             raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
 
         def update() -> tuple[dict[str, Any], list[Part], list[str]]:
             drives = map_store.one_library(store)[1]
-            return drives, *update_index(store, drives, state.hash, state, threads, progress)
+            return drives, *update_index(store, drives, state, execution)
 
         drives, parts, warnings = without_damaged(store, update)
         files = [part.path for part in parts if part.path is not None]
@@ -127,7 +130,7 @@ def index_map(
         }
 
 
-def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pipeline, PlaceState]:
+def open_map(store: Store, execution: Execution) -> tuple[dict[str, dict[str, Any]], Pipeline, PlaceState]:
     """The drives of a map, its settings, and the library that describes its places. Raises VplogError."""
     library, drives = map_store.one_library(store)
     pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
@@ -137,11 +140,11 @@ def open_map(store: Store, threads: int) -> tuple[dict[str, dict[str, Any]], Pip
             f"{store} has lost its library {library}. Copy it back to {folder}, or describe the map again: vplog "
             f"map redescribe {store} --library LIB -o MAP"
         )
-    return drives, pipeline, pipeline.places.load(folder, Execution(threads))
+    return drives, pipeline, pipeline.places.load(folder, Execution(execution.threads))
 
 
 def describe_log(
-    log: Log, pipeline: Pipeline, state: PlaceState, threads: int, progress: Progress = lambda *_: None
+    log: Log, pipeline: Pipeline, state: PlaceState, execution: Execution
 ) -> tuple[Ints, list[Any], list[str]]:
     """Stamps (Q,) and descriptors of the keyframes of a log, and what was lost; of all frames without odometry.
 
@@ -153,66 +156,59 @@ def describe_log(
         stamps = keyframes.stamp_ns
     else:
         warnings.append(f"{log.name} has no odometry, so every frame is a query.")
-    execution = Execution(threads, progress)
     frames = extract_frames(log.frames(stamps), pipeline.features, execution, pipeline.stereo)
 
     def describe(found: Any) -> tuple[int, Any, str]:
         stamp_ns, _, features, why = found
         return stamp_ns, None if features is None else state.describe(features), why
 
-    seen, descriptors, lost = [], [], []
+    described, descriptors, lost = [], [], []
     for stamp_ns, descriptor, why in execution.counted("describe", execution.map(describe, frames), len(stamps)):
         if descriptor is None:
             lost.append(why)
         else:
-            seen.append(stamp_ns)
+            described.append(stamp_ns)
             descriptors.append(descriptor)
-    if not seen:
+    if not described:
         raise LogError(f"{log.name}: none of {len(stamps)} frames could be decoded. {' '.join(lost[:1])}")
     if lost:
         warnings.append(f"{len(lost)} of {len(stamps)} views were lost to damaged images. First: {lost[0]}")
-    return np.array(seen, np.int64), descriptors, warnings
+    return np.array(described, np.int64), descriptors, warnings
 
 
 def search(
-    store: Store,
-    drives: Mapping[str, Mapping[str, Any]],
-    state: PlaceState,
-    descriptors: Sequence[Any],
-    top: int,
-    settings: SequenceSettings,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
-    executor: Executor | None = None,
-) -> tuple[Answers, list[str]]:
-    """The `top` best places of all drives for each of Q views in order, and what the user should know of them.
+    store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState, descriptors: Sequence[Any],
+    query: MapQuery, settings: SequenceSettings, execution: Execution = Execution(),
+) -> tuple[Answers, list[str]]:  # fmt: skip
+    """The best places of all drives for each of Q views in order, and warnings.
 
     Ties go to the earlier drive, then row. Single views are ranked exactly, by the map's index where the recogniser is
     `bobb`. Lines are drawn in every drive of a map of up to EXACT_PLACES, else in the likely ones (`sequences.py`).
     """
-    numbered = dict(enumerate(drives))
+    numbered, warnings, executor = dict(enumerate(drives)), list[str](), query.executor
     if not isinstance(state, CodedState):
-        top = min(top, sum(store.rows("descriptors", drive) for drive in drives))
-        told = [] if executor is None else ["Ray was not used: a map of another recogniser than bobb is searched here."]
-        return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
-    parts, told = update_index(store, drives, state.hash, state, threads, progress)
-    if store.mirror is not None:  # workers elsewhere do not see these files
-        parts = [replace(part, path=None) for part in parts]
-    places = sum(part.places for part in parts)
-    top = min(top, places)
-    if settings.length == 1:
-        return best_places(parts, state, descriptors, top, threads, executor, progress), told
-    if places > EXACT_PLACES:
-        single = best_places(parts, state, descriptors, PLACES_A_VIEW, threads, executor, progress)
-        numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
-        told.append(f"Sequences were searched in the {len(numbered)} of {len(drives)} drives most like single views.")
-    elif executor is not None:
-        told.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
-    return best_lines(store, numbered, state, state.hash, descriptors, top, settings, threads, progress), told
+        places = sum(store.rows("descriptors", drive) for drive in drives)
+        if executor is not None:
+            warnings.append("Ray was not used: a map of another recogniser than bobb is searched here.")
+    else:
+        parts, warnings = update_index(store, drives, state, execution)
+        if store.mirror is not None:  # workers elsewhere do not see these files
+            parts = [replace(part, path=None) for part in parts]
+        places = sum(part.places for part in parts)
+        if settings.length == 1:
+            return best_places(parts, state, descriptors, min(query.top, places), execution, executor), warnings
+        if places > EXACT_PLACES:
+            single = best_places(parts, state, descriptors, PLACES_A_VIEW, execution, executor)
+            numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
+            count = f"{len(numbered)} of {len(drives)}"
+            warnings.append(f"Sequences were searched in the {count} drives most like single views.")
+        elif executor is not None:
+            warnings.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
+    return best_lines(store, numbered, state, descriptors, min(query.top, places), settings, execution), warnings
 
 
 def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
-    """What to do where a window of views is longer than drives: of what is usual in them there is too little."""
+    """A warning where a window of views is longer than drives: they have too few places for its statistics."""
     short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
     if not short:
         return []

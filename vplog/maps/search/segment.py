@@ -16,10 +16,10 @@ import hashlib
 import json
 import zlib
 from dataclasses import asdict, dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from vplog.errors import ResultError
 from vplog.places.code_lists import MOST_ROWS, CodeLists, check_lists
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from vplog.data import Ints
+    from vplog.data import Bytes, Ints
 
 SUFFIX = ".lists"
 _MAGIC = b"vplists\n"
@@ -39,19 +39,17 @@ _FORMAT = 2
 _CRC_BYTES = 4
 _ALIGNED = 64
 """Bytes; a line of the cache, and more than any number needs."""
-_MOST_REFERENCES = 65_535
-"""A reference's number has 16 bits, and the last one is none."""
-_MOST_WINDOWS = 256
-"""16 windows along each side, as the settings have it."""
+_MOST_PLACES = 2**31 - 1
+"""A row has 31 bits."""
 
 
 @dataclass(frozen=True, order=True)
 class Content:
-    """Whose places a segment holds: a drive as it was when they were read."""
+    """A drive of a segment, as it was when its places were read."""
 
     drive: str
     key: str
-    """Of drive.json: hash of all that the drive was made from."""
+    """Key in drive.json: hash of all that the drive was made from."""
     mark: str
     """Hash of the footer of its descriptors.parquet, which tells another table even where the key is the same; on an
     object store that of the whole file, which its manifest has."""
@@ -108,7 +106,7 @@ def write_segment(folder: Path, segment: Segment) -> Path:
 
 
 def _blocks(segment: Segment) -> Iterator[bytes | memoryview]:
-    """What its file holds, but for the checksum."""
+    """The bytes of its file, but for the checksum."""
     header = segment.header
     yield (start := _MAGIC + len(header).to_bytes(8, "little") + header)
     at = len(start)
@@ -120,96 +118,99 @@ def _blocks(segment: Segment) -> Iterator[bytes | memoryview]:
             at += len(data)
 
 
+class _Drive(BaseModel, strict=True):
+    drive: str
+    key: str
+    mark: str
+    places: Annotated[int, Field(ge=0, le=_MOST_PLACES)]
+
+
+class _Header(BaseModel, strict=True):
+    library: str
+    block: Annotated[int, Field(gt=0, le=MOST_ROWS)]
+    references: Annotated[int, Field(ge=0, le=65_535)]
+    """A reference's number has 16 bits, and the last one is none."""
+    windows: Annotated[int, Field(ge=0, le=256)]
+    """16 windows along each side, as the settings have it."""
+    entries: Annotated[int, Field(ge=0, le=2**48)]
+    drives: list[_Drive]
+
+
+class _OtherVersionError(Exception):
+    """The format of a segment is not _FORMAT."""
+
+
 def open_segment(path: Path) -> Segment:
     """A segment whose arrays stay in the file, which is read through once for its checksum.
 
-    The file may be anyone's: sizes are held to that of the file, and what kernels follow is looked at. Raises
-    ResultError where it is no segment or a damaged one, and FileNotFoundError where it is gone.
+    The file may be anyone's: sizes are held to that of the file, and indices to their ranges. Raises ResultError where
+    it is no segment, a damaged one or of another version, and FileNotFoundError where it is gone.
     """
     try:
         check_file(path)
         with path.open("rb") as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            start = stream.read(16)
-            length = int.from_bytes(start[8:], "little")
-            if len(start) < 16 or not start.startswith(_MAGIC) or length > size - 16:
+            if not stream.read(1):
                 raise ResultError("It is not a part of an index.")
-            header = _header(stream.read(length))
-            places = [one["places"] for one in header["drives"]]
-            shapes = _shapes(header, sum(places))
-            ends, at = [], 16 + length
-            for kind, shape in shapes:
-                at += -at % _ALIGNED
-                ends.append(at)
-                at += np.dtype(kind).itemsize * int(np.prod([int(n) for n in shape], dtype=object))
-            if at + _CRC_BYTES != size:
-                raise ResultError(f"It has {size} bytes, and its header claims {at + _CRC_BYTES}.")
-            whole = np.asarray(np.memmap(stream, np.uint8, "r"))
-            if zlib.crc32(whole[:at].data).to_bytes(_CRC_BYTES, "little") != whole[at:].tobytes():
-                raise ResultError("Its checksum does not match.")
+            return _parsed(np.asarray(np.memmap(stream, np.uint8, "r")))
     except FileNotFoundError:
         raise
     except OSError as error:
         raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
     except ResultError as error:
         raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
-    ends.append(at)
-    parts = [
-        whole[a : a + np.dtype(kind).itemsize * int(np.prod(shape))].view(kind).reshape(shape)
-        for (kind, shape), (a, _) in zip(shapes, pairwise(ends), strict=True)
-    ]
-    lists = CodeLists(*parts, block=header["block"])
-    try:
-        check_lists(lists)
-    except ResultError as error:
-        raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
-    contents = tuple(Content(one["drive"], one["key"], one["mark"]) for one in header["drives"])
-    return Segment(header["library"], contents, np.cumsum([0, *places]), lists)
+    except _OtherVersionError:
+        raise ResultError(f"{path} is of another version of vplog. The index is built again without it.") from None
 
 
-def _header(text: bytes) -> dict[str, Any]:
-    """The header, every value of the kind and within the limits that it must have. Raises ResultError."""
+def _parsed(whole: Bytes) -> Segment:
+    """The segment in the bytes of a file. Raises ResultError where they are damaged."""
+    start = whole[:16].tobytes()
+    length = int.from_bytes(start[8:], "little")
+    if len(start) < 16 or not start.startswith(_MAGIC) or length > len(whole) - 16:
+        raise ResultError("It is not a part of an index.")
+    header = _header(whole[16 : 16 + length].tobytes())
+    places = [one.places for one in header.drives]
+    slices, at = [], 16 + length
+    for kind, shape in _shapes(header, sum(places)):
+        at += -at % _ALIGNED
+        stop = at + np.dtype(kind).itemsize * int(np.prod([int(n) for n in shape], dtype=object))
+        slices.append((kind, shape, at, stop))
+        at = stop
+    if at + _CRC_BYTES != len(whole):
+        raise ResultError(f"It has {len(whole)} bytes, and its header claims {at + _CRC_BYTES}.")
+    if zlib.crc32(whole[:at].data).to_bytes(_CRC_BYTES, "little") != whole[at:].tobytes():
+        raise ResultError("Its checksum does not match.")
+    parts = [whole[start:stop].view(kind).reshape(shape) for kind, shape, start, stop in slices]
+    lists = CodeLists(*parts, block=header.block)
+    check_lists(lists)
+    contents = tuple(Content(one.drive, one.key, one.mark) for one in header.drives)
+    return Segment(header.library, contents, np.cumsum([0, *places]), lists)
+
+
+def _header(text: bytes) -> _Header:
+    """The header, every value within its limits. Raises ResultError."""
     try:
         header = json.loads(text)
     except (ValueError, RecursionError):
         raise ResultError("Its header is not JSON.") from None
-    if not isinstance(header, dict) or header.get("format") != _FORMAT:
-        raise ResultError("Its header is of another version.")
-    most = {"block": MOST_ROWS, "references": _MOST_REFERENCES, "windows": _MOST_WINDOWS, "entries": 2**48}
-    drives = header.get("drives")
-    sound = (
-        all(_is_count(header.get(name), limit) for name, limit in most.items())
-        and header["block"] > 0
-        and isinstance(header.get("library"), str)
-        and isinstance(drives, list)
-        and all(_is_drive(one) for one in drives)
-    )
-    if not sound:
-        raise ResultError("Its header lacks a value, or has one that cannot be.")
-    return header
+    if isinstance(header, dict) and type(header.get("format")) is int and header["format"] != _FORMAT:
+        raise _OtherVersionError
+    try:
+        return _Header.model_validate(header)
+    except ValidationError:
+        raise ResultError("Its header lacks a value, or has one that cannot be.") from None
 
 
-def _is_count(value: object, most: int) -> bool:
-    return type(value) is int and 0 <= value <= most
-
-
-def _is_drive(value: object) -> bool:
-    if not isinstance(value, dict) or not _is_count(value.get("places"), 2**31 - 1):
-        return False
-    return all(isinstance(value.get(name), str) for name in ("drive", "key", "mark"))
-
-
-def _shapes(header: dict[str, Any], places: int) -> Sequence[tuple[str, tuple[int, ...]]]:
+def _shapes(header: _Header, places: int) -> Sequence[tuple[str, tuple[int, ...]]]:
     """Type and shape of each array, in the order of `CodeLists.parts`."""
-    if places > 2**31 - 1:
+    if places > _MOST_PLACES:
         raise ResultError(f"It would hold {places} places, and a row has 31 bits.")
-    entries, blocks = header["entries"], -(-places // header["block"])
+    entries, blocks = header.entries, -(-places // header.block)
     return [
-        ("<i8", (header["references"], blocks + 1)),
+        ("<i8", (header.references, blocks + 1)),
         ("<u2", (entries,)),
         ("u1", (entries,)),
         ("u1", (entries,)),
-        ("u1", (entries, header["windows"])),
+        ("u1", (entries, header.windows)),
         ("<u4", (places,)),
     ]

@@ -13,26 +13,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
-from vplog.maps.search.index import as_described
-from vplog.maps.search.top_k import NONE, Answers, answers_of, merge, no_answers
+from vplog.maps.search.exact import NONE, Answers, answers_of, merge, no_answers
+from vplog.maps.search.index import read_column
 from vplog.maps.storage.damage import reading_drive
-from vplog.maps.storage.map_store import other_library
 from vplog.places.sequence import rank_places
-from vplog.results import tables
 from vplog.stages import index_of_part
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from typing import Any
 
     from vplog.data import Floats, Int32s, Ints
     from vplog.maps.storage.map_store import Store
     from vplog.places.sequence import SequenceSettings
     from vplog.stages import PlaceState
-
-    Progress = Callable[[str, int, int], None]
 
 EXACT_PLACES = 200_000
 """Up to so many places lines are drawn in every drive: some minutes of one core for a log of a thousand views."""
@@ -43,33 +38,22 @@ _DRIVES_A_STRETCH = 8
 
 
 def best_lines(
-    store: Store,
-    drives: Mapping[int, str],
-    state: PlaceState,
-    library: str,
-    descriptors: Sequence[Any],
-    top: int,
-    settings: SequenceSettings,
-    threads: int = 1,
-    progress: Progress = lambda *_: None,
-) -> Answers:
+    store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], top: int,
+    settings: SequenceSettings, execution: Execution,
+) -> Answers:  # fmt: skip
     """The `top` best places of some drives, by their numbers in the map, for each of Q views in order.
 
     Drives are read one after the other, so memory is that of the largest. Works for any recogniser, and for a window
     of one view. Raises LibraryError where a drive's descriptors are of another library.
     """
     best = no_answers(len(descriptors), top)
-    for done, (number, drive) in enumerate(drives.items()):
-        path = store.file(drive, "descriptors.parquet")
+    for number, drive in execution.counted("search", drives.items(), len(drives)):
+        column = read_column(store, drive, state)
         with reading_drive(drive):
-            column, made_by = tables.read_descriptors(path)
-            if made_by != library:
-                raise LibraryError(other_library(store, drive, made_by, library))
-            index = index_of_part(state, state.from_arrow(as_described(store, drive, column, state)))
+            index = index_of_part(state, state.from_arrow(column))
         stops = np.full(len(descriptors), len(column), np.int64)
-        rankings = rank_places(index, descriptors, stops, top, settings, Execution(threads))
+        rankings = rank_places(index, descriptors, stops, top, settings, Execution(execution.threads))
         best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)
-        progress("search", done + 1, len(drives))
     return best
 
 

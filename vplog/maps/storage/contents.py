@@ -13,8 +13,8 @@ import pyarrow as pa
 import vplog
 from vplog.errors import LibraryError, NewerError, ResultError
 from vplog.maps.geo_bounds import earth_from_plain, earth_of_run
-from vplog.maps.storage.damage import check_at_hand, damaged_files, reading_drive
-from vplog.maps.storage.layout import ADD_AGAIN, AT_HAND, FORMAT, HASH, drive_record, folder_name
+from vplog.maps.storage.damage import DamagedDriveError, check_at_hand, damaged_files, reading_drive
+from vplog.maps.storage.layout import ADD_AGAIN, AT_HAND, FORMAT, HASH, drive_record, folder_name, write_changed
 from vplog.maps.storage.upload import send_rest, write_json
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     T = TypeVar("T")
 
 _TRIES, _PAUSE_S = 6, 0.02
-"""A drive is read again where it was replaced while it was read, after a pause that doubles: 1.3 s in all. A batch
-replaces each once, and a rename takes less than a millisecond."""
+"""Reads of a drive that is replaced meanwhile, with a pause that doubles: 1.3 s in all. A batch replaces each drive
+once, and a rename takes less than a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -46,56 +46,51 @@ class Head:
 
 @dataclass(frozen=True)
 class Store:
-    """The names in a map. Of one on an object store `root` is a local folder, where `run`, `table` and `library` put
-    what they are asked for."""
+    """A map. Of one on an object store `root` is a local folder, into which files are fetched on demand."""
 
     root: Path
     mirror: Mirror | None = None
     """None for a map that is a folder."""
     damaged: dict[str, str] = field(default_factory=dict)
-    """Drives that `drives` leaves out, and why."""
+    """Drives that are left out of `drives` and of answers, and why."""
 
     def __str__(self) -> str:
-        """As its user calls it."""
+        """The map's path or URL."""
         return str(self.root if self.mirror is None else self.mirror.remote)
 
     @property
     def index(self) -> Path:
-        """Where its index is; of a map on an object store that of the reader alone, in the cache if there is one."""
+        """Folder of the index; of a map on an object store it is the reader's own, in the cache if there is one."""
         if self.mirror is not None and self.mirror.cache is not None:
             return self.mirror.cache.index_of(self.mirror.remote)
         return self.root / "index"
 
     @property
     def joint_damage(self) -> str:
-        """What is damaged of what joins the drives, where a writer goes on without it; a map on an object store."""
+        """Why a writer has dropped the joint graphs of a map on an object store; empty where it has not."""
         return "" if self.mirror is None else self.mirror.rest_damage
 
     @property
     def staging(self) -> Path:
-        """Where a writer makes what it renames in; hidden, on the same file system."""
+        """Hidden folder on the map's file system, where a writer makes what it renames in."""
         return self.root / ".staging"
 
-    def run(self, drive: str) -> Path:
-        """The run folder; of a map on a store with its tables and run.json alone (`whole` has the rest)."""
+    def run(self, drive: str, names: Iterable[str] = AT_HAND) -> Path:
+        """The run folder; of a map on a store with these of its files."""
         if self.mirror is not None:
-            self.mirror.fetch(drive, AT_HAND)
+            self.mirror.fetch(drive, names)
         return self.root / "runs" / folder_name(drive)
 
     def file(self, drive: str, name: str) -> Path:
         """One file of the run folder, where it has one of this name."""
-        if self.mirror is not None:
-            self.mirror.fetch(drive, [name])
-        return self.root / "runs" / folder_name(drive) / name
+        return self.run(drive, [name]) / name
 
     def whole(self, drive: str) -> Path:
-        """The run folder with all that is in it."""
-        if self.mirror is not None:
-            self.mirror.fetch(drive, self.sizes(drive))
-        return self.root / "runs" / folder_name(drive)
+        """The run folder with all files."""
+        return self.run(drive, () if self.mirror is None else self.sizes(drive))
 
     def forget(self, drive: str) -> None:
-        """Of a map on a store, free the disk of what was asked for of a drive."""
+        """Free the disk of what was fetched of a drive."""
         if self.mirror is not None:
             self.mirror.forget(drive)
 
@@ -106,6 +101,7 @@ class Store:
         return self.root / name / folder_name(drive) / f"{name}.parquet"
 
     def library(self, digest: str) -> Path:
+        """The folder of a library."""
         if self.mirror is not None:
             self.mirror.library(digest)
         return self.root / "libraries" / digest
@@ -118,12 +114,12 @@ class Store:
         return {name: (run / name).lstat().st_size for name in regular_files(run)}
 
     def damaged_files(self, drive: str) -> list[str]:
-        """A line for each file of a drive that is not as it was written; of a map on a store, of what drives are worked
-        with by and of what is gone. Raises UnreachableError."""
+        """A line for each file of a drive that is not as it was written; of a map on a store, of those in AT_HAND and
+        of those that are gone. Raises UnreachableError."""
         return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive, AT_HAND)
 
     def is_whole(self, drive: str) -> bool:
-        """Whether all of a drive is where it was, though its removal may be decided. Of one that failed nothing is."""
+        """Whether nothing of a drive is removed yet. Of one that failed there is only its entry in failures.json."""
         if self.mirror is None:
             return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
         return drive in self.mirror.manifests or drive in self.failures()
@@ -132,8 +128,13 @@ class Store:
         """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
         if self.mirror is not None:
             return int(self.mirror.manifests[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
+        path = self.run(drive) / f"{name}.parquet"
         with reading_drive(drive):
-            return row_count(self.run(drive) / f"{name}.parquet")
+            try:
+                return read_footer(path).num_rows
+            except (OSError, ValueError, pa.ArrowException) as error:
+                why = str(error).splitlines()[0]
+                raise ResultError(f"{path} cannot be read: {why} Check its permissions, or {ADD_AGAIN}") from None
 
     def earth(self, drive: str) -> Earth | None:
         """Where on earth a drive is, None where nothing says so. Raises DamagedDriveError."""
@@ -142,11 +143,10 @@ class Store:
             return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
 
     def keep(self) -> None:
-        """Of a map on an object store, send what was made so far beside drives; a folder has it already. Where that
-        fails it is sent another time; raises SettingsError where another writer has the map now."""
+        """Of a map on an object store, send what was made so far beside drives; where that fails it is sent later.
+        Raises SettingsError where another writer has the map now."""
         if self.mirror is not None:
-            if self.mirror.lock is not None:
-                self.mirror.lock.check()
+            self.mirror.check_lock()
             with suppress(ResultError):
                 send_rest(self.mirror)
 
@@ -182,11 +182,10 @@ class Store:
         return record
 
     def read(self, drive: str, of: Callable[[Path], T], names: Iterable[str] = AT_HAND) -> T:
-        """What a function makes of these files of the run folder, all of one state of the drive: of the folder that a
-        writer put in place of another meanwhile, it is asked again. Raises ResultError."""
-        folder = self.root / "runs" / folder_name(drive)
+        """`of` the run folder with these files, all of one state of the drive: it is called again where a writer
+        replaced the folder meanwhile. Raises ResultError."""
+        folder = self.run(drive, names)
         if self.mirror is not None:
-            self.mirror.fetch(drive, names)
             return of(folder)  # of one generation, always
         for number in range(_TRIES):
             time.sleep(_PAUSE_S * (2**number - 1))
@@ -221,7 +220,7 @@ class Store:
         """Log and error of each drive that failed when it was last tried, by ID."""
         path = self.root / "failures.json"
         found = run_record.read_run_json(path) if path.exists() else {}
-        if any(not isinstance(told, dict) or not isinstance(told.get("error"), str) for told in found.values()):
+        if any(not isinstance(one, dict) or not isinstance(one.get("error"), str) for one in found.values()):
             raise ResultError(f"{path} is damaged. Move it away: the next batch tries what failed again.")
         return found
 
@@ -267,17 +266,30 @@ class Store:
 
     def _write(self, name: str, record: dict[str, Any]) -> None:
         """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
-        path = self.root / name
-        try:
-            if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
-                return
-        except NewerError:
-            raise
-        except ResultError:  # damaged
-            pass
-        run_record.write_run_json(path, record, checksum=name != "failures.json")  # whose keys are drives
-        if self.mirror is not None:
+        # the keys of failures.json are drives, so it has no field for a checksum
+        if write_changed(self.root / name, record, checksum=name != "failures.json") and self.mirror is not None:
             write_json(self.mirror, name)
+
+
+def without_damaged(store: Store, work: Callable[[], T]) -> T:
+    """The result of `work` on a map, which is called again without each drive that it finds damaged."""
+    while True:
+        try:
+            return work()
+        except DamagedDriveError as error:
+            if error.drive in store.damaged:
+                raise
+            store.damaged[error.drive] = str(error)
+
+
+def left_out(store: Store) -> list[str]:
+    """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
+    dropped = f"{store.joint_damage}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
+    return [dropped] * bool(store.joint_damage) + [
+        f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
+        f"Compute it again from its log: vplog batch LOG -o {store}"
+        for drive, why in sorted(store.damaged.items())
+    ]
 
 
 def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:
@@ -300,16 +312,6 @@ def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
     return head.library, drives
 
 
-def row_count(path: Path) -> int:
-    """Rows of a table, by its footer. Raises ResultError."""
-    try:
-        return read_footer(path).num_rows
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise ResultError(
-            f"{path} cannot be read: {str(error).splitlines()[0]} Check its permissions, or {ADD_AGAIN}"
-        ) from None
-
-
 def _drive_of(folder: Path) -> str:
     """The drive of a damaged run folder: by its drive.json, else by its name."""
     try:
@@ -319,7 +321,7 @@ def _drive_of(folder: Path) -> str:
 
 
 def _identity(run: Path) -> tuple[int, int, int] | None:
-    """Of the folder that has the name now; None where there is none."""
+    """Identity of the folder that has the name now; None where there is none."""
     try:
         found = (run / "drive.json").stat()
     except OSError:

@@ -1,9 +1,9 @@
-"""Damaged drives: a drive that cannot be read is named and left out of an answer, and the rest of the map is not."""
+"""Damaged drives: a drive with a damaged file is named and left out of an answer, and the rest of the map is not."""
 
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, NewerError, ResultError
 from vplog.maps.geo_bounds import earth_of_made
@@ -13,24 +13,8 @@ from vplog.storage.folders import is_below
 from vplog.storage.scratch import files_in
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
-
-    T = TypeVar("T")
-
-
-class Quarantining(Protocol):
-    """A map; as text what its user calls it."""
-
-    @property
-    def damaged(self) -> dict[str, str]:
-        """Drives that are left out of answers, and why."""
-        ...
-
-    @property
-    def joint_damage(self) -> str:
-        """Why a writer has dropped the joint graphs; empty where it has not."""
-        ...
 
 
 class UnreachableError(ResultError):
@@ -56,30 +40,9 @@ def reading_drive(drive: str) -> Iterator[None]:
         raise DamagedDriveError(str(error), drive) from None
 
 
-def without_damaged(store: Quarantining, work: Callable[[], T]) -> T:
-    """What `work` makes of a map; a drive that it finds damaged is left out, and it is done again without."""
-    while True:
-        try:
-            return work()
-        except DamagedDriveError as error:
-            if error.drive in store.damaged:
-                raise
-            store.damaged[error.drive] = str(error)
-
-
-def left_out(store: Quarantining) -> list[str]:
-    """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
-    dropped = f"{store.joint_damage}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
-    return [dropped] * bool(store.joint_damage) + [
-        f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
-        f"Compute it again from its log: vplog batch LOG -o {store}"
-        for drive, why in sorted(store.damaged.items())
-    ]
-
-
 def check_at_hand(folder: Path, record: dict[str, Any]) -> None:
     """Raises ResultError where run.json or a table of a drive is missing or, tables by their length, not as drive.json
-    has it; of a drive whose drive.json has no lengths, as an older vplog wrote it, that is found when it is read."""
+    has it. A drive.json of an older vplog has no lengths: then damage is found when the file is read."""
     files = _files(record)
     for name in AT_HAND if files else ():
         if wrong := _difference(folder / name, files.get(name, {}), hashed=name == "run.json"):
@@ -116,7 +79,7 @@ def complete_record(made: Path, hashed: bool) -> None:
 
 
 def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:
-    """How a file differs from what drive.json says of it; empty where it does not."""
+    """How a file differs from its entry in drive.json; empty where it does not."""
     try:
         if not path.is_file():
             return f"{path} is not a file." if path.exists() else f"{path} is not there."
@@ -130,7 +93,7 @@ def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:
 
 
 def _files(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Of each file its length and sha256, by drive.json; empty where an older vplog wrote it."""
+    """Length and sha256 of each file, by drive.json; empty where an older vplog wrote it."""
     files = record.get("files")
     sound = isinstance(files, dict) and all(isinstance(files[name], dict) and is_below(name) for name in files)
     return files if isinstance(files, dict) and sound else {}

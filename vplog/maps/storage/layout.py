@@ -1,16 +1,24 @@
-"""The names in a map, and what its records must say."""
+"""The names in a map, what its records must say, and what drives are called and made from."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import re
+import shutil
+from dataclasses import replace
+from functools import cache
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from vplog.errors import ResultError
-from vplog.results import run_record
+from vplog.cache.code_hash import code_of
+from vplog.errors import NewerError, ResultError
+from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
 FORMAT = run_record.FORMAT
@@ -18,25 +26,25 @@ FORMAT = run_record.FORMAT
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 """Data sets of a map: each is a file of this name in every run folder."""
 AT_HAND = (*(f"{name}.parquet" for name in TABLES), "run.json")
-"""Of a run folder on an object store, what those who work with drives have fetched: all but pictures and reports."""
+"""Files of a run folder that are fetched from an object store to work with the drive: not its report and figures."""
 HASH = re.compile(r"[0-9a-f]{64}")
-"""How a library is called: the sha256 of all that descriptors depend on."""
-
-
+"""Name of a library: sha256 over all that descriptors depend on."""
 ADD_AGAIN = "compute the drive again: vplog batch LOG -o MAP"
-"""What to do about a drive that is damaged: nothing that may still be of use is removed for it."""
+"""What to do about a damaged drive: nothing is removed for it."""
+_NOT_IN_KEY = ("key", "log", "earth", "format", "files")
+"""Fields of drive.json that its key does not depend on."""
 _MOST_NAME = 200
 """Characters of a drive's name in a file's; what stands around them takes up to thirty more."""
 
 
 def folder_name(drive: str) -> str:
-    """What a partition of a data set is called."""
+    """Name of a partition of a data set."""
     return f"drive={quoted(drive)}"
 
 
 def quoted(drive: str) -> str:
-    """A drive in a file's name: other characters than letters, digits and `_.-~` as in a URL, the end of what is very
-    long as a hash: a name has 255 bytes on most file systems, and a letter beyond ASCII takes six to twelve."""
+    """A drive in a file's name: other characters than letters, digits and `_.-~` as in a URL, and the end of a long one
+    as a hash, since most file systems take 255 bytes."""
     name = quote(drive, safe="")
     if len(name) <= _MOST_NAME:
         return name
@@ -50,7 +58,7 @@ def drive_record(folder: Path) -> dict[str, Any]:
 
 
 def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """What drive.json of `folder` says, checked. Raises ResultError."""
+    """The record of drive.json in `folder`, checked. Raises ResultError."""
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
         raise ResultError(
@@ -63,7 +71,95 @@ def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     return record
 
 
+def write_changed(path: Path, record: dict[str, Any], checksum: bool = True) -> bool:
+    """Write a record; False where the file holds it already, which is left as it is. Raises ResultError."""
+    try:
+        if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+            return False
+    except NewerError:
+        raise
+    except ResultError:  # damaged
+        pass
+    run_record.write_run_json(path, record, checksum=checksum)
+    return True
+
+
+def link(source: str | Path, target: str | Path) -> str | Path:
+    """Give a file a second name, or copy it where the file system has no hard links; the name. No writer of a map
+    changes a file, each replaces it. Raises OSError."""
+    try:
+        os.link(source, target)
+    except FileNotFoundError:
+        raise
+    except OSError:
+        shutil.copyfile(source, target)
+    return target
+
+
 def sha256_of(path: Path) -> str:
-    """Of a file's bytes."""
+    """sha256 of a file's bytes."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, Any]], inputs: list[Any]) -> list[str]:
+    """The ID of each log: that under which the map knows it, by its path or else by its content; else its name, with
+    a number where others have the same. Logs given in the same order to an empty map get the same IDs."""
+    result, taken = dict[int, str](), set[str]()
+    for field, given in (("log", logs), ("inputs", inputs)):
+        places: dict[str, list[str]] = {}
+        for drive, record in known.items():
+            places.setdefault(run_record.canonical_json(record[field]), []).append(drive)
+        for at, name in enumerate(names):
+            own = re.compile(re.escape(name) + r"(-\d+)?")
+            found = places.get(run_record.canonical_json(given[at]), [])
+            for drive in sorted(found, key=lambda drive: known[drive]["inputs"] != inputs[at]):
+                if at not in result and drive not in taken and own.fullmatch(drive):
+                    result[at] = drive
+                    taken.add(drive)
+    for at, name in enumerate(names):
+        if at not in result:
+            result[at] = numbered(name, name, taken | known.keys())
+            taken.add(result[at])
+    return [result[at] for at in range(len(names))]
+
+
+def numbered(name: str, base: str, taken: Collection[str]) -> str:
+    """The name, or where it is taken `base` with the first free number."""
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{base}-{number}", number + 1
+    return free
+
+
+def free_name(drive: str, log: str, known: Collection[str]) -> str:
+    """The ID of a drive from another map: its own, or where that is taken the log's name with the first free number, by
+    which `drive_names` still knows it."""
+    parts = re.fullmatch(r"(.+)-\d+", drive)
+    return numbered(drive, parts[1] if parts and not PurePath(log).name.startswith(drive) else drive, known)
+
+
+def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
+    """drive.json of the drive under another ID: with the key that a batch would give it."""
+    made_from = {name: value for name, value in record.items() if name not in _NOT_IN_KEY}
+    own = key_of(made_from) == record["key"]
+    return {**record, "drive": drive, "key": key_of({**made_from, "drive": drive}) if own else record["key"]}
+
+
+def name_keyframes(path: Path, drive: str) -> None:
+    """Give keyframes.parquet of a drive the ID that it has in the map. Raises ResultError."""
+    header = tables.read_metadata(path)
+    keyframes, world_from_body = tables.read_keyframes(path)
+    about = tables.TableMetadata(json.loads(header["vplog.settings"]), header["vplog.library"])
+    tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about)
+
+
+@cache
+def code_hash() -> str:
+    """sha256 over the files of the package that a run uses."""
+    return code_of("vplog.pipeline")["code"]
+
+
+def key_of(made_from: dict[str, Any]) -> str:
+    """sha256 over all that a drive's results depend on."""
+    return hashlib.sha256(run_record.canonical_json(made_from).encode()).hexdigest()

@@ -2,7 +2,8 @@
 
 On S3 the store itself decides who gets it (conditional writes, by boto3), so two can never hold it. Elsewhere, and
 without boto3, a writer writes its name, waits and reads whether it is still there: two that start within a round trip
-of each other are told apart by that, but not with certainty. Nothing in a map breaks where two do write: see mirror.py.
+of each other are told apart by that, but not with certainty. Nothing in a map breaks where two do write: see
+remote_map.py.
 """
 
 from __future__ import annotations
@@ -100,36 +101,29 @@ def _started(pid: int) -> str | None:
 
 
 def _take(lock: Lock, root: RemotePath) -> None:
+    found = objects.get_tagged(lock.place)
+    if found is not None:
+        _refuse_held(found[0], found[2], root)
     if objects.decides(lock.place):
-        found = objects.get_tagged(lock.place)
-        if found is not None:
-            _refuse_held(found[0], found[2], root)
         _write(lock, None if found is None else found[1])
-        if not lock.lost and objects.put_if(lock.place, _said(lock), None) is not None:
+        if not lock.lost and objects.put_if(lock.place, _content(lock), None) is not None:
             lock.tag = None  # it is there, so a store that decides refuses to make it
     else:
-        found, age_s = objects.get(lock.place), objects.age_s(lock.place)
-        if found is not None:
-            _refuse_held(found, age_s, root)
-        objects.put(lock.place, _said(lock))
+        objects.put(lock.place, _content(lock))
     if lock.tag is None and not lock.lost:
         time.sleep(_SETTLE_S)
-        _still_mine(lock)
+        _check_mine(lock)
     if lock.lost:
         raise SettingsError(f"Another vplog process has just begun to write to {root}. Wait for it to end.")
 
 
-def _said(lock: Lock) -> bytes:
-    """What the object says. The count makes every renewal another object, so that a tag tells one from the other."""
+def _content(lock: Lock) -> bytes:
+    """Bytes of the lock object. The count makes every renewal another object, so that a tag tells them apart."""
     return json.dumps({**lock.name, "renewed": lock.renewed}).encode()
 
 
-def _is_mine(lock: Lock, found: bytes | None) -> bool:
-    return found is not None and _holder(found).get("token") == lock.name["token"]
-
-
 def _holder(found: bytes) -> dict[str, Any]:
-    """Who a lock object says holds it; empty where nobody does."""
+    """The holder that a lock object names; empty where there is none."""
     try:
         holder = json.loads(found)
     except ValueError:
@@ -139,18 +133,18 @@ def _holder(found: bytes) -> dict[str, Any]:
 
 def _write(lock: Lock, tag: str | None) -> None:
     """Where the lock has this tag. A refusal may be the echo of a write whose answer was lost, so it is read back."""
-    lock.tag = objects.put_if(lock.place, _said(lock), tag)
+    lock.tag = objects.put_if(lock.place, _content(lock), tag)
     if lock.tag is None:
-        found = objects.get_tagged(lock.place)
-        if found is None or not _is_mine(lock, found[0]):
-            lock.lost = f"Another writer has taken {lock.place} over."
-        else:
-            lock.tag = found[1]
+        lock.tag = _check_mine(lock)
 
 
-def _still_mine(lock: Lock) -> None:
-    if not _is_mine(lock, objects.get(lock.place)):
+def _check_mine(lock: Lock) -> str | None:
+    """Read the lock back: its tag. It is lost where another writer's name is in it."""
+    found = objects.get_tagged(lock.place)
+    if found is None or _holder(found[0]).get("token") != lock.name["token"]:
         lock.lost = f"Another writer has taken {lock.place} over."
+        return None
+    return found[1] or None
 
 
 def _refuse_held(found: bytes, age_s: float, root: RemotePath) -> None:
@@ -171,26 +165,28 @@ def _renew(lock: Lock) -> None:
     """Write it again, which makes the lock young, until it is over or somebody else's."""
     last = time.monotonic()
     while not lock.lost and not lock.over.wait(LEASE_S / RENEWALS):
+        lock.renewed += 1
         try:
-            if lock.tag is None:
-                _still_mine(lock)
-            if lock.lost:
-                break
-            lock.renewed += 1
-            if lock.tag is None:
-                objects.put(lock.place, _said(lock))
-            else:
+            if lock.tag is not None:
                 _write(lock, lock.tag)
+            else:
+                _put_if_mine(lock, _content(lock))
             last = time.monotonic()
         except OSError as error:
             if time.monotonic() - last > LEASE_S:
                 lock.lost = f"{lock.place} could not be renewed for {LEASE_S:.0f} s: {reason(error)}."
 
 
+def _put_if_mine(lock: Lock, data: bytes) -> None:
+    _check_mine(lock)
+    if not lock.lost:
+        objects.put(lock.place, data)
+
+
 def _release(lock: Lock) -> None:
-    """Nobody's. Where that fails the lease ends by itself."""
+    """Leave the lock without a holder. Where that fails the lease ends by itself."""
     with suppress(OSError):
         if lock.tag is not None:
             objects.put_if(lock.place, b"{}", lock.tag)
-        elif _is_mine(lock, objects.get(lock.place)):
-            objects.put(lock.place, b"{}")
+        else:
+            _put_if_mine(lock, b"{}")

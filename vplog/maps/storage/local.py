@@ -85,11 +85,6 @@ def _whole(made: Path) -> str | None:
     return record["drive"] if all((made / f"{name}.parquet").is_file() for name in TABLES) else None
 
 
-def clear(store: Store) -> None:
-    """Away with what a writer was making."""
-    shutil.rmtree(store.staging, ignore_errors=True)
-
-
 def publish(store: Store, drive: str, made: Path) -> None:
     """Make a finished run folder the drive's, in place of the one it may have, and link its tables.
 
@@ -129,8 +124,10 @@ def link_tables(store: Store, drive: str) -> None:
         source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
         if not source.is_file():
             raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
-        if path.exists() and (path.samefile(source) or _same_copy(source, path)):
-            continue
+        if path.exists():
+            alike = path.stat().st_size == source.stat().st_size
+            if path.samefile(source) or (alike and sha256_of(path) == sha256_of(source)):  # a file system without links
+                continue
         part = store.staging / f"{name}-{os.getpid()}.parquet"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -145,15 +142,11 @@ def link_tables(store: Store, drive: str) -> None:
                 shutil.copyfileobj(whole, stream)
 
 
-def _same_copy(source: Path, path: Path) -> bool:
-    """Whether a file that is no link holds the same, told by its bytes."""
-    return source.stat().st_size == path.stat().st_size and sha256_of(source) == sha256_of(path)
-
-
 def check_removable(store: Store, drives: Sequence[str]) -> None:
     """Raises ResultError where this user may not remove a folder of these drives."""
     for path in [folder for drive in drives for folder in _folders_of(store, drive)]:
-        for folder in [path.parent, path, *(path / name for name in _folders_below(path))]:
+        below = {above for name in regular_files(path) for above in PurePosixPath(name).parents}
+        for folder in [path.parent, path, *(path / above for above in below)]:
             if not os.access(folder, os.W_OK | os.X_OK):
                 raise ResultError(
                     f"Cannot remove {', '.join(drives)} from {store}: no permission to change {folder}. The map is as "
@@ -186,8 +179,3 @@ def take_out(store: Store, drives: Sequence[str]) -> None:
 def _folders_of(store: Store, drive: str) -> list[Path]:
     """All that bears the name of a drive, its cache too."""
     return list(store.root.glob(f"*/{folder_name(drive)}"))
-
-
-def _folders_below(folder: Path) -> set[str]:
-    """Names of the folders below one that hold files."""
-    return {str(above) for name in regular_files(folder) for above in PurePosixPath(name).parents}

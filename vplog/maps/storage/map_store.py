@@ -9,20 +9,20 @@
     MAP/removed.json                           drives that are being removed, while that is not done
 
 A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when its manifest is
-(mirror.py). Its tables are links: no byte is stored twice, both names always show the same bytes (every writer here
-replaces a file and never changes one), and one look at the inode tells whether a link is missing. Drives are removed
-by naming them in removed.json, one step that decides for all of them; then their files go, by the next writer where
-this one is killed.
+(remote_map.py). No byte is stored twice, and both names of a table always show the same bytes, since every writer here
+replaces a file and never changes one. Naming drives in removed.json removes them all in one step; their files are
+deleted afterwards, by the next writer where this one is killed.
 """
 
 from __future__ import annotations
 
+import shutil
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps.storage import lease_lock, local, upload
-from vplog.maps.storage.contents import Head, Store, one_library, other_library, row_count
+from vplog.maps.storage.contents import Head, Store, one_library
 from vplog.maps.storage.damage import complete_record
 from vplog.maps.storage.layout import HASH, TABLES, drive_record, folder_name
 from vplog.maps.storage.remote_map import Mirror
@@ -37,10 +37,8 @@ if TYPE_CHECKING:
 
     from vplog.maps.storage.download_cache import Cache
 
-__all__ = [
-    "TABLES", "Head", "Store", "add_library", "folder_name", "one_library", "other_library", "publish", "reading",
-    "remove", "row_count", "writing",
-]  # fmt: skip
+__all__ = ["TABLES", "Head", "Store", "add_library", "folder_name", "one_library", "publish", "reading", "remove"]
+__all__ += ["relocate", "writing"]
 
 
 @contextmanager
@@ -64,10 +62,9 @@ def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
 
 @contextmanager
 def writing(root: Path) -> Iterator[Store]:
-    """The map for one writer, made where it is not there yet.
+    """The map for one writer, made where it is not there yet; drives that a killed writer had finished are put in.
 
-    What a writer that was killed had finished is put in; what it had not is removed. Raises SettingsError where the
-    folder holds other things, or where another process writes.
+    Raises SettingsError where the folder holds other things, or where another process writes.
     """
     if isinstance(root, RemotePath):
         with _writing_remote(root) as store:
@@ -78,7 +75,7 @@ def writing(root: Path) -> Iterator[Store]:
         _sweep(store)
         local.settle(store)
         yield store
-        local.clear(store)
+        shutil.rmtree(store.staging, ignore_errors=True)
 
 
 @contextmanager
@@ -93,7 +90,7 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
         store.staging.mkdir()
         try:
             yield store
-        except BaseException:  # what was verified of closures stays
+        except BaseException:  # verified closures stay
             with suppress(VplogError, OSError):
                 upload.send_rest(mirror)
             raise
@@ -153,9 +150,9 @@ def _sweep(store: Store) -> None:
     else:
         for drive in drives:
             upload.remove(store.mirror, drive)
-    kept = {drive: told for drive, told in store.failures().items() if drive not in drives}
-    if kept != store.failures():
-        store.write_failures(kept)
+    failures = store.failures()
+    if failures.keys() & set(drives):
+        store.write_failures({drive: why for drive, why in failures.items() if drive not in drives})
     store.write_removed([])
 
 

@@ -9,7 +9,7 @@ from email.utils import parsedate_to_datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from vplog.storage.remote_path import names_below, s3_place
+from vplog.storage.remote_path import s3_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,26 +31,9 @@ def put(path: RemotePath, data: bytes) -> None:
 
 
 def get(path: RemotePath) -> bytes | None:
-    """What an object holds, None where there is none. Raises OSError.
-
-    All of one state, also while it is replaced: one request has that by itself; pyarrow asks for the length before,
-    and what is read by another object's length is read again.
-    """
-    if decides(path):
-        found = get_tagged(path)
-        return None if found is None else found[0]
-    system, place = path.place
-    for _ in range(_TRIES):
-        before = system.get_file_info(place)
-        try:
-            with _opened(path) as stream:
-                data = stream.read()
-        except FileNotFoundError:
-            return None
-        after = system.get_file_info(place)
-        if (before.size, before.mtime) == (after.size, after.mtime) == (len(data), after.mtime):
-            return data
-    raise OSError("it is replaced faster than it can be read")
+    """The bytes of an object, None where there is none. Raises OSError."""
+    found = get_tagged(path)
+    return None if found is None else found[0]
 
 
 def send(path: RemotePath, source: Path) -> str:
@@ -123,23 +106,6 @@ def files_below(path: RemotePath) -> dict[str, datetime]:
     return {one.path[len(place) + 1 :]: one.mtime for one in found if one.type == FileType.File}
 
 
-def folders_in(path: RemotePath) -> list[str]:
-    """Names right below this prefix that have objects below, in order. Raises OSError."""
-    return sorted(name for name, is_folder in names_below(path).items() if is_folder)
-
-
-def names_in(path: RemotePath) -> list[str]:
-    """All names right below this prefix, in order. Raises OSError."""
-    return sorted(names_below(path))
-
-
-def age_s(path: RemotePath) -> float:
-    """Seconds since an object was written, by this machine's clock and the server's; 0 where there is none."""
-    system, place = path.place
-    written = system.get_file_info(place).mtime
-    return 0.0 if written is None else (datetime.now(UTC) - written).total_seconds()
-
-
 def decides(path: RemotePath) -> bool:
     """Whether `put_if` is at hand: on S3 with boto3, which alone asks for conditional writes."""
     if path.scheme != "s3":
@@ -159,25 +125,26 @@ def put_if(path: RemotePath, data: bytes, tag: str | None) -> str | None:
     knows none writes in any case.
     """
     condition = {"IfNoneMatch": "*"} if tag is None else {"IfMatch": tag}
-    bucket, _, key = path.place[1].partition("/")
-    try:
-        return _asked("put_object", Bucket=bucket, Key=key, Body=data, **condition)["ETag"]
-    except RefusedError:
-        return None
+    answer = _request("put_object", path, Body=data, **condition)
+    return None if answer is None else answer["ETag"]
 
 
 def get_tagged(path: RemotePath) -> tuple[bytes, str, float] | None:
-    """What an object holds, its tag and how many seconds ago it was written, both by the server's clock; None where
-    there is none. Raises OSError."""
+    """The bytes of an object, its tag (empty where the store has none) and its age in seconds; None where there is
+    none. Raises OSError.
+
+    All of one state, also while it is replaced: one request of boto3 has that by itself; pyarrow asks for the length
+    before, and what is read by another object's length is read again.
+    """
+    if not decides(path):
+        return _get_whole(path)
     from botocore.exceptions import BotoCoreError
 
-    bucket, _, key = path.place[1].partition("/")
-    try:
-        answer = _asked("get_object", Bucket=bucket, Key=key)
-    except RefusedError:
+    answer = _request("get_object", path)
+    if answer is None:
         return None
-    told = answer["ResponseMetadata"]["HTTPHeaders"].get("date")
-    now = parsedate_to_datetime(told) if told else datetime.now(UTC)
+    date = answer["ResponseMetadata"]["HTTPHeaders"].get("date")
+    now = parsedate_to_datetime(date) if date else datetime.now(UTC)  # by the server's clock, as its LastModified
     try:
         data = answer["Body"].read()
     except BotoCoreError as error:
@@ -185,20 +152,34 @@ def get_tagged(path: RemotePath) -> tuple[bytes, str, float] | None:
     return data, answer["ETag"], (now - answer["LastModified"]).total_seconds()
 
 
-class RefusedError(Exception):
-    """The condition does not hold, or there is no such object. Never leaves this file."""
+def _get_whole(path: RemotePath) -> tuple[bytes, str, float] | None:
+    system, place = path.place
+    for _ in range(_TRIES):
+        before = system.get_file_info(place)
+        try:
+            with _opened(path) as stream:
+                data = stream.read()
+        except FileNotFoundError:
+            return None
+        after = system.get_file_info(place)
+        if (before.size, before.mtime) == (after.size, after.mtime) == (len(data), after.mtime):
+            now = datetime.now(UTC)
+            return data, "", (now - (after.mtime or now)).total_seconds()
+    raise OSError("it is replaced faster than it can be read")
 
 
-def _asked(verb: str, **arguments: Any) -> dict[str, Any]:
+def _request(verb: str, path: RemotePath, **arguments: Any) -> dict[str, Any] | None:
+    """S3's answer; None where the condition does not hold or there is no such object. Raises OSError."""
     from botocore.exceptions import BotoCoreError, ClientError
 
+    bucket, _, key = path.place[1].partition("/")
     try:
-        return getattr(_client(*s3_place()), verb)(**arguments)
+        return getattr(_client(*s3_place()), verb)(Bucket=bucket, Key=key, **arguments)
     except ClientError as error:
         # 412: the condition does not hold; 409: another write of the object is under way; 404: there is none
-        told = error.response
-        if told["ResponseMetadata"]["HTTPStatusCode"] in (404, 409, 412) and told["Error"]["Code"] != "NoSuchBucket":
-            raise RefusedError from None
+        status, code = error.response["ResponseMetadata"]["HTTPStatusCode"], error.response["Error"]["Code"]
+        if status in (404, 409, 412) and code != "NoSuchBucket":
+            return None
         raise OSError(str(error)) from None
     except BotoCoreError as error:
         raise OSError(str(error)) from None

@@ -1,4 +1,4 @@
-"""A map on an object store, through a local folder that has the names of a map and of its files what was asked for.
+"""A map on an object store, through a local folder that has the names of a map and of its files those asked for.
 
     MAP/map.json, failures.json, libraries/HASH/...   as in a folder
     MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
@@ -9,23 +9,24 @@
 
 An object store has no rename and no links, but an object appears whole or not at all. So a manifest is the one thing
 that changes, and what it names never does: a reader has the drive of the old manifest or that of the new one. What the
-old one named is removed afterwards, by the writer that replaced it, and a reader that comes too late for it reads the
-new manifest. No writer removes what it did not itself see replaced, so nothing breaks even where two write at once:
-the last manifest counts. A killed writer leaves objects that no manifest names; a later one removes them after a day.
+old one named is removed afterwards, by the writer that replaced it; a reader that comes too late for it reads the new
+manifest. No writer removes what it did not itself replace, so nothing breaks even where two write at once: the last
+manifest counts. A killed writer leaves objects that no manifest names; a later one removes them after a day.
 """
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import threading
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 from urllib.parse import unquote
+
+from pydantic import BaseModel, Field, StrictInt
 
 from vplog.errors import NewerError, ResultError
 from vplog.maps.storage import objects
@@ -33,7 +34,7 @@ from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, folder_name, sound_record
 from vplog.results import run_record
 from vplog.storage.folders import is_below
-from vplog.storage.remote_path import reason
+from vplog.storage.remote_path import names_below, reason
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -45,11 +46,25 @@ if TYPE_CHECKING:
 
 _REQUESTS = 16
 """At once: a store answers each in some 20 to 50 ms, whatever its size."""
-OWN = ("generation", "replaces", "files")
-"""What a manifest says beside the drive.json of a folder."""
+_NOT_IN_FOLDER = ("generation", "replaces", "files")
+"""Fields of a manifest that the drive.json of a folder does not have."""
 _LIBRARY_FILE_BYTES = 2**34
 """Longest file of a library that is fetched: 16 GB, more than load_references takes."""
-_GENERATION = re.compile(r"[0-9a-f]{16}")
+Generation = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
+
+
+class _File(BaseModel):
+    bytes: StrictInt
+    sha256: Annotated[str, Field(pattern=f"^{HASH.pattern}$")]
+    rows: StrictInt = 0
+
+
+class _Manifest(BaseModel):
+    """The fields of a manifest beside those of drive.json."""
+
+    generation: Generation
+    replaces: Generation | None
+    files: dict[str, _File]
 
 
 class Mirror:
@@ -69,13 +84,20 @@ class Mirror:
         """What is damaged of all else, where a writer goes on without it."""
         self._fetched: set[str] = set()
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
-        with told(remote):
+        with store_errors(remote):
             for name in ("map.json", "failures.json", "removed.json"):
                 if (data := objects.get(remote / name)) is not None:
                     (local / name).write_bytes(data)
-            folders = [name for name in objects.folders_in(remote / "runs") if name.startswith("drive=")]
+            runs = names_below(remote / "runs")
+            folders = sorted(name for name, has_below in runs.items() if has_below and name.startswith("drive="))
             with ThreadPoolExecutor(_REQUESTS) as pool:
                 list(pool.map(self._open, folders))
+
+    def check_lock(self) -> None:
+        """Raises ResultError where the map is open for reading, or another writer has taken the lock over."""
+        if self.lock is None:
+            raise ResultError(f"{self.remote} is open for reading alone.")
+        self.lock.check()
 
     def _open(self, drive_folder: str) -> None:
         """Read the manifest of a drive. One that is missing was there where a table has a copy: that comes after it."""
@@ -86,11 +108,11 @@ class Mirror:
             raise
         except ResultError as error:
             self.damaged[drive] = str(error)
-        else:
-            if found is not None:
-                self.lay(found)
-            elif any(objects.files_below(self.remote / name / drive_folder) for name in TABLES):
-                self.damaged[drive] = f"{place}/drive.json is not there."
+            return
+        if found is not None:
+            self.lay(found)
+        elif any(objects.files_below(self.remote / name / drive_folder) for name in TABLES):
+            self.damaged[drive] = f"{place}/drive.json is not there."
 
     def fetch(self, drive: str, names: Iterable[str]) -> None:
         """Have these files of a drive in the local folder, all of one generation. Raises DamagedDriveError where one is
@@ -118,7 +140,7 @@ class Mirror:
         """A line for each file of a drive that is gone, and for the first of `names` that is damaged: these are
         fetched. Raises UnreachableError."""
         manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
-        with told(self.remote):
+        with store_errors(self.remote):
             there = objects.files_below(place / manifest["generation"])
         gone = [f"{place / manifest['generation'] / name} is not there." for name in manifest["files"].keys() - there]
         try:
@@ -138,7 +160,7 @@ class Mirror:
     def _again(self, drive: str) -> None:
         """Read the manifest of a drive whose files are gone. Raises ResultError where some of them were handed out."""
         place = self.remote / "runs" / folder_name(drive)
-        with told(self.remote):
+        with store_errors(self.remote):
             found = self.read_manifest(place.name)
         old = self.manifests[drive]
         if found is not None and found["generation"] == old["generation"]:
@@ -160,7 +182,7 @@ class Mirror:
             return
         part, files = target.with_name(f".{digest}.part"), dict[str, str]()
         if self.cache is None or not self.cache.take_library(digest, part):
-            with told(self.remote):
+            with store_errors(self.remote):
                 names = sorted(objects.files_below(place))
                 if "library.json" not in names:  # it is sent last
                     return
@@ -190,30 +212,30 @@ class Mirror:
 
     def _rest_without_manifest(self) -> dict[str, Any]:
         """A manifest of the copies that joins have by their own names; it has none of their lengths and hashes."""
-        with told(self.remote):
+        with store_errors(self.remote):
             below = [f"{top}/{name}" for top in ("joint", "joins") for name in objects.files_below(self.remote / top)]
         return {"files": {name: {"sha256": ""} for name in ("joint.json", *below)}}
 
     def _fetch_rest(self, names: Collection[str]) -> str:
-        """What is damaged of it, if anything. Raises ResultError."""
+        """The first damage of it, if any. Raises ResultError."""
         before = None
         for _ in range(3):
             try:
-                with told(self.remote):
-                    manifest = read_rest(self.remote)
+                with store_errors(self.remote):
+                    data = objects.get(self.remote / "rest.json")
+                if data is None:
+                    return ""
+                manifest = sound_manifest(data, self.remote / "rest.json")
             except UnreachableError:
                 raise
             except ResultError as error:
                 return str(error).partition(". ")[0]
-            if manifest is None:
-                return ""
             self.rest_manifest, place = manifest, self.remote / "rest" / manifest["generation"]
-            files = {name: about for name, about in manifest["files"].items() if self._is_of_a_drive(name)}
-            wanted = {name: about for name, about in files.items() if name in names or not names}
+            wanted = {name for name in manifest["files"] if self._is_of_a_drive(name) and (name in names or not names)}
             damaged, gone = list[str](), list[str]()
-            for name, about in wanted.items():
+            for name in sorted(wanted):
                 try:
-                    damaged += filter(None, [self._bring(place / name, self.local / name, about)])
+                    damaged += filter(None, [self._bring(place / name, self.local / name, manifest["files"][name])])
                 except FileNotFoundError:
                     gone.append(f"{place / name} is not there")
             if not gone or manifest["generation"] == before:
@@ -255,15 +277,13 @@ class Mirror:
         """As it is now; None where there is none. Raises OSError, and ResultError where it is damaged."""
         place = self.remote / "runs" / drive_folder
         data = objects.get(place / "drive.json")
-        if data is None:
-            return None
-        return sound_record(sound_manifest(data, place / "drive.json"), cast("Path", place))
+        return None if data is None else sound_record(sound_manifest(data, place / "drive.json"), cast("Path", place))
 
     def lay(self, manifest: dict[str, Any]) -> None:
         """The drive's folder with its drive.json."""
         folder = self.run(manifest["drive"])
         folder.mkdir(parents=True, exist_ok=True)
-        own = {key: manifest[key] for key in manifest if key not in OWN}
+        own = {key: manifest[key] for key in manifest if key not in _NOT_IN_FOLDER}
         text = json.dumps(own, indent=2, ensure_ascii=False) + "\n"  # as write_run_json has it
         (folder / "drive.json").write_text(text, encoding="utf-8")
         self.manifests[manifest["drive"]] = manifest
@@ -278,25 +298,14 @@ class Mirror:
         self.damaged.pop(manifest["drive"], None)
         self._fetched.add(manifest["drive"])
 
-    def digest(self, drive: str, name: str) -> str | None:
-        """sha256 of a file of a drive, None where it has none of this name."""
-        about = self.manifests[drive]["files"].get(name) if drive in self.manifests else None
-        return None if about is None else str(about["sha256"])
-
     def run(self, drive: str) -> Path:
+        """The drive's local folder."""
         return self.local / "runs" / folder_name(drive)
 
 
-def read_rest(remote: RemotePath) -> dict[str, Any] | None:
-    """The manifest of all that is neither a drive's nor a library's; None where there is none. Raises OSError, and
-    ResultError where it is damaged."""
-    data = objects.get(remote / "rest.json")
-    return None if data is None else sound_manifest(data, remote / "rest.json")
-
-
 @contextmanager
-def told(remote: RemotePath) -> Iterator[None]:
-    """What a store refuses, as an error of ours."""
+def store_errors(remote: RemotePath) -> Iterator[None]:
+    """Raises UnreachableError where a store refuses."""
     try:
         yield
     except OSError as error:
@@ -307,20 +316,8 @@ def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
     """A manifest whose names stay within the map. Raises ResultError."""
     try:
         manifest = json.loads(data)
-        files = manifest["files"]
-        generations = [manifest["generation"], manifest["replaces"] or manifest["generation"]]
-        sound = (
-            run_record.has_checksum(manifest)
-            and all(_GENERATION.fullmatch(one) for one in generations)
-            and all(
-                isinstance(one["bytes"], int)
-                and isinstance(one.get("rows", 0), int)
-                and is_below(name)
-                and HASH.fullmatch(one["sha256"])
-                for name, one in files.items()
-            )
-        )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        sound = run_record.has_checksum(manifest) and all(map(is_below, _Manifest.model_validate(manifest).files))
+    except (ValueError, TypeError, AttributeError, RecursionError):
         sound, manifest = False, {}
     if not sound:
         raise ResultError(f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}")

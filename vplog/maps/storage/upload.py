@@ -1,4 +1,4 @@
-"""What a writer sends to a map on an object store: first the files, then the manifest that names them."""
+"""Writes to a map on an object store: first the files, then the manifest that names them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 from vplog.errors import NewerError, ResultError, SettingsError
 from vplog.maps.storage import objects
 from vplog.maps.storage.layout import AT_HAND, TABLES, folder_name, sha256_of
-from vplog.maps.storage.remote_map import told
+from vplog.maps.storage.remote_map import store_errors
 from vplog.results import run_record
+from vplog.storage.remote_path import names_below
 from vplog.storage.scratch import files_in
 
 if TYPE_CHECKING:
@@ -31,39 +32,33 @@ _LEFT_OVER = timedelta(days=1)
 _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
 _KNOWN = ("runs", "libraries", "map.json", "failures.json", "removed.json", *TABLES)
-"""What in a map's folder has a place of its own on a store; the rest goes together."""
+"""Names in a map's folder that have a place of their own on a store; the rest goes together."""
 
 
 def begin(mirror: Mirror) -> None:
     """Finish what a killed writer began. Raises SettingsError where other things than a map are there."""
     remote = mirror.remote
-    if not (mirror.local / "map.json").exists():
-        with told(remote):
-            others = [name for name in objects.names_in(remote) if not name.startswith(".")]
-        if others:
+    with store_errors(remote):
+        known = (mirror.local / "map.json").exists()
+        if others := [] if known else sorted(name for name in names_below(remote) if not name.startswith(".")):
             raise SettingsError(f"{remote} holds other things ({others[0]}), not a map. Choose another place with -o.")
-    with told(remote):
-        runs, rest = objects.files_below(remote / "runs"), objects.files_below(remote / "rest")
-        there = {name: objects.files_below(remote / name) for name in TABLES}
+        there = {name: objects.files_below(remote / name) for name in ("runs", "rest", *TABLES)}
         for drive, manifest in mirror.manifests.items():
             named = folder_name(drive)
             copied = all(f"{named}/{name}.parquet" in there[name] for name in TABLES)
-            if not copied or any(name.startswith(f"{named}/{manifest['replaces']}/") for name in runs):
+            if not copied or any(name.startswith(f"{named}/{manifest['replaces']}/") for name in there["runs"]):
                 _after_manifest(mirror, drive, manifest)
+        rest = mirror.rest_manifest
+        before = f"{rest.get('replaces')}/"
+        if known := [name.removeprefix(before) for name in there["rest"] if name.startswith(before)]:
+            _after_rest(remote, rest, rest["files"], known)
         damaged = {folder_name(drive) for drive in mirror.damaged}  # what their manifests name is not known
-        for name in TABLES:
-            for left in _left_over(there[name], 1, damaged | {folder_name(drive) for drive in mirror.manifests}):
-                objects.remove(remote / name / left)
-        named_runs = {f"{folder_name(drive)}/{one['generation']}" for drive, one in mirror.manifests.items()}
-        for left in _left_over(runs, 2, named_runs):
-            if left.split("/")[0] not in damaged:
-                objects.remove(remote / "runs" / left)
-        manifest = mirror.rest_manifest
-        before = f"{manifest.get('replaces')}/"
-        if known := [name.removeprefix(before) for name in rest if name.startswith(before)]:
-            _after_rest(remote, manifest, manifest["files"], known)
-        for left in _left_over(rest, 1, {manifest.get("generation")}):
-            objects.remove(remote / "rest" / left)
+        drives = {folder_name(drive): one["generation"] for drive, one in mirror.manifests.items()}
+        current = {"runs": {f"{drive}/{one}" for drive, one in drives.items()}, "rest": {rest.get("generation")}}
+        for top, files in there.items():
+            for left in _left_over(files, 2 if top == "runs" else 1, current.get(top, set(drives))):
+                if left.split("/")[0] not in damaged:
+                    objects.remove(remote / top / left)
 
 
 def _left_over(files: dict[str, datetime], depth: int, named: set[Any]) -> list[str]:
@@ -80,13 +75,10 @@ def _left_over(files: dict[str, datetime], depth: int, named: set[Any]) -> list[
 
 def publish(mirror: Mirror, drive: str, made: Path) -> None:
     """Send a finished run folder and then its manifest. Raises ResultError; then the store has the drive as before."""
-    lock = mirror.lock
-    if lock is None:
-        raise ResultError(f"{mirror.remote} is open for reading alone.")
-    lock.check()
+    mirror.check_lock()
     place, generation = mirror.remote / "runs" / folder_name(drive), secrets.token_hex(8)
     rows = {f"{name}.parquet": {"rows": _rows(made / f"{name}.parquet")} for name in TABLES}
-    with told(mirror.remote):
+    with store_errors(mirror.remote):
         sent = _send_all(files_in(made), made, place / generation)
         try:
             old = mirror.read_manifest(place.name)
@@ -100,7 +92,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
             "replaces": None if old is None else old["generation"],
             "files": {name: {**about, **rows.get(name, {})} for name, about in sent.items()},
         }
-        lock.check()
+        mirror.check_lock()
         put_json(place / "drive.json", manifest)
     for name in sent:
         if name not in (*AT_HAND, "drive.json"):  # a batch would fill the disk
@@ -110,24 +102,23 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
 
 
 def relocate(mirror: Mirror, drive: str, log: str) -> None:
-    """The manifest with another place of the drive's log. Raises ResultError."""
+    """Write the manifest with another place of the drive's log. Raises ResultError."""
     manifest = {**mirror.manifests[drive], "log": log}
-    if mirror.lock is not None:
-        mirror.lock.check()
-    with told(mirror.remote):
+    mirror.check_lock()
+    with store_errors(mirror.remote):
         put_json(mirror.remote / "runs" / folder_name(drive) / "drive.json", manifest)
     mirror.lay(manifest)
 
 
 def _send_all(names: list[str], folder: Path, place: RemotePath) -> dict[str, dict[str, Any]]:
-    """Files of a folder: length and sha256, by name."""
+    """Send files of a folder: length and sha256, by name."""
 
-    def sent(name: str) -> dict[str, Any]:
+    def send(name: str) -> dict[str, Any]:
         file = folder / name
         return {"bytes": file.stat().st_size, "sha256": objects.send(place / name, file)}
 
     with ThreadPoolExecutor(_SENT_AT_ONCE) as pool:
-        return dict(zip(names, pool.map(sent, names), strict=True))
+        return dict(zip(names, pool.map(send, names), strict=True))
 
 
 def _rows(file: Path) -> int:
@@ -138,11 +129,10 @@ def _rows(file: Path) -> int:
 
 
 def _after_manifest(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> None:
-    """The tables as data sets, then away with what was replaced; done twice it is as done once."""
+    """Copy the tables to their data sets, then remove the generation that was replaced. Idempotent."""
     named, remote = folder_name(drive), mirror.remote
-    place = remote / "runs" / named
-    with told(remote):
-        old = manifest["replaces"]
+    place, old = remote / "runs" / named, manifest["replaces"]
+    with store_errors(remote):
         for name in TABLES:
             file = f"{name}.parquet"
             objects.copy(place / manifest["generation"] / file, remote / name / named / file)
@@ -151,9 +141,9 @@ def _after_manifest(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> Non
 
 
 def write_json(mirror: Mirror, name: str) -> None:
-    """map.json or failures.json as it is in the local folder. Of several writers of a first map.json one wins."""
+    """Send map.json or failures.json of the local folder. Of several writers of a first map.json one wins."""
     data, place = (mirror.local / name).read_bytes(), mirror.remote / name
-    with told(mirror.remote):
+    with store_errors(mirror.remote):
         if name == "map.json" and objects.decides(place) and objects.get(place) is None:
             if objects.put_if(place, data, None) is None:
                 raise ResultError(f"Another writer has just made {place}. Run again.")
@@ -162,14 +152,15 @@ def write_json(mirror: Mirror, name: str) -> None:
 
 
 def put_json(place: RemotePath, record: dict[str, Any]) -> None:
+    """Write a record with its checksum. Raises OSError."""
     text = json.dumps(run_record.with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n"
     objects.put(place, text.encode())
 
 
 def send_library(mirror: Mirror, digest: str) -> None:
-    """Named by its content, so what is there stays; library.json comes last."""
+    """Send a library, library.json last. It is named by its content, so what is there stays."""
     folder, place = mirror.local / "libraries" / digest, mirror.remote / "libraries" / digest
-    with told(mirror.remote):
+    with store_errors(mirror.remote):
         if objects.get(place / "library.json") is not None:
             return
         for name in sorted(files_in(folder), key=lambda name: name == "library.json"):
@@ -179,44 +170,43 @@ def send_library(mirror: Mirror, digest: str) -> None:
 def remove(mirror: Mirror, drive: str) -> None:
     """Take a drive out: its manifest first, then all that bears its name. Raises ResultError."""
     named, remote = folder_name(drive), mirror.remote
-    if mirror.lock is not None:
-        mirror.lock.check()
-    with told(remote):
+    mirror.check_lock()
+    with store_errors(remote):
         objects.remove(remote / "runs" / named / "drive.json")
         mirror.manifests.pop(drive, None)
         objects.remove(remote / "runs" / named)
-        for name in objects.folders_in(remote):
-            objects.remove(remote / name / named)
+        for name, has_below in sorted(names_below(remote).items()):
+            if has_below:
+                objects.remove(remote / name / named)
     for folder in mirror.local.glob(f"*/{named}"):
         shutil.rmtree(folder)
 
 
 def send_rest(mirror: Mirror) -> None:
-    """All that the local folder has beside drives and libraries, if it changed; tables and records also by their own
-    names, for those who read them as data sets."""
+    """Send all that the local folder has beside drives and libraries, if it changed; tables and records also by their
+    own names, for those who read them as data sets."""
     old = mirror.rest_manifest
     known: dict[str, dict[str, Any]] = old.get("files", {})
     now = {name: sha256_of(mirror.local / name) for name in files_in(mirror.local) if name.split("/")[0] not in _KNOWN}
     if now == {name: one["sha256"] for name, one in known.items()}:
         return
-    if mirror.lock is not None:
-        mirror.lock.check()
+    mirror.check_lock()
     remote, generation = mirror.remote, secrets.token_hex(8)
     place = remote / "rest" / generation
-    with told(remote):
-        kept = {name: known[name] for name in now if name in known and known[name]["sha256"] == now[name]}
-        for name in kept:
+    with store_errors(remote):
+        same = {name: known[name] for name in now if name in known and known[name]["sha256"] == now[name]}
+        for name in same:
             objects.copy(remote / "rest" / old["generation"] / name, place / name)
-        files = {**kept, **_send_all([name for name in now if name not in kept], mirror.local, place)}
+        files = {**same, **_send_all([name for name in now if name not in same], mirror.local, place)}
         manifest = {"generation": generation, "replaces": old.get("generation"), "files": dict(sorted(files.items()))}
         put_json(remote / "rest.json", manifest)
         mirror.rest_manifest = manifest
-        _after_rest(remote, manifest, [name for name in files if name not in kept], known)
+        _after_rest(remote, manifest, [name for name in files if name not in same], known)
 
 
 def _after_rest(remote: RemotePath, manifest: dict[str, Any], new: Iterable[str], known: Iterable[str]) -> None:
-    """What is `new` by its own name, too; away with what was `known` before and is not any more, and last with the
-    generation that was replaced, which tells a later writer that this was not done to its end."""
+    """Copy what is `new` to its own name, remove what was `known` before and is gone, and last the generation that was
+    replaced, which tells a later writer that this was not done to its end."""
     place = remote / "rest" / manifest["generation"]
     for name in new:
         if name.endswith((".parquet", ".json")):
