@@ -15,7 +15,6 @@ from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
 from vplog.logs.formats.ros2_folder import (
     Chain,
-    Counted,
     Metadata,
     MetadataError,
     ZstdMessages,
@@ -136,7 +135,7 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
     if not parts:
         raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
     parts = in_order_of_time(parts)
-    first, chain = parts[0], Chain([part.container for part in parts])
+    first, chain = parts[0], Chain([part.container for part in parts], notes)
     return _recorded(first.path, _name(first.path), _KINDS[first.kind], chain, notes, choice)
 
 
@@ -202,10 +201,8 @@ def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Note
     for missing in metadata.missing:
         detail = f"{name} lacks {missing}, which metadata.yaml names."
         notes.account.add("missing_file", None, (missing, 0), [], detail)
-    chain: Container = Chain(parts)
-    files = [file.name for file in metadata.files] + metadata.missing
-    counted = Counted(chain, metadata, files, notes) if metadata.recorded else chain
-    container = ZstdMessages(counted, notes) if metadata.mode == "message" else counted
+    chain = Chain(parts, notes, metadata)
+    container = ZstdMessages(chain, notes) if metadata.mode == "message" else chain
     return _recorded(folder, name, "ros2-mcap" if "mcap" in kinds else "ros2-db3", container, notes, choice)
 
 

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import re
 import struct
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from mcap.opcode import Opcode
 
 from vplog.errors import LogError
-from vplog.logs.formats.checksum import crc32
-from vplog.logs.formats.compression import KINDS
-from vplog.logs.formats.resync import MOST_GAPS, Search
+from vplog.logs.formats.compression import KINDS, crc32
+from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, Search
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,50 +72,6 @@ _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
 """The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
-
-
-@dataclass(slots=True)
-class Chunk:
-    """A chunk of messages; or, with compression None, message records outside any chunk."""
-
-    start: int
-    """Offset of its records in the file."""
-    stop: int
-    compression: str | None
-    size: int
-    crc: int
-    first_ns: int
-    last_ns: int
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages per channel id, from the message indexes behind it; empty where the writer left none."""
-    cut: bool = False
-    record: int = -1
-    """Offset of its record."""
-    doubtful: bool = False
-    """Damage lies between its message indexes, so that they may not be all."""
-
-
-@dataclass
-class Layout:
-    """Chunks and damage of a file."""
-
-    chunks: list[Chunk] = field(default_factory=list)
-    missing: list[Chunk] = field(default_factory=list)
-    """Chunks that lie in damaged bytes, as the index at the end or their own message indexes tell of them."""
-    recorded: dict[int, int] = field(default_factory=dict)
-    """Messages per channel id by the file's statistics; empty where it has none."""
-    gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Where damage may begin, and where reading goes on."""
-    cut_at: int | None = None
-    """Byte behind which nothing can be read, where messages may have been."""
-    unknown_at: int | None = None
-    """The first record of an unknown kind that would be a message if that byte were damaged."""
-    spare: list[tuple[int, bytes]] = field(default_factory=list)
-    """Schemas and channels of a summary whose checksum is wrong, for those that no other place defines."""
-    appended_at: int | None = None
-    """Byte behind the end of the recording where another one follows."""
-    index_cut_at: int | None = None
-    """Byte behind which nothing can be read, where the messages had ended."""
 
 
 def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None], name: str) -> Layout:
@@ -193,9 +147,7 @@ class _LayoutReader:
             elif any(start <= offset < stop for start, stop in self.layout.gaps):  # else the index is what is damaged
                 listed.counts = self._counts(indexes)
                 self.layout.missing.append(listed)
-        self.layout.chunks.sort(key=lambda chunk: chunk.start)
-        for chunk in self.layout.chunks:
-            chunk.counts = {} if chunk.doubtful else chunk.counts
+        self.layout.in_order()
         if found and self._indexed:  # they tell of every chunk in the gaps
             self.layout.gaps = []
 
@@ -323,12 +275,12 @@ class _LayoutReader:
         if last and last.compression is None and last.stop == start - RECORD.size and stop - last.start < _RUN:
             last.stop, last.first_ns, last.last_ns = stop, min(last.first_ns, log_ns), max(last.last_ns, log_ns)
         else:
-            chunks.append(Chunk(start - RECORD.size, stop, None, 0, 0, log_ns, log_ns))
+            chunks.append(Chunk(start - RECORD.size, stop, None, first_ns=log_ns, last_ns=log_ns))
 
     def _add_index(self, data: bytes) -> None:
         first_ns, last_ns, offset, _, size = struct.unpack_from("<QQQQI", data)
         entries = data[36 : 36 + min(size, len(data) - 36) // 10 * 10]  # channel id and offset of its message index
-        chunk = Chunk(offset, offset, "", 0, 0, first_ns, last_ns)
+        chunk = Chunk(offset, offset, first_ns=first_ns, last_ns=last_ns)
         self._indexed[offset] = chunk, dict(struct.iter_unpack("<HQ", entries))
 
     def _resume(self, before: int, position: int) -> int | None:
@@ -356,7 +308,7 @@ class _LayoutReader:
         if chunks and chunks[-1].record >= 0:
             chunks[-1].doubtful = True
         if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
-            self._indexing = Chunk(position, found, "", 0, 0, 0, 0)
+            self._indexing = Chunk(position, found)
             self.layout.missing.append(self._indexing)
         self.layout.gaps.append((position, found))
         return found

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks, ordered
-from vplog.logs.formats.resync import Search
+from vplog.logs.formats.layout import Search
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -104,16 +104,16 @@ class SqliteBag:
                 continue  # the index is what is damaged
         return 0
 
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return in_blocks(self._messages(channels))
+
+    def _messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
         for row, topic, time_ns, data in self._salvaged("rowid, topic_id, timestamp, data", ids):
             if isinstance(data, bytes) and isinstance(time_ns, int):
                 yield Message(self._topics[topic], time_ns, data, (row, time_ns))
             else:
                 self._add_damaged_row(row, f"{self._name} is damaged: row {row} holds no message.")
-
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self.messages(channels))
 
     def read(self, place: Place) -> bytes:
         try:
