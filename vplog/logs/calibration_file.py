@@ -1,4 +1,4 @@
-"""Files beside a log: its odometry (TUM) and its calibration: ROS camera_info, Kalibr's camchain, EuRoC's sensor.yaml."""
+"""Files beside a log: its odometry, and calibrations as ROS camera_info, Kalibr's camchain, EuRoC's sensor.yaml."""
 
 from __future__ import annotations
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import weakref
 from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs import image_folder
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
+from vplog.logs.formats.compression import fetched, unpacked
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
@@ -22,16 +25,15 @@ from vplog.logs.formats.ros2_folder import (
     split_parts,
 )
 from vplog.logs.formats.sqlite_bag import SqliteBag
-from vplog.logs.formats.zstd_file import fetched, unpacked
 from vplog.logs.image_folder import ImageFolder
+from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
-from vplog.logs.split_recording import Part, in_order_of_time
 from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vplog.logs.formats.container import Container
+    from vplog.logs.formats.container import Container, Contents
     from vplog.logs.topic_selection import TopicChoice
     from vplog.stages import Log
 
@@ -40,6 +42,10 @@ _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
 _LISTED = 5
 """Files that an error lists."""
+_OVERLAP_NS = 10**9
+"""ns that one file may reach into the next: recorders split between messages that are a little out of order."""
+_LONGEST_PAUSE_NS = 3600 * 10**9
+"""ns between two files of one drive; who goes on after more than an hour has not kept the odometry running."""
 _KNOWN = "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder) or a folder of images"
 
 
@@ -114,6 +120,16 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
     return container, kind
 
 
+@dataclass(frozen=True)
+class _Part:
+    """One file of a drive."""
+
+    path: Path
+    kind: str
+    container: Container
+    contents: Contents
+
+
 def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
     """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
     paths = [located(path) for path in paths]
@@ -127,16 +143,46 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
         same_name = sum(other.name == path.name for other in paths) > 1
         try:
             container, kind = open_container(path, notes, str(path) if same_name else path.name)
-            parts.append(Part(path, kind, container, container.contents()))
+            parts.append(_Part(path, kind, container, container.contents()))
         except OSError as error:
             raise LogError(f"Cannot read {path}: {error.strerror or error}.") from None
         except LogError as error:
             notes.account.add("missing_file", None, (str(path), 0), [], f"Left out: {error}")
     if not parts:
         raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
-    parts = in_order_of_time(parts)
+    parts = _in_order_of_time(parts)
     first, chain = parts[0], Chain([part.container for part in parts], notes)
     return _recorded(first.path, _name(first.path), _KINDS[first.kind], chain, notes, choice)
+
+
+def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
+    """The files with messages by their first log time.
+
+    Raises LogError where they overlap, lie far apart, differ in kind, or have no topic in common that is of use.
+    """
+    parts = [part for part in parts if part.contents.messages] or parts[:1]
+    parts = sorted(parts, key=lambda part: (part.contents.start_ns, part.path))
+    for a, b in pairwise(parts):
+        if a.kind != b.kind:
+            raise LogError(f"{a.path} ({a.kind}) and {b.path} ({b.kind}) are not one drive. Run each by itself.")
+        overlap_ns = a.contents.end_ns - b.contents.start_ns
+        if overlap_ns > _OVERLAP_NS:
+            raise LogError(
+                f"{a.path} and {b.path} overlap by {overlap_ns / 1e9:.1f} s, so they are not one drive in parts. "
+                "Run each by itself."
+            )
+        if -overlap_ns > _LONGEST_PAUSE_NS:
+            raise LogError(
+                f"{-overlap_ns / 3.6e12:.1f} hours lie between {a.path} and {b.path}, so they are two drives. "
+                "Run each by itself."
+            )
+    useful = [{c.topic for c, count in part.contents.counts.items() if count and kind_of(c)} for part in parts]
+    if len(parts) > 1 and not set.intersection(*useful):
+        raise LogError(
+            f"{parts[0].path} and the {len(parts) - 1} files after it have no topic in common that is of use, so they "
+            "are not one drive in parts. Run each by itself."
+        )
+    return parts
 
 
 def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:

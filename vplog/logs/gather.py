@@ -11,8 +11,7 @@ import numpy as np
 
 from vplog.logs.formats.container import Block, plural
 from vplog.logs.formats.loss_account import Runs
-from vplog.logs.messages.decode import decode, stamp_of
-from vplog.logs.messages.odometry import read_poses
+from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,

@@ -14,7 +14,7 @@ from vplog.data import Gps, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.logs.formats.container import Notes, plural
-from vplog.logs.messages.odometry import Poses
+from vplog.logs.messages.decode import Poses
 from vplog.logs.stamps import Stamps
 from vplog.logs.static_transforms import are_usable, clean
 

@@ -64,13 +64,6 @@ def block_of(data: Octets, rows: list[Row]) -> Block:
     return Block(data, *map(list, zip(*rows, strict=True))) if rows else Block(data, [], [], [], [], [])
 
 
-def part_of(data: Octets, start: int, stop: int) -> Octets:
-    """Bytes of a chunk where they lie, which keeps all of it; a copy of those of a large one."""
-    return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
-
-
-_VIEWED = 4 * 2**20
-"""Bytes of a chunk up to which its images are not copied: each that waits to be decoded may keep another."""
 _COPIED = 4096
 """Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
 _TOGETHER = 256

@@ -140,12 +140,11 @@ def read_metadata(folder: Path) -> Metadata:
     listed = tree.get("relative_file_paths")
     names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
     # Names only: the first writers put the folder before them, and a stranger's list must not lead elsewhere.
-    files = [folder / name.replace("\\", "/").rpartition("/")[2] for name in names]
-    missing = [file.name for file in files if not file.is_file()]
-    files = [file for file in files if file.is_file()]
+    named = [folder / name.replace("\\", "/").rpartition("/")[2] for name in names]
+    files, missing = [file for file in named if file.is_file()], [file.name for file in named if not file.is_file()]
     if not files:
-        named = ", ".join(missing[:3]) or "no storage file"
-        raise MetadataError(f"{folder / 'metadata.yaml'} names {named}, and no such file is in the folder.")
+        lacks = ", ".join(missing[:3]) or "no storage file"
+        raise MetadataError(f"{folder / 'metadata.yaml'} names {lacks}, and no such file is in the folder.")
     mode = str(tree.get("compression_mode") or "").lower()
     start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
     end_ns = start_ns + length_ns if start_ns and length_ns else 0
@@ -154,15 +153,13 @@ def read_metadata(folder: Path) -> Metadata:
 
 def _recorded(tree: dict) -> dict[str, int]:
     """Messages by topic; empty where the list is not one."""
-    result: dict[str, int] = {}
+    result: Counter[str] = Counter()
     topics = tree.get("topics_with_message_count")
     for topic in topics if isinstance(topics, list) else []:
-        about = topic.get("topic_metadata") if isinstance(topic, dict) else None
-        name = about.get("name") if isinstance(about, dict) else None
-        count = topic.get("message_count") if isinstance(topic, dict) else None
-        if isinstance(name, str) and isinstance(count, int) and 0 <= count < _MOST_MESSAGES:
-            result[name] = result.get(name, 0) + count
-    return result
+        match topic:
+            case {"topic_metadata": {"name": str(name)}, "message_count": int(count)} if 0 <= count < _MOST_MESSAGES:
+                result[name] += count
+    return dict(result)
 
 
 def _nanoseconds(tree: Any) -> int:
