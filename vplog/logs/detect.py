@@ -100,10 +100,8 @@ def _recorded(path: Path, name: str, kind: str, container: Container, notes: Not
 
 
 def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container, str]:
-    """The messages of one file, unpacked first where it is compressed as a whole, and its kind. Raises LogError.
-
-    `name` is what the file is called in notes, its own name where empty.
-    """
+    """The messages of one file, unpacked first where it is compressed as a whole, and its kind. `name` is what it is
+    called in notes, its own name where empty. Raises LogError."""
     kind, inside = _magic(path), path
     with ExitStack() as copies:
         if kind == "zstd":
@@ -156,10 +154,8 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
 
 
 def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
-    """The files with messages by their first log time.
-
-    Raises LogError where they overlap, lie far apart, differ in kind, or have no topic in common that is of use.
-    """
+    """The files with messages by their first log time. Raises LogError where they overlap, lie far apart, differ in
+    kind, or have no useful topic in common."""
     parts = [part for part in parts if part.contents.messages] or parts[:1]
     parts = sorted(parts, key=lambda part: (part.contents.start_ns, part.path))
     for a, b in pairwise(parts):

@@ -90,10 +90,8 @@ class RecordedFrame:
     """That of the image, where it came later and is another than the camera's."""
 
     def decode(self) -> Frame:
-        """Raises LogError with topic and stamp where the bytes are not an image.
-
-        Without its depth or right image, where that does not decode or does not fit, the frame is still one.
-        """
+        """The frame, without depth or right image where that does not decode or fit. Raises LogError where the image
+        does not."""
         image, affine = self._image()
         if self.pair is not None:
             return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))

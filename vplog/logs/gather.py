@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.formats.container import Block, plural
+from vplog.logs.formats.container import Block, Notes, plural
 from vplog.logs.formats.loss_account import Runs
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
@@ -19,13 +19,13 @@ from vplog.logs.messages.records import (
     ImageMessage,
     PoseMessage,
 )
-from vplog.logs.stamps import NONE, Stamps
+from vplog.logs.stamps import NONE, Stamps, rate_hz
 from vplog.logs.tf_odometry import MovingFrames
 from vplog.logs.tracks import FixTrack, PoseTrack
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.formats.container import Channel, Message, Notes, Octets, Place
+    from vplog.logs.formats.container import Channel, Message, Octets, Place
     from vplog.logs.topic_selection import Selection
 
 _SMALL = 512
@@ -218,7 +218,7 @@ class Gathered:
     def rates_hz(self) -> dict[Channel, float | None]:
         """Messages a second of each topic that was read, by its own times."""
         found = {channel: one.stamps for channel, one in (*self.by_channel.items(), *self.poses.items())}
-        return {channel: stamps.rate_hz() for channel, stamps in (*found.items(), *self._others.items())}
+        return {channel: rate_hz(stamps.order("", Notes())[0]) for channel, stamps in (found | self._others).items()}
 
     def _add(self, message: Message, position: int) -> None:
         """Raises BadMessageError."""

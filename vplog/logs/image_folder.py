@@ -35,8 +35,7 @@ PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM", b"II*\0", b"MM\0*", b"P5", b"P6", b"P2", b"P3")
 _SINCE_1970_S = (631_152_000, 4_102_444_800)
-"""1990 to 2100: whole numbers of s, ms, us or ns in it have 9 to 19 digits, and never fit two of the units.
-In ns since a start they come up after a week."""
+"""1990 to 2100: whole numbers of s, ms, us or ns in it have 9 to 19 digits, and never fit two of the units."""
 _PERIODS_NS = (5_000_000, 5_000_000_000)
 """200 Hz down to 0.2 Hz, as cameras have it: in us and in ns two ranges that meet and do not overlap."""
 _TRIED = 10
@@ -95,10 +94,8 @@ Group = dict[str, list["Path"]]
 
 
 def of_one_camera(folder: Path, files: list[Path], choice: str | None) -> list[Path]:
-    """The files in order, of one camera: of several, that which `choice` names, as `left_*.png`.
-
-    Cameras differ by names in more than numbers, by bits, or by size. Raises LogError where none of them is chosen.
-    """
+    """The files in order, of one camera, by names, bits or size: of several, that which `choice` names, as
+    `left_*.png`. Raises LogError where none of them is chosen."""
     groups = next((found for split in (_by_name, _by_bits, _by_size) if len(found := split(files)) > 1), {})
     if not groups:
         return files

@@ -65,10 +65,8 @@ class Pictures:
                 yield image_in(channel, self._container.read(place))
 
     def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
-        """Frame, and width and height of the first image that decodes.
-
-        Raises LogError where none of the first few does, and where it is a video that needs PyAV.
-        """
+        """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
+        does, and where it is a video that needs PyAV."""
         video, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +25,7 @@ class FrameTree:
     """Static transforms between named frames; a later transform of the same pair replaces an earlier one."""
 
     def __init__(self, transforms: Iterable[PoseMessage]) -> None:
-        self._from: dict[str, dict[str, Floats]] = {}
+        self._from: defaultdict[str, dict[str, Floats]] = defaultdict(dict)
         self.edges: list[tuple[str, str]] = []
         """Parent and child of each transform."""
         self.dropped = 0
@@ -37,8 +37,7 @@ class FrameTree:
                 self.dropped += 1
                 continue
             self.edges.append((parent, child))
-            self._from.setdefault(parent, {})[child] = parent_from_child
-            self._from.setdefault(child, {})[parent] = se3.inverse(parent_from_child)
+            self._from[parent][child], self._from[child][parent] = parent_from_child, se3.inverse(parent_from_child)
 
     def __contains__(self, frame: str) -> bool:
         return clean(frame) in self._from

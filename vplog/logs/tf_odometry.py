@@ -1,7 +1,4 @@
-"""Frames that move: the transforms of tf topics become an odometry, by the chain from its root to the body.
-
-Those of a tf topic that never change are static transforms: logs older than tf_static have no others.
-"""
+"""Frames that move: the transforms of tf topics become an odometry, by the chain from its root to the body."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ import numpy as np
 
 from vplog.data import Odometry
 from vplog.geometry import se3
-from vplog.logs.stamps import Stamps
+from vplog.logs.stamps import NONE, Stamps
 from vplog.logs.static_transforms import are_usable, clean
 
 if TYPE_CHECKING:
@@ -86,10 +83,8 @@ class MovingFrames:
         return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
 
     def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:
-        """The poses of the body in the frame that stands still, and the frames from there down to the body.
-
-        None and no frames where no chain moves.
-        """
+        """The poses of the body in the frame that stands still, and the frames from there to the body; None and none
+        where no chain moves."""
         chain = self._chain(tree, topic, notes)
         moving = [edge for edge in chain if edge in self._links and self._links[edge].moves]
         if not moving:
@@ -98,11 +93,10 @@ class MovingFrames:
         names = " -> ".join(frames)
         tracks = {edge: self._track(edge, topic, notes) for edge in moving}
         pace = max(moving, key=lambda edge: len(tracks[edge][0]))
-        first_ns = max((stamps[0] for stamps, _ in tracks.values() if len(stamps)), default=0)
-        last_ns = min((stamps[-1] for stamps, _ in tracks.values() if len(stamps)), default=0)
         at_ns = tracks[pace][0]
-        at_ns = at_ns[(at_ns >= first_ns) & (at_ns <= last_ns)]
-        if not len(at_ns) or not all(len(stamps) for stamps, _ in tracks.values()):
+        for stamps, _ in tracks.values():
+            at_ns = at_ns[(at_ns >= stamps[0]) & (at_ns <= stamps[-1])] if len(stamps) else NONE
+        if not len(at_ns):
             notes.add(f"{topic}: the transforms {names} have no time in common; there is no odometry.")
             return None, []
         poses = np.tile(np.eye(4), (len(at_ns), 1, 1))
@@ -160,10 +154,9 @@ def _upwards(frame: str, parents: dict[str, str]) -> list[Edge]:
     """Edges from a frame to the top of its tree; in a circle, up to the frame that comes twice."""
     result: list[Edge] = []
     passed = {frame}
-    while frame in parents and parents[frame] not in passed:
-        result.append((parents[frame], frame))
-        frame = parents[frame]
-        passed.add(frame)
+    while (parent := parents.get(frame, frame)) not in passed:
+        result.append((parent, frame))
+        passed.add(frame := parent)
     return result
 
 

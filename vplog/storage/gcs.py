@@ -1,8 +1,7 @@
 """gs:// through pyarrow: where the server is, who asks, and a bound on every wait.
 
-pyarrow's client of Google Cloud Storage goes on for 15 minutes with what cannot succeed, looks for credentials by the
-same rule, and says what is wrong in some thousand characters. So it is given less time, the server is greeted first,
-and what has no credentials asks without any, as public data allow.
+pyarrow's client goes on for 15 minutes with what cannot succeed, and looks for credentials as long. So it is given less
+time, the server is greeted first, and what has no credentials asks without any, as public data allow.
 """
 
 from __future__ import annotations

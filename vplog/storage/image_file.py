@@ -149,11 +149,8 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _checked_png(data: bytes) -> bytes:
-    """The PNG with its pixels unpacked, in one IDAT of stored blocks, and with nothing beside them but its palette.
-    Raises BadImageError where libpng would find fault with either.
-
-    Pixels are grey by their values alone, as those of raw images are: not by the gamma and primaries of a file.
-    """
+    """The PNG with its pixels unpacked, in one IDAT of stored blocks, and with nothing beside them but its palette: not
+    the gamma and primaries. Raises BadImageError where libpng would find fault with it."""
     view = memoryview(data)
     found: dict[bytes, list[memoryview]] = {b"IHDR": [], b"PLTE": [], b"IDAT": []}
     for kind, start, stop in _png_chunks(data):

@@ -1,12 +1,10 @@
 """Parquet files: their checksums, the version of their columns, and what they may take in memory.
 
-Every page has a CRC-32 as the format has it, which any reader may check. Headers of pages and the footer have none, so
-a seal of 16 bytes stands in the gap before the footer, where other readers do not look: CRC-32 of all before it, and of
-all behind it. A file without a seal was written by another program and is read by its page checksums alone.
+Every page has a CRC-32. Headers of pages and the footer have none, so a seal of 16 bytes stands in the gap before the
+footer, where other readers do not look: CRC-32 of all before it, and of all behind it.
 
-Equal values are one number and a count in Parquet, so 200 kB may say four million rows. Files may come from anyone, so
-what their rows come to is reckoned from the footer before any is read. Texts are read as numbers of a dictionary, whose
-entries are in the file, and checked before each row gets its own.
+Equal values are one number and a count in Parquet, so 200 kB may say four million rows: what the rows come to is
+reckoned from the footer before any is read. Texts are read as numbers of a dictionary, whose entries are in the file.
 """
 
 from __future__ import annotations
@@ -38,8 +36,8 @@ _LEAF_BYTES = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "D
 
 
 TABLE_VERSION = 1
-"""Version of the columns of all tables. A new nullable column does not raise it: older programs pass it over, and newer
-ones read null where it is missing. Any other change of a column does, and is refused by older programs."""
+"""Version of the columns of all tables. A new nullable column does not raise it; any other change of a column does, and
+is refused by older programs."""
 VERSION_KEY = "vplog.table_version"
 """In the header of a file; a file without it is of version 1."""
 VERSION_ABOUT = (

@@ -22,14 +22,12 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Octets
 
 MOST_BYTES = 64 * 2**20
-"""Bytes of unpacked chunks that a process keeps, whatever their number: drives of a few minutes are unpacked once, and
-in longer ones image and depth, which lie in neighbouring chunks, do not unpack their chunks twice."""
+"""Bytes of unpacked chunks that a process caches: neighbouring chunks of image and depth are not unpacked twice."""
 _THREADS = 2
-"""Threads that read ahead, where there may be as many: each unpacks about 1 GB/s, and images are gone through twice as
-fast. More cost more time of the processor than they save."""
+"""Threads that read ahead: each unpacks about 1 GB/s, and images are read twice as fast; more cost more than they
+save."""
 _ALONE_S = 0.02
-"""Seconds of unpacking before other threads help. To start them and to hand over costs a few ms; what takes long to
-unpack, by its size or its packing, is there soon."""
+"""Seconds of unpacking before other threads help: to start them and to hand over costs a few ms."""
 _LEAST_BYTES = 64 * 2**10
 """Size of a chunk from which another thread unpacks it: handing over takes as long as some 50 kB."""
 _AHEAD_BYTES = 32 * 2**20

@@ -50,10 +50,7 @@ class BadChunkError(Exception):
 
 def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
     """The `size` bytes that `data` holds under `kind` (one of KINDS); fewer where `partial` and the data are cut.
-
-    Raises BadChunkError where the kind is not known, the size claimed is beyond what the data justify, or the data
-    are damaged.
-    """
+    Raises BadChunkError where the kind is unknown, the size beyond what the data justify, or the data are damaged."""
     if kind not in KINDS:
         raise BadChunkError(f"unknown compression {kind[:20]!r}")
     if kind in ("", "none"):

@@ -102,10 +102,8 @@ class Search:
         accept: Callable[[int], bool] = lambda _: True,
         stop: int | None = None,
     ) -> int | None:
-        """The first offset from `start` on, below `stop`, where the pattern matches and `accept(offset)` holds.
-
-        The pattern matches at most 64 bytes, so that none is missed between two blocks.
-        """
+        """The first offset from `start` on, below `stop`, where the pattern, of at most 64 bytes, matches and
+        `accept(offset)` holds."""
         position, stop = start, self._length if stop is None else stop
         while position < stop and self._left > 0:
             self._file.seek(position)

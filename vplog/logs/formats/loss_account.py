@@ -1,7 +1,4 @@
-"""What of a log could not be used: counted by topic, placed in time, in one sentence for each reason.
-
-Times are log times, as the recorder wrote them: they are there even where a message's own stamp is the damage.
-"""
+"""What of a log could not be used: counted by topic, placed in time by log times, in one sentence for each reason."""
 
 from __future__ import annotations
 
@@ -93,10 +90,8 @@ class Account:
         spans: list[Span],
         detail: str = "",
     ) -> None:
-        """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all.
-
-        `key`, a file or topic and a place in it, makes the same loss found again replace itself.
-        """
+        """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all. `key`,
+        a file or topic and a place in it, makes the same loss found again replace itself."""
         if (reason, key) in self._settled:
             return
         self._found.get((reason, ""), {}).pop(key, None)  # their topic, or how many, may be known by now
@@ -137,10 +132,8 @@ class Account:
     def settle(
         self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
     ) -> dict[str, int]:
-        """Make the losses in these files add up to what was recorded less what was found: those that nothing counted
-        get what is left, and those that were counted twice, by an index in the wrong place, lose it. `end_ns` is when
-        the recording ended. Gives what no loss explains.
-        """
+        """Make the losses in these files add up to what was recorded less what was found: uncounted ones get what is
+        left, those counted twice lose it. `end_ns` is when the recording ended. Returns what no loss explains."""
         if not recorded:
             return {}
         for topic, count in recorded.items():

@@ -1,7 +1,4 @@
-"""MCAP files (mcap.dev/spec), whole, cut, damaged or without a summary, as a Container.
-
-What the message indexes behind the chunks say spares the unpacking of chunks without a topic of interest.
-"""
+"""MCAP files (mcap.dev/spec), whole, cut, damaged or without a summary, as a Container."""
 
 from __future__ import annotations
 
@@ -132,8 +129,8 @@ class McapFile:
             account.add("damaged_bytes", unexplained, (name, 0), [span], detail)
 
     def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
-        """Take a schema or a channel. The first sound definition of a number holds; a doubtful one, from a damaged
-        chunk or summary, until there is a sound one."""
+        """Take a schema or a channel: the first sound definition of a number, or a doubtful one until there is a sound
+        one."""
         stream = ReadDataStream(io.BytesIO(data))
         try:
             record = records.Schema.read(stream) if opcode == Opcode.SCHEMA else records.Channel.read(stream)
@@ -189,8 +186,7 @@ class McapFile:
         return data
 
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
-        """Account for a damaged chunk, and take its schemas and channels: other chunks need them, and a wrong one fails
-        to decode, which a wrong message may not."""
+        """Account for a damaged chunk, and take its schemas and channels, which other chunks need."""
         data, at = error.data, 0
         while at + RECORD.size <= len(data):
             opcode, length = RECORD.unpack_from(data, at)

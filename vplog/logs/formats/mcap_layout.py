@@ -1,8 +1,7 @@
 """Where the chunks of an MCAP file lie (mcap.dev/spec): read record by record, over damage too.
 
-Chunks are stepped over, so that it reads a few kB per MB. A record says its length twice, before its fields and by
-them: where the two differ, the one with a record behind it holds. Where neither has, reading goes on at the next chunk
-that the file's own index names, or else at the next bytes that can be a record.
+A record says its length twice, before its fields and by them: where the two differ, the one with a record behind it
+holds. Where neither has, reading goes on at the next chunk of the file's index, or the next bytes that can be a record.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): read record by record, over damage too.
 
-A record is believed where another lies behind it. Where none does, reading goes on at the next bytes that can be the
-head of a chunk, or of a record of an index; what lay between is held against the index at the end.
+A record holds where another lies behind it. Where none does, reading goes on at the next bytes that can be the head of
+a chunk, or of a record of an index.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ class ZstdMessages:
 
 
 def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
-    """The container, or one that unpacks its messages where each is a zstd frame: a storage file of rosbag2's
-    compression mode MESSAGE, given without the metadata that say so. No CDR begins as a frame of zstd does."""
+    """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: a storage
+    file of rosbag2's compression mode MESSAGE without its metadata."""
     channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
     firsts = islice(messages_in(container, channels), _TRIED) if channels else ()
     packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)

@@ -118,11 +118,9 @@ class SqliteBag:
         return found[0] if found and isinstance(found[0], bytes) else b""
 
     def _salvaged(self, columns: str, topics: list[int] | None = None) -> Iterator[tuple]:
-        """Rows of the table of messages in its order: row id, topic, time, and more columns; over damage, row by row.
-
-        Recorders number the rows without a gap, so that a number that is not there is a message that is lost. A row
-        before one of a lower number is taken to have a wrong one, and looked for again by the numbers between.
-        """
+        """Rows of the table of messages: row id, topic, time, and more columns; over damage, row by row. Recorders
+        number them without a gap: a missing number is a lost message, and a row before one of a lower number has a
+        wrong one."""
         last, last_ns, tried = 0, 0, 0
         while True:
             waiting = None

@@ -20,8 +20,8 @@ _STAMPS = {
     ("cdr", False): struct.Struct(">4xiI"),
     ("ros1", True): struct.Struct("<4xII"),
 }
-"""Stamps in the headers of ROS, by encoding and whether it is little endian: CDR has 4 bytes of encapsulation before
-them, ROS 1 a sequence number."""
+"""Stamps in ROS headers, by encoding and whether little endian: behind CDR's encapsulation or ROS 1's sequence
+number."""
 
 _NUMBERS = {
     "nav_msgs/Odometry": (7 + 36, 6 + 36),
@@ -35,10 +35,7 @@ _HEAD = 12
 
 
 def decode(channel: Channel, data: Octets) -> Record:
-    """The record that a message holds, the bytes of images views of `data` where they can be.
-
-    Raises BadMessageError.
-    """
+    """The record of a message, the bytes of images views of `data` where they can be. Raises BadMessageError."""
     try:
         if ENCODINGS[channel.encoding] == "ros":
             return decode_ros(short_type(channel.type), channel.encoding, data)
@@ -78,8 +75,7 @@ class Poses(NamedTuple):
 
 
 def read_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
-    """The poses of messages of any type; None where they cannot be taken together: one is damaged or is no pose, or
-    they name different frames."""
+    """The poses of messages of any type; None where one is damaged or is no pose, or they name different frames."""
     try:
         if found := read_ros_poses(channel, messages):
             return found
@@ -97,10 +93,8 @@ def read_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
 
 
 def read_ros_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
-    """The poses of messages in little-endian CDR or as ROS 1 packs them, equal but for stamps and numbers.
-
-    None for anything else, and where a stamp is out of range. Raises BadMessageError where the first is damaged.
-    """
+    """The poses of messages in little-endian CDR or as ROS 1 packs them, equal but for stamps and numbers; None for
+    anything else. Raises BadMessageError where the first is damaged."""
     count, behind = _NUMBERS.get(short_type(channel.type), (0, 0))
     cdr, size = channel.encoding == "cdr", len(messages[0])
     at = size - 8 * (count + behind)

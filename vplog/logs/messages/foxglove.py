@@ -47,10 +47,8 @@ _FIXED = {1: 8, 5: 4}
 
 
 def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
-    """A record of type `foxglove.RawImage` and so on; in protobuf, the bytes of images are a view of `data`.
-
-    Raises BadMessageError or what the parsers raise.
-    """
+    """A record of type `foxglove.RawImage` and so on; in protobuf, the bytes of images are a view of `data`. Raises
+    BadMessageError or what the parsers raise."""
     make, read = _READERS[kind]
     message: Any = make()
     if encoding == "json":
@@ -72,8 +70,7 @@ def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
 
 
 def _find_data(message: Proto, data: Octets) -> tuple[int, int, int] | None:
-    """Where the field `data` of an image lies in protobuf: its tag, its first byte and its end. None where it is left
-    out, or bytes before it are odd."""
+    """Where the field `data` of an image lies in protobuf: its tag, first byte and end. None where it is left out."""
     tag, at = message.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH, 0
     try:
         while data[at] != tag:

@@ -88,8 +88,8 @@ def is_image(message: ImageMessage) -> bool:
 
 
 def may_be_thermal(message: ImageMessage) -> bool:
-    """Whether it has 16 bits that may be depth in mm or a thermal camera's counts: depth has px without measurement
-    (ROS REP 118), where nothing reflects, in shadow of the emitter and at edges; every px of a camera counts."""
+    """Whether it has 16 bits that may be a thermal camera's counts: depth has px without measurement (ROS REP 118),
+    where nothing reflects and at edges; every px of a camera counts."""
     if not message.encoding.startswith(_SIXTEEN_BITS) or "compresseddepth" in message.encoding.lower():
         return False
     try:
@@ -177,10 +177,8 @@ def _pixels(message: ImageMessage) -> tuple[Any, int | None]:
 
 
 def depth_m(message: ImageMessage) -> Float32s:
-    """(H, W) float32 m, NaN where unknown: 16UC1 and 16SC1 hold mm, 32FC1 and 64FC1 m (ROS REP 118).
-
-    Raises BadMessageError.
-    """
+    """(H, W) float32 m, NaN where unknown: 16UC1 and 16SC1 hold mm, 32FC1 and 64FC1 m (ROS REP 118). Raises
+    BadMessageError."""
     if not message.compressed:
         pixels, _ = _raw(message)
         return _metres(pixels, message.encoding)

@@ -1,9 +1,8 @@
 """Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
 
-foxglove.CompressedVideo, ffmpeg_image_transport's packets, and sensor_msgs/CompressedImage with such a format. Decoding
-runs forward only: for frames in order of time, every packet between two key frames is decoded at most once, and
-stretches between key frames without a frame of interest not at all. Behind a damaged or missing packet nothing is
-decoded up to the next key frame, since the pictures would be wrong; VP9 and AV1 do not tell a missing one.
+Decoding runs forward only: for frames in order of time every packet is decoded at most once, and stretches between key
+frames without a frame of interest not at all. Behind a damaged or missing packet, which VP9 and AV1 do not show, nothing
+is decoded up to the next key frame.
 """
 
 from __future__ import annotations
@@ -73,10 +72,8 @@ class VideoStream:
         return next((row for row in range(self._count) if self._kind(row) >= _KEY), None)
 
     def frame(self, row: int) -> Bytes:
-        """(H, W) uint8 grey; rows are best read in increasing order.
-
-        Raises BadMessageError where it cannot be decoded, and LogError where PyAV is not installed.
-        """
+        """(H, W) uint8 grey; rows are best read in increasing order. Raises BadMessageError where it cannot be decoded,
+        and LogError where PyAV is not installed."""
         if row not in self._ready:
             self._advance(row)
         self._last = row
