@@ -199,15 +199,13 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         endings = {file.suffix for file in images if file.suffix}
         damaged = {file for file in files if file.suffix in endings}.difference(images)
         return ImageFolder(path, [*images, *damaged], notes, choice, damaged)
-    inside = {folder.name: count for folder in sorted(path.iterdir()) if folder.is_dir() and (count := _images(folder))}
-    if inside:
-        found = ", ".join(f"{name} ({count})" for name, count in [*inside.items()][:_LISTED])
+    inside = [folder for folder in sorted(path.iterdir()) if folder.is_dir()]
+    counts = [sum(file.is_file() and image_folder.is_image(file) for file in folder.iterdir()) for folder in inside]
+    named = [f"{folder.name} ({count})" for folder, count in zip(inside, counts, strict=True) if count]
+    if named:
+        found = ", ".join(named[:_LISTED])
         raise LogError(f"{path} holds no images itself; folders in it do: {found}. Give one of them.")
     raise LogError(_no_folder(path, files))
-
-
-def _images(folder: Path) -> int:
-    return sum(file.is_file() and image_folder.is_image(file) for file in folder.iterdir())
 
 
 def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:
@@ -225,16 +223,14 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
 def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> Log:
     """A ROS 2 bag of several storage files. An unreadable one is left out as long as another is sound."""
     name = folder.resolve().name
-    parts: list[Container] = []
-    kinds: set[str] = set()
+    parts: list[tuple[Container, str]] = []
     failures: list[LogError] = []
     for file in metadata.files:
         try:
             container, kind = open_container(file, notes)
             if kind == "ros1":
                 raise LogError(f"{file} is a ROS 1 bag in the folder of a ROS 2 bag. Give it by itself.")
-            parts.append(container)
-            kinds.add(kind)
+            parts.append((container, kind))
         except LogError as error:
             failures.append(error)
             notes.account.add("missing_file", None, (file.name, 0), [], f"Left out: {error}")
@@ -243,9 +239,10 @@ def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Note
     for missing in metadata.missing:
         detail = f"{name} lacks {missing}, which metadata.yaml names."
         notes.account.add("missing_file", None, (missing, 0), [], detail)
-    chain = Chain(parts, notes, metadata)
+    chain = Chain([container for container, _ in parts], notes, metadata)
     container = ZstdMessages(chain, notes) if metadata.mode == "message" else chain
-    return _recorded(folder, name, "ros2-mcap" if "mcap" in kinds else "ros2-db3", container, notes, choice)
+    kind = "ros2-mcap" if any(kind == "mcap" for _, kind in parts) else "ros2-db3"
+    return _recorded(folder, name, kind, container, notes, choice)
 
 
 def _name(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -55,7 +56,7 @@ class Encoded:
         try:
             return convert(image_in(self.channel, self.data))
         except BadMessageError as error:
-            raise LogError(undecodable(self.channel, stamp_ns, str(error))) from None
+            raise _undecodable(self.channel, stamp_ns, error) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +64,12 @@ class Decoded:
     """A frame of a video, which decodes in the order of the file alone and so was decoded where it was read."""
 
     channel: Channel
-    image: Bytes | None
-    reason: str
-    """Why there is no image."""
+    image: Bytes | BadMessageError
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
-        if self.image is None:
-            raise LogError(undecodable(self.channel, stamp_ns, self.reason))
+        if isinstance(self.image, BadMessageError):
+            raise _undecodable(self.channel, stamp_ns, self.image)
         return self.image
 
 
@@ -95,8 +94,7 @@ class RecordedFrame:
         image, affine = self._image()
         if self.pair is not None:
             return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
-        depth = None if self.depth is None else self._registered(self.depth, image)
-        depth = None if depth is None else _warped_depth(depth, affine, self.camera)
+        depth = None if self.depth is None else self._registered(self.depth, image, affine)
         return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth)
 
     def _image(self) -> tuple[Bytes, Floats | None]:
@@ -112,21 +110,23 @@ class RecordedFrame:
             raise
         return image, None
 
-    def _registered(self, depth: Encoded, image: Bytes) -> Float32s | None:
-        """The depth of the image's px; None, and counted, where it does not decode or has another size."""
-        try:
+    def _registered(self, depth: Encoded, image: Bytes, affine: Floats | None) -> Float32s | None:
+        """The depth of the camera's px, NaN beyond the image; None, and counted, where it does not decode or has
+        another size than the image."""
+        detail, found = "", None
+        with suppress(LogError):
             found = depth.depth_m(self.stamp_ns)
-        except LogError:
-            self._lose(depth.channel)
-            return None
-        if found.shape == image.shape:
+        if found is not None and found.shape != image.shape:
+            detail = (
+                f"{depth.channel.topic} has {size_of(found)} px where the image has {size_of(image)}; depth must be "
+                "registered to the image: choose another with --depth-topic."
+            )
+        if found is None or detail:
+            return self._lose(depth.channel, detail)
+        if affine is None:
             return found
-        self._lose(
-            depth.channel,
-            f"{depth.channel.topic} has {size_of(found)} px where the image has {size_of(image)}; depth must be "
-            "registered to the image: choose another with --depth-topic.",
-        )
-        return None
+        size = self.camera.width, self.camera.height  # the nearest measurement to each px
+        return np.asarray(cv2.warpAffine(found, affine, size, flags=cv2.INTER_NEAREST, borderValue=np.nan), np.float32)
 
     def _right(self, pair: Pair) -> Bytes | None:
         if self.right is None:
@@ -135,8 +135,7 @@ class RecordedFrame:
             image = self.right.grey(self.stamp_ns)
             _check_size(self.right.channel, image, self.camera)
         except LogError:
-            self._lose(self.right.channel)
-            return None
+            return self._lose(self.right.channel)
         return pair.rectify(image, 1)
 
     def _lose(self, channel: Channel, detail: str = "") -> None:
@@ -144,8 +143,8 @@ class RecordedFrame:
         self.notes.account.add("undecodable_image", {channel.topic: 1}, (channel.topic, at), [(at, at)], detail)
 
 
-def undecodable(channel: Channel, stamp_ns: int, reason: str) -> str:
-    return f"{channel.topic} at {stamp_ns} ns cannot be decoded: {reason}."
+def _undecodable(channel: Channel, stamp_ns: int, reason: BadMessageError) -> LogError:
+    return LogError(f"{channel.topic} at {stamp_ns} ns cannot be decoded: {reason}.")
 
 
 def size_of(image: np.ndarray) -> str:
@@ -179,14 +178,6 @@ def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), max((shrunk - 1) / 2, 1e-3)), np.uint8)
     size = (camera.width, camera.height)
     return np.asarray(cv2.warpAffine(image, affine, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-def _warped_depth(depth: Float32s, affine: Floats | None, camera: Camera) -> Float32s:
-    """The nearest measurement to each px of the camera, NaN beyond the image."""
-    if affine is None:
-        return depth
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.warpAffine(depth, affine, size, flags=cv2.INTER_NEAREST, borderValue=np.nan), np.float32)
 
 
 def _check_size(channel: Channel, image: np.ndarray, camera: Camera) -> None:

@@ -44,9 +44,9 @@ class Pictures:
         if self._video is None:
             return Encoded(self._image, self._container.read(self.content.places[row]), self._levels)
         try:
-            return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])), "")
+            return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])))
         except BadMessageError as error:
-            return Decoded(self._image, None, str(error))
+            return Decoded(self._image, error)
 
     def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
         """The depth or right image of a row; None where there is none."""
@@ -79,16 +79,15 @@ class Pictures:
 
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
-        failure = None
+        failures: list[LogError] = []
         found = [(row, place) for row, place in enumerate(self.content.depth_places) if place is not None]
         for row, place in found[:_TRIED]:
             try:
-                depth = Encoded(channel, self._container.read(place))
-                return depth.depth_m(int(self.content.stamp_ns[row]))
+                return Encoded(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
             except LogError as error:
-                failure = failure or error
-        if failure is not None:
-            raise failure
+                failures.append(error)
+        if failures:
+            raise failures[0]
         return None
 
     def _stream(self, image: Channel, codec: str, places: list[Place]) -> VideoStream:

@@ -33,7 +33,7 @@ _METADATA_S = 2.0
 """It is on the machine itself: google-auth waits 3 s."""
 _RETRY_S = 20
 """What fails for so long is given up; a request that says nothing is given up by the client after 120 s."""
-_SAID = re.compile(
+_REASON = re.compile(
     r"(?:.*underlying error message was: |.*?last message of )(.*?)(?: error_info=|,? gcloud-cpp|}}|$)", re.S
 )
 """The part of a google::cloud::Status that says what is wrong: the innermost message."""
@@ -116,11 +116,11 @@ def plain(text: str) -> str:
     """One line of a google::cloud::Status, and what to do where it is about who asks."""
     if "google::cloud::Status" not in text:
         return text
-    found = _SAID.search(text)
-    said = " ".join((found[1] if found else text).split())[:200].rstrip(". ")
+    found = _REASON.search(text)
+    why = " ".join((found[1] if found else text).split())[:200].rstrip(". ")
     if "access token" in text or re.search(r"UNAUTHENTICATED|PERMISSION_DENIED", text):
         return (
-            f"Google Cloud answers: {said}. Log in with `gcloud auth application-default login`, or set "
+            f"Google Cloud answers: {why}. Log in with `gcloud auth application-default login`, or set "
             "GOOGLE_APPLICATION_CREDENTIALS to the key of an account that may"
         )
-    return said
+    return why

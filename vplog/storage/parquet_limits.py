@@ -33,8 +33,6 @@ MOST_TIMES = 200
 1.4; a ledger of which every candidate failed alike to 64."""
 _NARROW = {"INT_8": 1, "UINT_8": 1, "INT_16": 2, "UINT_16": 2}
 _LEAF_BYTES = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
-
-
 TABLE_VERSION = 1
 """Version of the columns of all tables. A new nullable column does not raise it; any other change of a column does, and
 is refused by older programs."""
@@ -149,8 +147,9 @@ def _summed(stream: BinaryIO, count: int) -> int:
 
 def _check_version(path: Path, schema: pa.Schema) -> None:
     header = schema.metadata or {}
-    said, maker = (header.get(key, b"").decode(errors="replace") for key in (VERSION_KEY.encode(), b"vplog.version"))
-    check_version(path, int(said or 1) if said.isdecimal() or not said else said, TABLE_VERSION, maker)
+    version, maker = (header.get(key, b"").decode(errors="replace") for key in (VERSION_KEY.encode(), b"vplog.version"))
+    version = version or "1"
+    check_version(path, int(version) if version.isdecimal() else version, TABLE_VERSION, maker)
 
 
 def check_version(path: Path, version: object, newest: int, maker: object = None) -> None:
@@ -224,17 +223,14 @@ def read_table(path: Path, file: pq.ParquetFile, columns: Collection[str] | None
     texts = [name for name in names if _is_text(schema.field(name).type)]
     if not texts:
         return file.read(columns=names)
-    with pq.ParquetFile(
-        path, metadata=file.metadata, read_dictionary=texts, page_checksum_verification=True
-    ) as numbered:
+    options: dict[str, Any] = {"read_dictionary": texts, "page_checksum_verification": True}
+    with pq.ParquetFile(path, metadata=file.metadata, **options) as numbered:
         table = numbered.read(columns=names)
     for name in texts:
-        column = table[name]
+        column, text = table[name], schema.field(name)
         lengths = [pc.call_function("binary_length", [part.dictionary]).to_numpy() for part in column.chunks]
         _check(sum(len(part) * int(own.max(initial=0)) for part, own in zip(column.chunks, lengths, strict=True)), path)
-        table = table.set_column(
-            table.schema.get_field_index(name), schema.field(name), column.cast(schema.field(name).type)
-        )
+        table = table.set_column(table.schema.get_field_index(name), text, column.cast(text.type))
     return table
 
 

@@ -284,10 +284,9 @@ def file_system(endpoint: str | None, region: str | None) -> FileSystem:
     """One for all objects of a server that speaks S3: it keeps its connections."""
     from pyarrow import fs
 
-    known = {"endpoint_override": endpoint, "region": region}
     return fs.S3FileSystem(  # delayed: a small file is one request, not the three of an upload in parts
         request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, allow_delayed_open=True,
-        **{name: value for name, value in known.items() if value},
+        endpoint_override=endpoint or None, region=region or None,
     )  # fmt: skip
 
 
@@ -395,5 +394,6 @@ def _check_bucket(path: RemotePath) -> None:
 
 
 def reason(error: OSError) -> str:
-    said = without_secrets(plain(error.strerror or str(error)))
-    return (said.splitlines()[0] if said else type(error).__name__)[:300].rstrip(".")
+    """Why something failed, in one line."""
+    text = without_secrets(plain(error.strerror or str(error)))
+    return (text.splitlines()[0] if text else type(error).__name__)[:300].rstrip(".")

@@ -86,8 +86,8 @@ def made_folder(folder: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A binary stream that becomes `path` when the block ends well; what was there before stays until then.
 
-    The bytes go to a hidden file beside it, are synced, then renamed. A link stays one: what it points to is replaced. A
-    device or a pipe is written into. Raises ResultError where the folder cannot be written or the disk is full.
+    The bytes go to a hidden file beside it, are synced, then renamed. A link stays one: what it points to is replaced.
+    A device or a pipe is written into. Raises ResultError where the folder cannot be written or the disk is full.
     """
     if not path.name:
         raise ResultError("The name of a file to write is empty. Give one with -o.")

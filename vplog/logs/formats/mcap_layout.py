@@ -136,12 +136,9 @@ class _LayoutReader:
         for offset, (listed, indexes) in sorted(self._indexed.items()):
             if (chunk := found.get(offset)) is not None:
                 if chunk.counts and chunk.counts.keys() != indexes.keys():
-                    listed.counts = self._counts(indexes)
-                    chunk.doubtful |= chunk.counts != {i: n for i, n in listed.counts.items() if n}
-            elif (bounds := self._bounds(offset))[0] == Opcode.CHUNK and bounds[
-                1
-            ] <= self._length:  # it was jumped over
-                self._add_chunk(offset + RECORD.size, bounds[1], cut=False)
+                    chunk.doubtful |= chunk.counts != {i: n for i, n in self._counts(indexes).items() if n}
+            elif (stop := self._chunk_stop(offset)) is not None:  # it was jumped over
+                self._add_chunk(offset + RECORD.size, stop, cut=False)
                 self.layout.chunks[-1].counts = self._counts(indexes)
             elif any(start <= offset < stop for start, stop in self.layout.gaps):  # else the index is what is damaged
                 listed.counts = self._counts(indexes)
@@ -149,6 +146,11 @@ class _LayoutReader:
         self.layout.in_order()
         if found and self._indexed:  # they tell of every chunk in the gaps
             self.layout.gaps = []
+
+    def _chunk_stop(self, position: int) -> int | None:
+        """Where the chunk at `position` stops; None where none lies whole there."""
+        opcode, stop = self._bounds(position)
+        return stop if opcode == Opcode.CHUNK and stop <= self._length else None
 
     def _counts(self, indexes: dict[int, int]) -> dict[int, int]:
         """Messages per channel id by message indexes at these offsets; empty where one is not there."""
@@ -193,13 +195,10 @@ class _LayoutReader:
         """Bytes of a record whose fields begin at `start`, as the lengths among them say."""
         if opcode not in _SHAPES:
             return None
-        position = start
+        at = start
         for step in _SHAPES[opcode]:
-            if step > 0:
-                position += step
-            else:
-                position += int.from_bytes(self.at(position, -step), "little") - step
-        return position - start
+            at += step if step > 0 else int.from_bytes(self.at(at, -step), "little") - step
+        return at - start
 
     def _is_record(self, position: int, behind: int = 0, longer: bool = False) -> bool:
         """Whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of the
