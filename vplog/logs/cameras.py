@@ -13,7 +13,7 @@ from vplog.logs.formats.container import Notes
 if TYPE_CHECKING:
     from vplog.data import Floats
     from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.static_transforms import FrameTree
+    from vplog.logs.tf_odometry import FrameTree
 
 _MODELS = {
     "plumb_bob": "plumb_bob",

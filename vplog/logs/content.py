@@ -13,7 +13,7 @@ from vplog.logs.gather import Gathered
 from vplog.logs.odometry_sources import choose_odometry, read_sources, weigh_sources
 from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import nearest, share_clock
-from vplog.logs.static_transforms import FrameTree
+from vplog.logs.tf_odometry import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry, OdometrySource

@@ -18,7 +18,7 @@ from vplog.logs.continuity import find_jumps
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
-from vplog.logs.static_transforms import FrameTree
+from vplog.logs.tf_odometry import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Ints, Odometry

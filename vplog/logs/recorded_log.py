@@ -14,8 +14,7 @@ from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
 from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
-from vplog.logs.frames import RecordedFrame, size_of
-from vplog.logs.pictures import Pictures
+from vplog.logs.frames import Pictures, RecordedFrame, size_of
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates

@@ -11,7 +11,7 @@ from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
 from vplog.logs.messages.video import codec_of
-from vplog.logs.static_transforms import clean
+from vplog.logs.tf_odometry import clean
 from vplog.logs.topic_selection import Candidate
 from vplog.storage.image_file import image_size
 

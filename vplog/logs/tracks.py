@@ -16,7 +16,7 @@ from vplog.geometry.geodesy import local_enu
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.messages.decode import Poses
 from vplog.logs.stamps import Stamps
-from vplog.logs.static_transforms import are_usable, clean
+from vplog.logs.tf_odometry import are_usable, clean
 
 if TYPE_CHECKING:
     from vplog.data import Floats

@@ -13,9 +13,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
-from vplog.logs.formats.chunk_losses import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
 from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, ordered, topics_of
+from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.mcap_chunk import ChunkReader
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.storage.remote_path import RemotePath

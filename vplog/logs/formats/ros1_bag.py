@@ -6,9 +6,9 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
-from vplog.logs.formats.chunk_losses import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, unpack
 from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, ordered, topics_of
+from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
 
