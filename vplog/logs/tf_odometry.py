@@ -85,7 +85,7 @@ def are_usable(poses: Floats) -> np.ndarray:
     """(K,) bool: whether `usable_pose` of x y z, x y z w in each row of (K, 7) is one."""
     sizes = np.abs(poses)
     placed, largest = (sizes[:, :3] < _FARTHEST_M).all(1), sizes[:, 3:].max(1)  # NaN where one is
-    return placed & (largest > _SMALLEST) & (largest < 1 / SMALLEST)
+    return placed & (largest > _SMALLEST) & (largest < 1 / _SMALLEST)
 
 
 @dataclass
