@@ -40,7 +40,7 @@ _REASON = re.compile(
 
 
 def google_place() -> str:
-    """Where the server is, as Google's own tools are told it."""
+    """Where the server is, by the variable of Google's own tools."""
     given = os.environ.get("STORAGE_EMULATOR_HOST") or _PUBLIC
     return given if "://" in given else f"http://{given}"
 

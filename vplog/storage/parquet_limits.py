@@ -52,7 +52,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 class _Sealed(io.RawIOBase):
-    """A stream that sums up what is written to it, and keeps back the footer."""
+    """A stream that sums up what is written to it, and holds back the footer."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self._crc, self.footer = stream, 0, bytearray()

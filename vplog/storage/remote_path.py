@@ -140,7 +140,7 @@ class RemotePath:
         return f"length {self._length}, time {self._info.mtime_ns}"
 
     def open(self, mode: str = "rb") -> BinaryIO:
-        """A stream that reads what is asked for. Raises OSError."""
+        """A stream that reads by requests for blocks. Raises OSError."""
         if mode != "rb":
             raise ValueError(f"a remote file is opened with mode rb, not {mode}")
         if self._is_http:
@@ -270,7 +270,7 @@ def names_below(path: RemotePath) -> dict[str, bool]:
 
 
 def s3_place() -> tuple[str | None, str | None]:
-    """Endpoint and region of S3, as its own tools are told them; None where they are not told."""
+    """Endpoint and region of S3, by the variables of its own tools; None where they are not set."""
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
     return endpoint, os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
 
@@ -305,7 +305,7 @@ def original(path: Path) -> Path:
 
 @contextmanager
 def stands_for(path: Path, place: Path | RemotePath) -> Iterator[Path]:
-    """For the time of the block, what is recorded of `path` is said of `place`, where its files come from or go to."""
+    """For the time of the block, records name `place` for `path`, where its files come from or go to."""
     _STANDS_FOR[path] = place
     try:
         yield path
@@ -332,9 +332,8 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
 
 
 def _download(path: RemotePath, target: Path) -> None:
-    files = [path] if path.is_file() else [file for file in path.rglob() if file.is_file()]
-    for file in files:
-        place = target if path.is_file() else target / file.relative_to(path)
+    files = {path: target} if path.is_file() else {f: target / f.relative_to(path) for f in path.rglob() if f.is_file()}
+    for file, place in files.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         with file.open() as source, place.open("wb") as sink:
             shutil.copyfileobj(source, sink, _BLOCK_BYTES)
@@ -377,8 +376,7 @@ def check_writable(path: RemotePath) -> None:
 
 
 def _check_bucket(path: RemotePath) -> None:
-    """Before an hour of work: raises ResultError where there is no server, or no such bucket on it. Whether this
-    account may write to it, only writing tells."""
+    """Raises ResultError where there is no server, or no such bucket on it; what may be written only writing tells."""
     from pyarrow.fs import FileType
 
     try:

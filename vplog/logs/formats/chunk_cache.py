@@ -79,7 +79,7 @@ class Chunks:
         threads: bool,
     ) -> None:
         """`load` reads and unpacks one, in any thread where `threads`; for its BadChunkError `damaged` is called in the
-        thread of the caller. `size` says how many bytes there will be, `packed` whether to keep them."""
+        thread of the caller. `size` says how many bytes there will be, `packed` whether to cache them."""
         self._load, self._damaged, self._size, self._packed = load, damaged, size, packed
         self._threads = min(_THREADS, allowed()) if threads else 0
         self._file = next(_FILES)

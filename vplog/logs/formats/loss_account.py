@@ -189,9 +189,9 @@ class Account:
         recorded: Counter[str] = Counter()
         for counts in self._recorded.values():
             recorded.update(counts)
-        order, all_found, result = list(REASONS), self._copy(), []
-        for reason, topic in sorted(all_found, key=lambda key: (order.index(key[0]), key)):
-            places = all_found[reason, topic]
+        order, found, result = list(REASONS), self._copy(), []
+        for reason, topic in sorted(found, key=lambda key: (order.index(key[0]), key)):
+            places = found[reason, topic]
             lost = [places[key] for key in sorted(places)]
             if lost:
                 messages = None if None in (counts := [one.messages for one in lost]) else sum(n or 0 for n in counts)

@@ -78,7 +78,7 @@ def _find_data(message: Proto, data: Octets) -> tuple[int, int, int] | None:
 
 
 def _skipped(data: Octets, at: int, tag: int) -> int:
-    """Where the value of a field ends that begins at `at`. Raises IndexError where that cannot be told."""
+    """Where the value of a field ends that begins at `at`. Raises IndexError where the tag is of another message."""
     if tag >= 0x80:  # a field number above 15, which none of these types has
         raise IndexError
     if tag & 7 == _LENGTH:
