@@ -14,7 +14,7 @@ from tests.logs.drives import START_NS, Drive, ros_messages, write_ros2
 from vplog import logs
 from vplog.logs.clocks import on_one_clock
 from vplog.logs.formats.container import Notes
-from vplog.logs.stamps import Stamps, share_clock
+from vplog.logs.stamps import Stamps, rate_hz, share_clock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -203,4 +203,4 @@ def test_a_clock_that_is_set_in_a_whole_log(tmp_path: Path) -> None:
 def test_the_rate_is_that_of_the_time_between_first_and_last(
     header_ns: np.ndarray, log_ns: np.ndarray, hz: float | None
 ) -> None:
-    assert stamps(header_ns, log_ns).rate_hz() == hz
+    assert rate_hz(stamps(header_ns, log_ns).order("", Notes())[0]) == hz

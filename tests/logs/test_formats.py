@@ -35,8 +35,7 @@ from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel
 from vplog.logs.image_folder import ImageFolder, stamps_of
-from vplog.logs.messages.decode import decode
-from vplog.logs.messages.odometry import read_poses, read_ros_poses
+from vplog.logs.messages.decode import decode, read_poses, read_ros_poses
 from vplog.logs.messages.records import PoseMessage
 from vplog.stages import Log
 

@@ -18,7 +18,7 @@ from vplog.logs.cameras import body_from_camera, camera_of
 from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import CalibrationMessage, PoseMessage
 from vplog.logs.stamps import Stamps, increasing, nearest
-from vplog.logs.static_transforms import FrameTree
+from vplog.logs.tf_odometry import FrameTree
 from vplog.logs.tracks import PoseTrack
 
 if TYPE_CHECKING:

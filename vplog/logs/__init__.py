@@ -16,10 +16,8 @@ __all__ = ["TopicChoice", "check", "open", "open_drive"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
-    """The drive at `path`, its kind found by content, its topics chosen as by `topic_selection.py` or by name.
-
-    Raises LogError where there is no log, or where a topic of `topics` is not in it.
-    """
+    """The drive at `path`, its kind found by content, its topics by the rules of `topic_selection.py` or by name.
+    Raises LogError where there is no log, or where a topic of `topics` is not in it."""
     from vplog.logs.detect import open_log  # OpenCV, rosbags and mcap load here, not with the package
 
     return open_log(path, topics or TopicChoice())
@@ -33,10 +31,8 @@ def check(path: Path) -> None:
 
 
 def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:
-    """One drive recorded in several files, given in any order; of one path, the same as `open`.
-
-    Raises LogError where the files overlap in time, lie far apart, differ in kind or have no topic in common.
-    """
+    """One drive recorded in several files, in any order. Raises LogError where they overlap in time, lie far apart,
+    differ in kind or have no topic in common."""
     from vplog.logs.detect import open_drive as open_parts
 
     return open_parts(paths, topics or TopicChoice())

@@ -1,4 +1,4 @@
-"""Calibrations in a file beside the log: ROS camera_info YAML, Kalibr's camchain, EuRoC's sensor.yaml."""
+"""Files beside a log: its odometry, and calibrations as ROS camera_info, Kalibr's camchain, EuRoC's sensor.yaml."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from vplog.data import Odometry
 from vplog.errors import LogError
 from vplog.geometry import se3
+from vplog.geometry.tum import read_tum
+from vplog.logs.continuity import without_jumps
 from vplog.logs.messages.records import CalibrationMessage
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Floats
+    from vplog.logs.formats.container import Notes
+    from vplog.logs.topic_selection import TopicChoice
 
 _LARGEST = 1_000_000
 """Bytes; a calibration has some kB, and the parser is not to be blown up."""
@@ -61,6 +66,32 @@ def read_calibrations(path: Path) -> list[CalibratedCamera]:
         raise LogError(f"{path}: {error}. {_KINDS}.") from None
 
 
+class SidecarFiles:
+    """The files of a TopicChoice, read at once: what is wrong with them shows before any work on the log."""
+
+    def __init__(self, choice: TopicChoice, notes: Notes) -> None:
+        """Raises LogError where a file cannot be read."""
+        self.odometry: Odometry | None = None
+        """None without a file."""
+        if choice.odometry_file is not None:
+            logged = Odometry(*read_tum(choice.odometry_file, LogError, "--odometry-file"), None)
+            self.odometry = without_jumps(logged, choice.odometry_file.name, notes)
+            notes.add(f"{choice.odometry_file.name} carries no covariance; its noise is that of the drift model.")
+        self._path = choice.calibration_file
+        self._cameras = [] if self._path is None else read_calibrations(self._path)
+
+    def camera(self, topic: str) -> CalibratedCamera | None:
+        """The camera of an image topic; None without a file. Raises LogError where the file does not say which."""
+        return None if self._path is None else camera_for(self._cameras, topic, self._path)
+
+    def right_from_left(self, left: str, right: str) -> Floats | None:
+        """(4, 4) between the cameras of two image topics; None where the file has no chain that leads there."""
+        a, b = self.camera(left), self.camera(right)
+        if a is None or b is None or a is b or a.from_first is None or b.from_first is None:
+            return None
+        return b.from_first @ se3.inverse(a.from_first)
+
+
 def camera_for(cameras: list[CalibratedCamera], topic: str, path: Path) -> CalibratedCamera:
     """The camera of an image topic: by its topic, by its name in the topic, or the only one. Raises LogError."""
     if len(cameras) == 1:
@@ -97,13 +128,12 @@ def _cameras(tree: Any) -> list[CalibratedCamera]:
 def _camera_info(tree: dict) -> CalibrationMessage:
     """docs.ros.org/en/api/camera_calibration_parsers."""
     lens = _matrix(tree.get("distortion_coefficients", []), None)
-    has_p = "projection_matrix" in tree
-    return CalibrationMessage(
-        0, "", _size(tree.get("image_width", 0)), _size(tree.get("image_height", 0)),
-        _text(tree.get("distortion_model")), lens, _matrix(tree["camera_matrix"], 9).reshape(3, 3),
-        _matrix(tree["projection_matrix"], 12).reshape(3, 4) if has_p else np.zeros((3, 4)),
-        _matrix(tree["rectification_matrix"], 9).reshape(3, 3) if "rectification_matrix" in tree else np.eye(3),
-    )  # fmt: skip
+    size = _size(tree.get("image_width", 0)), _size(tree.get("image_height", 0))
+    k, p, r = (
+        _matrix(tree.get(f"{name}_matrix", unset.ravel().tolist()), unset.size).reshape(unset.shape)
+        for name, unset in (("camera", np.eye(3)), ("projection", np.zeros((3, 4))), ("rectification", np.eye(3)))
+    )
+    return CalibrationMessage(0, "", *size, _text(tree.get("distortion_model")), lens, k, p, r)
 
 
 def _intrinsics(tree: dict) -> CalibrationMessage:

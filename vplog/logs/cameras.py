@@ -13,7 +13,7 @@ from vplog.logs.formats.container import Notes
 if TYPE_CHECKING:
     from vplog.data import Floats
     from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.static_transforms import FrameTree
+    from vplog.logs.tf_odometry import FrameTree
 
 _MODELS = {
     "plumb_bob": "plumb_bob",
@@ -38,11 +38,8 @@ _SAME_SHAPE = 0.01
 
 
 def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int, int], notes: Notes) -> Camera:
-    """The camera of images of `size` (width, height; 0 unknown), body_from_camera still the identity.
-
-    Images of a topic named image_rect... are rectified already: their matrix is that of P, without distortion
-    (sensor_msgs/CameraInfo).
-    """
+    """The camera of images of `size` (width, height; 0 unknown), body_from_camera still the identity. Images of a topic
+    named image_rect... are rectified: their matrix is that of P, without distortion (sensor_msgs/CameraInfo)."""
     width, height = size
     unknown = Camera(name, None, "none", np.zeros(0), width, height, np.eye(4))
     if calibration is None:
@@ -67,11 +64,8 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
 def camera_from_image(
     camera: Camera, size: tuple[int, int], calibration: CalibrationMessage | None
 ) -> tuple[Floats | None, bool]:
-    """(2, 3) from px of an image of `size` to px of the camera, of the same lens, and whether the two are the same.
-
-    By the image's own calibration where it has one; else, where the shape is the same, as a scaled image of all that
-    the camera sees. Neither where the shape is another. A change below a px, as of a lens in focus, is none.
-    """
+    """(2, 3) from px of an image of `size` to px of the camera, and whether the two are the same, but for less than a
+    px. By the image's own calibration; else, where the shape is the same, by scale. None where it is another."""
     own = None if calibration is None else camera_of(camera.name, calibration, size, Notes())
     if camera.matrix is not None and own is not None and own.matrix is not None:
         found = (camera.matrix @ np.linalg.inv(own.matrix))[:2]
@@ -126,10 +120,8 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
 
 
 def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes) -> Floats:
-    """(4, 4) through the static transforms; the identity, with a note where that is a guess, where there is no chain.
-
-    `body` is the odometry's child frame, empty where its type has none; `frame` is the image's frame_id.
-    """
+    """(4, 4) through the static transforms; without a chain the identity, noted where that is a guess. `body` is the
+    odometry's child frame, empty where its type has none; `frame` is the image's frame_id."""
     if not body and _BODY in tree:
         body = _BODY
         notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")

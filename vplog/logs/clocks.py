@@ -1,8 +1,7 @@
-"""Header stamps against log times: which of the two jumped, and what the stamps are without the jump.
+"""Header stamps against log times: which of the two clocks was set, and what the stamps are without that.
 
-A header stamp says when something was measured, and aligns topics; but clocks are set while a drive runs, simulations
-start again at zero, and single stamps are damaged. The log time is late by the transport but steady, so it is the
-check: between two messages of a topic both should advance alike, and their difference, the skew, stays at one level.
+The log time is late by the transport but steady: between two messages of a topic both should advance alike, and their
+difference, the skew, stays at one level.
 """
 
 from __future__ import annotations
@@ -85,11 +84,8 @@ class _Levels:
 
 
 def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
-    """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1.
-
-    Where there are several clocks, `reference_ns` is the skew of the one to end on, that of most messages of all
-    topics; None takes that of most of these.
-    """
+    """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1. Of
+    several clocks, `reference_ns` is the skew of the one to end on; None takes that of most messages."""
     step, log_step = np.diff(header_ns), np.diff(log_ns)
     period = float(np.median(np.minimum(np.abs(step), np.abs(log_step)))) if len(step) else 0.0
     jump_ns = max(LEAST_JUMP_NS, _PERIODS * period)
@@ -132,11 +128,8 @@ def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], 
 
 
 def _levels(header_ns: Ints, log_ns: Ints, least_ns: float) -> _Levels | None:
-    """The runs and clocks with steps of `least_ns` or more; None where these leave the skew at no level.
-
-    The clock of a run is another than that of the run before where the skew stays at another level, by more than it
-    varies: late messages and bursts come back.
-    """
+    """The runs and clocks with steps of `least_ns` or more; None where these leave the skew at no level. The clock of a
+    run is another than that before where the skew stays at another level, by more than it varies."""
     runs, gaps = _runs(header_ns, log_ns, least_ns)
     skew, lengths = log_ns - header_ns, [run.stop - run.start for run in runs]
     least = min(_LEAST_RUN, max(lengths))

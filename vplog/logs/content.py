@@ -9,12 +9,11 @@ import numpy as np
 
 from vplog.logs.continuity import without_jumps
 from vplog.logs.formats.container import Notes, plural
-from vplog.logs.gather import Calibrations, Gathered, Images
+from vplog.logs.gather import Gathered
 from vplog.logs.odometry_sources import choose_odometry, read_sources, weigh_sources
+from vplog.logs.recorder_clock import mend_steps_back
 from vplog.logs.stamps import nearest, share_clock
-from vplog.logs.static_transforms import FrameTree
-from vplog.logs.tf_odometry import MovingFrames
-from vplog.logs.tracks import FixTrack, PoseTrack
+from vplog.logs.tf_odometry import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry, OdometrySource
@@ -58,6 +57,11 @@ class Content:
     """By topic that was read: messages a second."""
 
     @property
+    def calibration(self) -> CalibrationMessage | None:
+        """The camera's."""
+        return next(iter(self.calibrations), None)
+
+    @property
     def body(self) -> str:
         """The frame that the odometry moves, empty where it has no name."""
         return self.frames[-1] if self.frames else ""
@@ -69,22 +73,12 @@ _TOGETHER_NS = 5_000_000
 
 def read_content(container: Container, chosen: Selection, notes: Notes) -> Content:
     """Read the chosen topics once; what had to be repaired or left out is noted."""
-    read = Gathered(
-        Images(chosen.image),
-        Images(chosen.depth),
-        Images(chosen.right),
-        Calibrations(chosen.camera_info),
-        Calibrations(chosen.right_info),
-        {source: PoseTrack(source.topic) for source in chosen.sources if source not in chosen.tf},
-        FixTrack(chosen.gps.topic) if chosen.gps else None,
-        tf=chosen.tf,
-        moving=MovingFrames(keep=any(source in chosen.tf for source in chosen.sources)),
-    )
+    read = Gathered(chosen)
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
     for block in container.blocks(chosen.channels, stamped):
         read.take_block(block)
     read.finish_poses()
-    read.mend_steps_back(notes)
+    mend_steps_back(read.every_stamps(), notes)
     share_clock(stamps for _, stamps in read.stamps())
     found = read_sources(read, chosen)
     sources = weigh_sources(found, read.images.finish(Notes())[0])
@@ -101,13 +95,13 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
     paired = []
     for name, images in (("depth", read.depths), ("right", read.rights)):
         other_ns, other_places, _ = images.finish(notes)
-        pairs = nearest(stamp_ns, other_ns).tolist()
-        paired.append([None if pair < 0 else other_places[pair] for pair in pairs])
-        if images.channel and (alone := sum(pair < 0 for pair in pairs)):
+        pairs = nearest(stamp_ns, other_ns)
+        paired.append([None if pair < 0 else other_places[pair] for pair in pairs.tolist()])
+        if images.channel and (alone := int((pairs < 0).sum())):
             notes.add(f"{alone} of {plural(len(pairs), 'image')} have no {name} image within half a frame period.")
-        both = np.flatnonzero(np.array(pairs, np.int64) >= 0)
-        late_ns = np.abs(other_ns[np.array(pairs, np.int64)[both]] - stamp_ns[both])
-        if name == "right" and len(both) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
+        both = pairs >= 0
+        late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
+        if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
             notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion.")
     odometry, frames = None, []
     if chosen.odometry is not None:

@@ -59,11 +59,8 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
 
 
 def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
-    """The odometry with its motion continued over each jump as it was before; stray poses are left out. Both is noted.
-
-    What follows a jump is moved as one piece, so every other step stays as logged. The covariance of the pose behind a
-    jump becomes unknown.
-    """
+    """The odometry with its motion continued over each jump, and without stray poses; both is noted. What follows a
+    jump is moved as one piece, and the covariance of the pose behind it becomes unknown."""
     stamp_ns, poses, covariance = odometry.stamp_ns, odometry.odom_from_body, odometry.covariance
     rows = find_jumps(stamp_ns, poses)
     stray = _stray(stamp_ns, poses, rows)
@@ -83,10 +80,7 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
 
 def _departure(steps: Floats, seconds: Floats) -> Floats:
     """(T,) how far each of (T, 3) steps is from those between the medians of the steps before and behind, as velocities
-    or, where the stamps jitter, as they are.
-
-    What speeds up or starts to turn leads from one to the other; a jump is like neither.
-    """
+    or, where the stamps jitter, as they are."""
     found = []
     for scale in (seconds, np.ones_like(seconds)):
         rate = steps / scale[:, None]

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import weakref
 from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs import image_folder
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
+from vplog.logs.formats.compression import fetched, unpacked
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
 from vplog.logs.formats.ros2_folder import (
     Chain,
-    Counted,
     Metadata,
     MetadataError,
     ZstdMessages,
@@ -23,16 +25,15 @@ from vplog.logs.formats.ros2_folder import (
     split_parts,
 )
 from vplog.logs.formats.sqlite_bag import SqliteBag
-from vplog.logs.formats.zstd_file import fetched, unpacked
 from vplog.logs.image_folder import ImageFolder
+from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
-from vplog.logs.split_recording import Part, in_order_of_time
 from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vplog.logs.formats.container import Container
+    from vplog.logs.formats.container import Container, Contents
     from vplog.logs.topic_selection import TopicChoice
     from vplog.stages import Log
 
@@ -41,6 +42,10 @@ _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
 _LISTED = 5
 """Files that an error lists."""
+_OVERLAP_NS = 10**9
+"""ns that one file may reach into the next: recorders split between messages that are a little out of order."""
+_LONGEST_PAUSE_NS = 3600 * 10**9
+"""ns between two files of one drive; who goes on after more than an hour has not kept the odometry running."""
 _KNOWN = "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder) or a folder of images"
 
 
@@ -95,10 +100,8 @@ def _recorded(path: Path, name: str, kind: str, container: Container, notes: Not
 
 
 def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container, str]:
-    """The messages of one file, unpacked first where it is compressed as a whole, and its kind. Raises LogError.
-
-    `name` is what the file is called in notes, its own name where empty.
-    """
+    """The messages of one file, unpacked first where it is compressed as a whole, and its kind. `name` is what it is
+    called in notes, its own name where empty. Raises LogError."""
     kind, inside = _magic(path), path
     with ExitStack() as copies:
         if kind == "zstd":
@@ -115,6 +118,16 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
     return container, kind
 
 
+@dataclass(frozen=True)
+class _Part:
+    """One file of a drive."""
+
+    path: Path
+    kind: str
+    container: Container
+    contents: Contents
+
+
 def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
     """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
     paths = [located(path) for path in paths]
@@ -128,16 +141,44 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
         same_name = sum(other.name == path.name for other in paths) > 1
         try:
             container, kind = open_container(path, notes, str(path) if same_name else path.name)
-            parts.append(Part(path, kind, container, container.contents()))
+            parts.append(_Part(path, kind, container, container.contents()))
         except OSError as error:
             raise LogError(f"Cannot read {path}: {error.strerror or error}.") from None
         except LogError as error:
             notes.account.add("missing_file", None, (str(path), 0), [], f"Left out: {error}")
     if not parts:
         raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
-    parts = in_order_of_time(parts)
-    first, chain = parts[0], Chain([part.container for part in parts])
+    parts = _in_order_of_time(parts)
+    first, chain = parts[0], Chain([part.container for part in parts], notes)
     return _recorded(first.path, _name(first.path), _KINDS[first.kind], chain, notes, choice)
+
+
+def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
+    """The files with messages by their first log time. Raises LogError where they overlap, lie far apart, differ in
+    kind, or have no useful topic in common."""
+    parts = [part for part in parts if part.contents.messages] or parts[:1]
+    parts = sorted(parts, key=lambda part: (part.contents.start_ns, part.path))
+    for a, b in pairwise(parts):
+        if a.kind != b.kind:
+            raise LogError(f"{a.path} ({a.kind}) and {b.path} ({b.kind}) are not one drive. Run each by itself.")
+        overlap_ns = a.contents.end_ns - b.contents.start_ns
+        if overlap_ns > _OVERLAP_NS:
+            raise LogError(
+                f"{a.path} and {b.path} overlap by {overlap_ns / 1e9:.1f} s, so they are not one drive in parts. "
+                "Run each by itself."
+            )
+        if -overlap_ns > _LONGEST_PAUSE_NS:
+            raise LogError(
+                f"{-overlap_ns / 3.6e12:.1f} hours lie between {a.path} and {b.path}, so they are two drives. "
+                "Run each by itself."
+            )
+    useful = [{c.topic for c, count in part.contents.counts.items() if count and kind_of(c)} for part in parts]
+    if len(parts) > 1 and not set.intersection(*useful):
+        raise LogError(
+            f"{parts[0].path} and the {len(parts) - 1} files after it have no topic in common that is of use, so they "
+            "are not one drive in parts. Run each by itself."
+        )
+    return parts
 
 
 def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
@@ -158,15 +199,13 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         endings = {file.suffix for file in images if file.suffix}
         damaged = {file for file in files if file.suffix in endings}.difference(images)
         return ImageFolder(path, [*images, *damaged], notes, choice, damaged)
-    inside = {folder.name: count for folder in sorted(path.iterdir()) if folder.is_dir() and (count := _images(folder))}
-    if inside:
-        found = ", ".join(f"{name} ({count})" for name, count in [*inside.items()][:_LISTED])
+    inside = [folder for folder in sorted(path.iterdir()) if folder.is_dir()]
+    counts = [sum(file.is_file() and image_folder.is_image(file) for file in folder.iterdir()) for folder in inside]
+    named = [f"{folder.name} ({count})" for folder, count in zip(inside, counts, strict=True) if count]
+    if named:
+        found = ", ".join(named[:_LISTED])
         raise LogError(f"{path} holds no images itself; folders in it do: {found}. Give one of them.")
     raise LogError(_no_folder(path, files))
-
-
-def _images(folder: Path) -> int:
-    return sum(file.is_file() and image_folder.is_image(file) for file in folder.iterdir())
 
 
 def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:
@@ -184,16 +223,14 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
 def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> Log:
     """A ROS 2 bag of several storage files. An unreadable one is left out as long as another is sound."""
     name = folder.resolve().name
-    parts: list[Container] = []
-    kinds: set[str] = set()
+    parts: list[tuple[Container, str]] = []
     failures: list[LogError] = []
     for file in metadata.files:
         try:
             container, kind = open_container(file, notes)
             if kind == "ros1":
                 raise LogError(f"{file} is a ROS 1 bag in the folder of a ROS 2 bag. Give it by itself.")
-            parts.append(container)
-            kinds.add(kind)
+            parts.append((container, kind))
         except LogError as error:
             failures.append(error)
             notes.account.add("missing_file", None, (file.name, 0), [], f"Left out: {error}")
@@ -202,11 +239,10 @@ def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Note
     for missing in metadata.missing:
         detail = f"{name} lacks {missing}, which metadata.yaml names."
         notes.account.add("missing_file", None, (missing, 0), [], detail)
-    chain: Container = Chain(parts)
-    files = [file.name for file in metadata.files] + metadata.missing
-    counted = Counted(chain, metadata, files, notes) if metadata.recorded else chain
-    container = ZstdMessages(counted, notes) if metadata.mode == "message" else counted
-    return _recorded(folder, name, "ros2-mcap" if "mcap" in kinds else "ros2-db3", container, notes, choice)
+    chain = Chain([container for container, _ in parts], notes, metadata)
+    container = ZstdMessages(chain, notes) if metadata.mode == "message" else chain
+    kind = "ros2-mcap" if any(kind == "mcap" for _, kind in parts) else "ros2-db3"
+    return _recorded(folder, name, kind, container, notes, choice)
 
 
 def _name(path: Path) -> str:

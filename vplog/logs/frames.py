@@ -1,9 +1,10 @@
-"""Images as the log holds them, with what belongs to each: all that a worker needs to decode one frame."""
+"""Images as the log holds them, by their row in time, with what belongs to each to decode one frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -12,18 +13,25 @@ import numpy as np
 from vplog.data import Frame
 from vplog.errors import LogError
 from vplog.logs.cameras import camera_from_image
+from vplog.logs.formats.container import plural
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.pixels import depth_m, grey
+from vplog.logs.messages.pixels import depth_m, drive_levels, grey, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
+from vplog.logs.messages.video import VideoStream
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from vplog.data import Bytes, Camera, Float32s, Floats
-    from vplog.logs.formats.container import Channel, Notes, Octets
+    from vplog.logs.content import Content
+    from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
     from vplog.logs.messages.pixels import Levels
     from vplog.logs.messages.records import CalibrationMessage
     from vplog.logs.rectification import Pair
+
+
+_TRIED = 10
+"""Images tried for the size of all; a drive whose first second is damaged is not usable."""
 
 
 def image_in(channel: Channel, data: Octets) -> ImageMessage:
@@ -55,7 +63,7 @@ class Encoded:
         try:
             return convert(image_in(self.channel, self.data))
         except BadMessageError as error:
-            raise LogError(undecodable(self.channel, stamp_ns, str(error))) from None
+            raise _undecodable(self.channel, stamp_ns, error) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +71,12 @@ class Decoded:
     """A frame of a video, which decodes in the order of the file alone and so was decoded where it was read."""
 
     channel: Channel
-    image: Bytes | None
-    reason: str
-    """Why there is no image."""
+    image: Bytes | BadMessageError
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
-        if self.image is None:
-            raise LogError(undecodable(self.channel, stamp_ns, self.reason))
+        if isinstance(self.image, BadMessageError):
+            raise _undecodable(self.channel, stamp_ns, self.image)
         return self.image
 
 
@@ -90,15 +96,12 @@ class RecordedFrame:
     """That of the image, where it came later and is another than the camera's."""
 
     def decode(self) -> Frame:
-        """Raises LogError with topic and stamp where the bytes are not an image.
-
-        Without its depth or right image, where that does not decode or does not fit, the frame is still one.
-        """
+        """The frame, without depth or right image where that does not decode or fit. Raises LogError where the image
+        does not."""
         image, affine = self._image()
         if self.pair is not None:
             return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
-        depth = None if self.depth is None else self._registered(self.depth, image)
-        depth = None if depth is None else _warped_depth(depth, affine, self.camera)
+        depth = None if self.depth is None else self._registered(self.depth, image, affine)
         return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth)
 
     def _image(self) -> tuple[Bytes, Floats | None]:
@@ -114,21 +117,23 @@ class RecordedFrame:
             raise
         return image, None
 
-    def _registered(self, depth: Encoded, image: Bytes) -> Float32s | None:
-        """The depth of the image's px; None, and counted, where it does not decode or has another size."""
-        try:
+    def _registered(self, depth: Encoded, image: Bytes, affine: Floats | None) -> Float32s | None:
+        """The depth of the camera's px, NaN beyond the image; None, and counted, where it does not decode or has
+        another size than the image."""
+        detail, found = "", None
+        with suppress(LogError):
             found = depth.depth_m(self.stamp_ns)
-        except LogError:
-            self._lose(depth.channel)
-            return None
-        if found.shape == image.shape:
+        if found is not None and found.shape != image.shape:
+            detail = (
+                f"{depth.channel.topic} has {size_of(found)} px where the image has {size_of(image)}; depth must be "
+                "registered to the image: choose another with --depth-topic."
+            )
+        if found is None or detail:
+            return self._lose(depth.channel, detail)
+        if affine is None:
             return found
-        self._lose(
-            depth.channel,
-            f"{depth.channel.topic} has {size_of(found)} px where the image has {size_of(image)}; depth must be "
-            "registered to the image: choose another with --depth-topic.",
-        )
-        return None
+        size = self.camera.width, self.camera.height  # the nearest measurement to each px
+        return np.asarray(cv2.warpAffine(found, affine, size, flags=cv2.INTER_NEAREST, borderValue=np.nan), np.float32)
 
     def _right(self, pair: Pair) -> Bytes | None:
         if self.right is None:
@@ -137,8 +142,7 @@ class RecordedFrame:
             image = self.right.grey(self.stamp_ns)
             _check_size(self.right.channel, image, self.camera)
         except LogError:
-            self._lose(self.right.channel)
-            return None
+            return self._lose(self.right.channel)
         return pair.rectify(image, 1)
 
     def _lose(self, channel: Channel, detail: str = "") -> None:
@@ -146,8 +150,8 @@ class RecordedFrame:
         self.notes.account.add("undecodable_image", {channel.topic: 1}, (channel.topic, at), [(at, at)], detail)
 
 
-def undecodable(channel: Channel, stamp_ns: int, reason: str) -> str:
-    return f"{channel.topic} at {stamp_ns} ns cannot be decoded: {reason}."
+def _undecodable(channel: Channel, stamp_ns: int, reason: BadMessageError) -> LogError:
+    return LogError(f"{channel.topic} at {stamp_ns} ns cannot be decoded: {reason}.")
 
 
 def size_of(image: np.ndarray) -> str:
@@ -183,15 +187,94 @@ def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
     return np.asarray(cv2.warpAffine(image, affine, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _warped_depth(depth: Float32s, affine: Floats | None, camera: Camera) -> Float32s:
-    """The nearest measurement to each px of the camera, NaN beyond the image."""
-    if affine is None:
-        return depth
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.warpAffine(depth, affine, size, flags=cv2.INTER_NEAREST, borderValue=np.nan), np.float32)
-
-
 def _check_size(channel: Channel, image: np.ndarray, camera: Camera) -> None:
     if image.shape != (camera.height, camera.width):
         size = f"{camera.width} x {camera.height}"
         raise LogError(f"{channel.topic} has an image of {size_of(image)} px among those of {size} px; it is left out.")
+
+
+class Pictures:
+    """Reads images where `content` says they lie."""
+
+    def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
+        """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
+        self._container, self._image = container, image
+        self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
+        self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
+        """What was read, without the images before a video's first key frame."""
+
+    def image(self, row: int) -> Encoded | Decoded:
+        if self._image is None:
+            raise LogError("No image topic is chosen. Choose one with --image-topic.")
+        if self._video is None:
+            return Encoded(self._image, self._container.read(self.content.places[row]), self._levels)
+        try:
+            return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])))
+        except BadMessageError as error:
+            return Decoded(self._image, error)
+
+    def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
+        """The depth or right image of a row; None where there is none."""
+        place = places[row]
+        return None if channel is None or place is None else Encoded(channel, self._container.read(place), self._levels)
+
+    @cached_property
+    def _levels(self) -> Levels | None:
+        """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
+        places = self.content.places
+        return None if self._image is None else drive_levels(self._sampled(self._image, places[:: spread(len(places))]))
+
+    def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
+        for place in places:
+            with suppress(BadMessageError):
+                yield image_in(channel, self._container.read(place))
+
+    def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
+        """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
+        does, and where it is a video that needs PyAV."""
+        video, reason = self._video if channel == self._image else None, ""
+        for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
+            try:
+                message = image_in(channel, self._container.read(place))
+                pixels = grey(message) if video is None else video.frame(int(self.content.stream_rows[i]))
+                return message.frame, (pixels.shape[1], pixels.shape[0])
+            except BadMessageError as error:
+                reason = str(error)
+        raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another --image-topic.")
+
+    def first_depth(self, channel: Channel) -> Float32s | None:
+        """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
+        failures: list[LogError] = []
+        found = [(row, place) for row, place in enumerate(self.content.depth_places) if place is not None]
+        for row, place in found[:_TRIED]:
+            try:
+                return Encoded(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
+            except LogError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
+        return None
+
+    def _stream(self, image: Channel, codec: str, places: list[Place]) -> VideoStream:
+        def payload(row: int) -> bytes:
+            with suppress(BadMessageError):
+                return bytes(image_in(image, self._container.read(places[row])).data)
+            return b""
+
+        return VideoStream(codec, image.topic, payload, len(places))
+
+    def _from_first_key(self, video: VideoStream, content: Content, notes: Notes) -> Content:
+        first = video.first_key()
+        decodable = content.stream_rows >= (len(content.stream) if first is None else first)
+        if self._image is not None and (lost := int((~decodable).sum())):
+            why = "without a key frame before them" if first is None else "before the first key frame"
+            notes.add(f"{self._image.topic}: {plural(lost, 'image')} {why} cannot be decoded; left out.")
+        rows = np.flatnonzero(decodable).tolist()
+        return replace(
+            content,
+            stamp_ns=content.stamp_ns[decodable],
+            places=[content.places[row] for row in rows],
+            stream_rows=content.stream_rows[decodable],
+            depth_places=[content.depth_places[row] for row in rows],
+            right_places=[content.right_places[row] for row in rows],
+        )

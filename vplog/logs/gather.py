@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.formats.container import Block, plural
+from vplog.logs.formats.container import Block, Notes, plural
 from vplog.logs.formats.loss_account import Runs
-from vplog.logs.messages.decode import decode, stamp_of
-from vplog.logs.messages.odometry import read_poses
+from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
@@ -19,14 +19,14 @@ from vplog.logs.messages.records import (
     ImageMessage,
     PoseMessage,
 )
-from vplog.logs.recorder_clock import mend_steps_back
-from vplog.logs.stamps import NONE, Stamps
+from vplog.logs.stamps import NONE, Stamps, rate_hz
 from vplog.logs.tf_odometry import MovingFrames
+from vplog.logs.tracks import FixTrack, PoseTrack
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.formats.container import Channel, Message, Notes, Octets, Place
-    from vplog.logs.tracks import FixTrack, PoseTrack
+    from vplog.logs.formats.container import Channel, Message, Octets, Place
+    from vplog.logs.topic_selection import Selection
 
 _SMALL = 512
 """Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
@@ -107,29 +107,27 @@ class Calibrations:
         return self.found or ([self._first] if self._first else [])
 
 
-@dataclass
 class Gathered:
-    """What has been collected so far."""
+    """What has been collected so far of the topics of a selection."""
 
-    images: Images
-    depths: Images
-    rights: Images
-    calibrations: Calibrations
-    right_calibrations: Calibrations
-    poses: dict[Channel, PoseTrack]
-    """Tracks of the topics that may be the odometry."""
-    fixes: FixTrack | None
-    transforms: list[PoseMessage] = field(default_factory=list)
-    lost: dict[tuple[str, str], Runs] = field(default_factory=dict)
-    """Lost messages by reason and topic."""
-    waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = field(default_factory=dict)
-    """Messages of odometry that are still to be added, their log times and their positions."""
-    messages: int = 0
-    """Read so far: the position of the next one in the order of the file."""
-    others: dict[Channel, Stamps] = field(default_factory=dict)
-    """Log times of the topics that are not followed over time."""
-    tf: tuple[Channel, ...] = ()
-    moving: MovingFrames = field(default_factory=lambda: MovingFrames(keep=False))
+    def __init__(self, chosen: Selection) -> None:
+        self.images, self.depths, self.rights = Images(chosen.image), Images(chosen.depth), Images(chosen.right)
+        self.calibrations = Calibrations(chosen.camera_info)
+        self.right_calibrations = Calibrations(chosen.right_info)
+        self.poses = {source: PoseTrack(source.topic) for source in chosen.sources if source not in chosen.tf}
+        """Tracks of the topics that may be the odometry."""
+        self.fixes = FixTrack(chosen.gps.topic) if chosen.gps else None
+        self.transforms: list[PoseMessage] = []
+        self.moving = MovingFrames(keep=any(source in chosen.tf for source in chosen.sources))
+        self.lost: dict[tuple[str, str], Runs] = {}
+        """Lost messages by reason and topic."""
+        self._tf = chosen.tf
+        self._waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = {}
+        """Messages of odometry that are still to be added, their log times and their positions."""
+        self._messages = 0
+        """Read so far: the position of the next one in the order of the file."""
+        self._others: defaultdict[Channel, Stamps] = defaultdict(Stamps)
+        """Log times of the topics that are not followed over time."""
 
     @cached_property
     def by_channel(self) -> dict[Channel, Images]:
@@ -139,8 +137,8 @@ class Gathered:
     def take_block(self, block: Block) -> None:
         """Add the messages of a block; those that drives are full of, all of a topic at once."""
         rows: dict[Channel, list[int]] = {}
-        view, first = memoryview(block.data), self.messages
-        self.messages += len(block.channels)
+        view, first = memoryview(block.data), self._messages
+        self._messages += len(block.channels)
         for row, channel in enumerate(block.channels):
             rows.setdefault(channel, []).append(row)
         single: list[int] = []
@@ -149,14 +147,14 @@ class Gathered:
             if channel in self.by_channel:
                 single += mine
             elif channel in self.poses:
-                data, waiting_ns, waiting_positions = self.waiting.setdefault(channel, ([], [], []))
+                data, waiting_ns, waiting_positions = self._waiting.setdefault(channel, ([], [], []))
                 data += [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
                 waiting_ns += log_ns
                 waiting_positions += positions
                 if len(data) >= _TOGETHER:
                     self._add_poses(channel)
             else:
-                self.others.setdefault(channel, Stamps()).extend([0] * len(mine), log_ns, positions)
+                self._others[channel].extend([0] * len(mine), log_ns, positions)
                 known = self.calibrations_of(channel)
                 single += [
                     row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
@@ -166,12 +164,12 @@ class Gathered:
 
     def finish_poses(self) -> None:
         """Add the messages of odometry that wait."""
-        for channel in list(self.waiting):
+        for channel in list(self._waiting):
             self._add_poses(channel)
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
-        data, log_ns, positions = self.waiting.pop(channel)
+        data, log_ns, positions = self._waiting.pop(channel)
         found = read_poses(channel, data)
         if found is not None:
             self.poses[channel].add_all(found, log_ns, positions)
@@ -195,9 +193,8 @@ class Gathered:
             self._sound(channel.topic)
 
     def _sound(self, topic: str) -> None:
-        for reason in ("empty_image", "undecodable") if self.lost else ():
-            if (reason, topic) in self.lost:
-                self.lost[reason, topic].sound()
+        for runs in (runs for (_, lost), runs in self.lost.items() if lost == topic):
+            runs.sound()
 
     def calibrations_of(self, channel: Channel) -> Calibrations | None:
         """The calibrations that a channel holds, if it is one of them."""
@@ -208,11 +205,11 @@ class Gathered:
         images = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
         return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one]
 
-    def mend_steps_back(self, notes: Notes) -> None:
-        """Undo steps back of the recorder's clock, which all topics share."""
+    def every_stamps(self) -> list[Stamps]:
+        """Stamps of every topic that was read, each pose with its position."""
         for track in self.poses.values():
             track.give_places()
-        mend_steps_back([*(stamps for _, stamps in self.stamps()), *self.others.values(), *self.moving.stamps()], notes)
+        return [*(stamps for _, stamps in self.stamps()), *self._others.values(), *self.moving.stamps()]
 
     def skew_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
@@ -221,7 +218,7 @@ class Gathered:
     def rates_hz(self) -> dict[Channel, float | None]:
         """Messages a second of each topic that was read, by its own times."""
         found = {channel: one.stamps for channel, one in (*self.by_channel.items(), *self.poses.items())}
-        return {channel: stamps.rate_hz() for channel, stamps in (*found.items(), *self.others.items())}
+        return {channel: rate_hz(stamps.order("", Notes())[0]) for channel, stamps in (found | self._others).items()}
 
     def _add(self, message: Message, position: int) -> None:
         """Raises BadMessageError."""
@@ -233,7 +230,7 @@ class Gathered:
                 self.poses[channel].add(pose, message.log_ns, position)
             case FixMessage() as fix if self.fixes:
                 self.fixes.add(fix, message.log_ns, position)
-            case list() as transforms if channel in self.tf:
+            case list() as transforms if channel in self._tf:
                 self.moving.add(transforms, message.log_ns, position)
             case list() as transforms:
-                self.transforms.extend(transforms)
+                self.transforms += transforms

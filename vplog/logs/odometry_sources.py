@@ -18,7 +18,7 @@ from vplog.logs.continuity import find_jumps
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
-from vplog.logs.static_transforms import FrameTree
+from vplog.logs.tf_odometry import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Ints, Odometry
@@ -75,11 +75,9 @@ def weigh(source: Channel, frames: list[str], odometry: Odometry, camera_ns: Int
         evidence["a single pose"] = _FAINT
     if jumps:
         evidence[f"jumps {plural(jumps, 'time')}"] = 1.0 / (1.0 + jumps)
-    score = math.prod(evidence.values())
-    return OdometrySource(
-        topic, kind, frames, len(stamp_ns), None if rate_hz is None else round(rate_hz, 3), round(coverage, 4),
-        round(path_m, 3), jumps, evidence, round(score, 6),
-    )  # fmt: skip
+    score, rate_hz = round(math.prod(evidence.values()), 6), None if rate_hz is None else round(rate_hz, 3)
+    numbers = len(stamp_ns), rate_hz, round(coverage, 4), round(path_m, 3), jumps
+    return OdometrySource(topic, kind, frames, *numbers, evidence, score)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +134,6 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
 
 
 def _note_doubts(source: OdometrySource, requested: bool, pictured: bool, notes: Notes) -> None:
-    """Say what is lost with a source that is taken all the same."""
     if source.coverage < COVERED and pictured:
         better = "" if requested else " No other source is better; --odometry-file takes one from a file."
         notes.add(

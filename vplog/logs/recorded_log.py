@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING
 
 from vplog.data import LogInfo, Topic
 from vplog.errors import LogError
+from vplog.logs.calibration_file import SidecarFiles
 from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
 from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
-from vplog.logs.frames import RecordedFrame, size_of
-from vplog.logs.pictures import Pictures
+from vplog.logs.frames import Pictures, RecordedFrame, size_of
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
-from vplog.logs.sidecar_files import SidecarFiles
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
-from vplog.logs.topic_selection import TopicChoice, select
+from vplog.logs.topic_selection import Candidate, TopicChoice, select
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Camera, Gps, Ints, Odometry
     from vplog.logs.content import Content
     from vplog.logs.formats.container import Channel, Container, Contents
-    from vplog.logs.formats.loss_account import Account, Loss
+    from vplog.logs.formats.loss_account import Loss
     from vplog.logs.messages.records import CalibrationMessage
     from vplog.logs.rectification import Pair
 
@@ -42,7 +41,8 @@ class RecordedLog:
     def __init__(
         self, path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice
     ) -> None:
-        self._path, self._name, self._kind, self._notes = path, name, kind, notes
+        self.name, self.account = name, notes.account
+        self._path, self._kind, self._notes = path, kind, notes
         self._contents: Contents = container.contents()
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
@@ -50,22 +50,13 @@ class RecordedLog:
         self._sidecar = SidecarFiles(choice, notes)
 
     @property
-    def name(self) -> str:
-        return self._name
-
-    @property
     def warnings(self) -> list[str]:
-        return list(self._notes.lines)
-
-    @property
-    def account(self) -> Account:
-        """Account of what could not be used so far."""
-        return self._notes.account
+        return self._notes.lines
 
     @property
     def losses(self) -> list[Loss]:
         """What could not be used so far, counted; complete once the log was read."""
-        return self._notes.account.losses
+        return self.account.losses
 
     def info(self) -> LogInfo:
         """Reads the chosen topics once, so that the warnings are complete."""
@@ -73,31 +64,24 @@ class RecordedLog:
         topics = [self._topic(channel, count) for channel, count in self._contents.counts.items()]
         if self._selection.image is not None:
             self._check_images()
-        stamps = [content.stamp_ns] + [track.stamp_ns for track in (content.odometry, content.gps) if track is not None]
-        stamps = [stamp_ns for stamp_ns in stamps if len(stamp_ns)]
-        start_ns = min((int(s[0]) for s in stamps), default=self._contents.start_ns)
-        end_ns = max((int(s[-1]) for s in stamps), default=self._contents.end_ns)
-        messages = self._contents.messages
-        frames = [frame for frame in content.frames if frame]
+        tracks = [track for track in (content, content.odometry, content.gps) if track and len(track.stamp_ns)]
+        start_ns = min((int(track.stamp_ns[0]) for track in tracks), default=self._contents.start_ns)
+        end_ns = max((int(track.stamp_ns[-1]) for track in tracks), default=self._contents.end_ns)
         return LogInfo(
-            str(self._path), self._kind, start_ns, end_ns, messages, topics, self.warnings, frames, content.skew_ms,
-            content.sources,
+            str(self._path), self._kind, start_ns, end_ns, self._contents.messages, topics, self.warnings,
+            [frame for frame in content.frames if frame], content.skew_ms, content.sources,
         )  # fmt: skip
 
     def _topic(self, channel: Channel, count: int) -> Topic:
         part, rate_hz = self._content.chosen.parts.get(channel, ""), self._content.rates_hz.get(channel)
-        known = next((c for c in self._candidates if c.channel == channel), None)
-        if known is None:
-            return Topic(channel.topic, channel.type, channel.encoding, count, "", bool(part), part, rate_hz=rate_hz)
+        known = self._candidate(channel) or Candidate(channel, count, "")
         calibrated = known.calibrated if known.role == "camera_info" else None
         return Topic(
-            channel.topic, channel.type, channel.encoding, count, known.role, bool(part), part, known.encoding,
-            *known.size, known.frame, calibrated, rate_hz,
-        )  # fmt: skip
+            *channel, count, known.role, bool(part), part, known.encoding, *known.size, known.frame, calibrated, rate_hz
+        )
 
-    def camera(self) -> Camera:
-        """Raises LogError where the log has no images."""
-        return self._camera
+    def _candidate(self, channel: Channel | None) -> Candidate | None:
+        return next((candidate for candidate in self._candidates if candidate.channel == channel), None)
 
     def stamps(self) -> Ints:
         self._image_channel()
@@ -105,9 +89,13 @@ class RecordedLog:
 
     def frames(self, stamp_ns: Ints) -> Iterator[RecordedFrame]:
         """Raises LogError where a stamp is not one of `stamps()`."""
-        camera = self.camera()
-        for row in rows_of(self._content.stamp_ns, stamp_ns, self._name):
-            yield self._frame(row, camera)
+        content, pictures, pair, camera = self._content, self._pictures, self._pair, self.camera()
+        for row in rows_of(content.stamp_ns, stamp_ns, self.name):
+            right = None if pair is None else pictures.beside(self._selection.right, content.right_places, row)
+            depth = pictures.beside(self._depth, content.depth_places, row)
+            at_ns, image = int(content.stamp_ns[row]), pictures.image(row)
+            own = self._calibration_at(at_ns)
+            yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own)
 
     def odometry(self) -> Odometry | None:
         return self._sidecar.odometry or self._content.odometry
@@ -135,14 +123,6 @@ class RecordedLog:
             raise LogError(f"No image of {self._selection.image.topic} can be read. Choose another with --image-topic.")
         return self._selection.image
 
-    def _frame(self, row: int, camera: Camera) -> RecordedFrame:
-        content, pictures, pair = self._content, self._pictures, self._pair
-        right = None if pair is None else pictures.beside(self._selection.right, content.right_places, row)
-        depth = pictures.beside(self._depth, content.depth_places, row)
-        stamp_ns, image = int(content.stamp_ns[row]), pictures.image(row)
-        own = self._calibration_at(stamp_ns)
-        return RecordedFrame(stamp_ns, camera, image, depth, right, pair, self._notes, own)
-
     def _calibration_at(self, stamp_ns: int) -> CalibrationMessage | None:
         """The calibration in force at a stamp, where it is another than the camera's."""
         found = self._later_calibrations
@@ -156,41 +136,35 @@ class RecordedLog:
             return []
         return sorted(self._content.calibrations[1:], key=lambda calibration: calibration.stamp_ns)
 
-    def _codec(self, channel: Channel | None) -> str:
-        return next((candidate.codec for candidate in self._candidates if candidate.channel == channel), "")
-
     @cached_property
     def _depth(self) -> Channel | None:
         """The depth topic, or None, with a note, where its first images do not decode or do not fit the camera's."""
-        depth = self._selection.depth
-        if depth is None:
-            return None
+        depth, camera = self._selection.depth, self.camera()
         try:
-            first = self._pictures.first_depth(depth)
+            first = None if depth is None else self._pictures.first_depth(depth)
         except LogError as error:
             self._notes.add(f"Depth is not used: {error}")
             return None
-        if first is None:
+        if first is None or depth is None:
             return None
-        if first.shape != (self._camera.height, self._camera.width):
-            size = f"{self._camera.width} x {self._camera.height}"
+        if first.shape != (camera.height, camera.width):
+            size = f"{camera.width} x {camera.height}"
             self._notes.add(f"Depth is not used: {depth.topic} has {size_of(first)} px, the images {size}.")
             return None
         return depth
 
     @cached_property
     def _pictures(self) -> Pictures:
-        image = self._selection.image
-        codec = self._codec(image)
-        content = read_content(self._container, self._selection, self._notes)
-        return Pictures(self._container, image, codec, content, self._notes)
+        image, content = self._selection.image, read_content(self._container, self._selection, self._notes)
+        known = self._candidate(image)
+        return Pictures(self._container, image, known.codec if known else "", content, self._notes)
 
     @property
     def _content(self) -> Content:
         return self._pictures.content
 
-    @cached_property
-    def _camera(self) -> Camera:
+    def camera(self) -> Camera:
+        """Raises LogError where the log has no images."""
         return self._left[0] if self._pair is None else self._pair.camera
 
     @cached_property
@@ -200,7 +174,7 @@ class RecordedLog:
         content, notes = self._content, self._notes
         frame, size = self._pictures.first(image, [*content.places], self._path.name)
         known = self._sidecar.camera(image.topic)
-        calibration = known.calibration if known else next(iter(content.calibrations), None)
+        calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
         named = content.body and frame and content.tree.between(content.body, frame) is not None
         if known is not None and known.body_from_camera is not None and not named:
@@ -220,12 +194,12 @@ class RecordedLog:
         if left.matrix is None:  # warned of as such: it costs more than the depth
             return None
         try:
-            if self._codec(right):
+            if (beside := self._candidate(right)) and beside.codec:
                 raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
             known = [self._sidecar.camera(channel.topic) for channel in (image, right)]
             calibrations = [camera.calibration if camera else None for camera in known]
             if known[0] is None:
-                calibrations = [next(iter(content.calibrations), None), content.right_calibration]
+                calibrations = [content.calibration, content.right_calibration]
             if calibrations[0] is None or calibrations[1] is None:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._pictures.first(right, content.right_places, self._path.name)

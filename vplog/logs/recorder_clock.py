@@ -1,10 +1,8 @@
 """The recorder's clock set back on the way: found by the order of the file and undone in all topics.
 
-A recorder writes messages as it receives them, so its log times go back in the file only where its clock was set, or
-where parts of a recording were joined in another order or twice. A clock that was set back passes a time twice: the
-messages behind it fall between those before it. Parts in another order do not overlap, and a part that was written
-twice holds the same messages. Where a clock was set back into a gap nothing overlaps; there the motion decides, which
-leads on from one message to the next where they were received one behind the other.
+A clock that was set back passes a time twice: the messages behind it fall between those before it. Parts of a recording
+in another order do not overlap, and a part that was written twice holds the same messages. Where a clock was set back
+into a gap the motion decides, which leads on from one message to the next in the order in which they were received.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 _BASELINES_M = (1e-3, 20.0)
 """m; endoscopes have 4 mm, stereo across a lorry's cab 2 m: anything outside is another unit, or another thing."""
 _APART_RAD = np.radians(20.0)
-"""Most that the two cameras may be turned against each other: stereo heads are parallel to a few degrees, while the
-left and right cameras of a surround view look 55 degrees apart and more."""
+"""Most that the two cameras may be turned: stereo heads are parallel to a few degrees, surround views 55 apart and
+more."""
 _REMAP_PX = 2**15
 """Sides from which cv2.remap takes no image."""
 _CHECKED_FEATURES = 1000
@@ -74,10 +74,8 @@ class Pair:
 
 
 def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
-    """The pair by P and R of the two calibrations, else by the static transforms between the cameras (4, 4).
-
-    Raises NoPairError with a reason that completes "The right image is not used: ...".
-    """
+    """The pair by P and R of the two calibrations, else by the static transforms between the cameras (4, 4). Raises
+    NoPairError with a reason that completes "The right image is not used: ..."."""
     if right.camera.matrix is None:
         raise NoPairError(f"{right.camera.name} is not calibrated")
     sizes = [(side.camera.width, side.camera.height) for side in (left, right)]
@@ -123,10 +121,7 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
 
 
 def row_error_px(rectified: Iterable[tuple[Bytes, Bytes]]) -> float | None:
-    """Median distance of the rows of matching features in left and right images; None where too few match to tell.
-
-    A calibration may be of another size, of other lenses, or of images that were rectified before: the pictures tell.
-    """
+    """Median distance of the rows of matching features in left and right images, px; None where too few match."""
     orb, matcher = cv2.ORB.create(nfeatures=_CHECKED_FEATURES), cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     apart: list[float] = []
     for left, right in rectified:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,29 +43,22 @@ _NAMED = 4
 """Jumps of a clock that are named."""
 
 
-def _numbers() -> array[int]:
-    return array("q")
-
-
 @dataclass
 class Stamps:
     """Header stamps of one topic in file order, with the log times they fall back to."""
 
-    header_ns: array[int] = field(default_factory=_numbers)
-    log_ns: array[int] = field(default_factory=_numbers)
-
+    header_ns: array[int] = field(default_factory=partial(array, "q"))
+    log_ns: array[int] = field(default_factory=partial(array, "q"))
     places: Floats | None = None
     """(M, 3) positions that the messages say, where they do: they tell a message from one that was written twice."""
     common: Clock | None = None
     """The clock that all topics of the log are to be on, where that is known."""
-    _positions: array[int] = field(default_factory=_numbers)
+    _positions: array[int] = field(default_factory=partial(array, "q"))
     _found: tuple[int, Repaired | None] | None = None
     """The one clock of so many messages."""
 
     def add(self, header_ns: int, log_ns: int, position: int | None = None) -> None:
-        self._positions.append(len(self.log_ns) if position is None else position)
-        self.header_ns.append(header_ns)
-        self.log_ns.append(min(log_ns, _LAST_NS))
+        self.extend([header_ns], [log_ns], None if position is None else [position])
 
     def extend(self, header_ns: list[int], log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add messages by their stamps, log times and positions in the file; None is one behind the other."""
@@ -76,11 +70,6 @@ class Stamps:
         """Log time less header stamp, the median; None where the header stamps follow no clock."""
         found = self._on_one_clock()
         return found.skew_ns if found is not None and found.valid.any() else None
-
-    def rate_hz(self) -> float | None:
-        """Messages a second between the first and the last; None where there is no such time."""
-        ordered_ns, _ = self.order("", Notes())
-        return rate_hz(ordered_ns)
 
     def positions(self) -> Ints:
         """(M,) where the messages lie among all of the file, in its order."""
@@ -97,12 +86,10 @@ class Stamps:
         return {} if found is None else found.counts
 
     def _on_one_clock(self) -> Repaired | None:
-        """Found once: three parts of a log's account ask for it."""
         if self._found is None or self._found[0] != len(self.log_ns):
             header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
-            log_ns, header_ns = log_ns[header_ns != 0], header_ns[header_ns != 0]
-            found = on_one_clock(header_ns, log_ns) if len(header_ns) else None
-            self._found = len(self.log_ns), found
+            stamped = header_ns != 0
+            self._found = len(self.log_ns), on_one_clock(header_ns[stamped], log_ns[stamped]) if stamped.any() else None
         return self._found[1]
 
     def order(self, topic: str, notes: Notes) -> tuple[Ints, Ints]:
@@ -189,10 +176,8 @@ def share_clock(topics: Iterable[Stamps]) -> None:
 
 
 def _on_common(stamp_ns: Ints, skew_ns: int, common: Clock | None, topic: str, notes: Notes) -> Ints:
-    """Stamps of another clock than the common one moved to it by the log times, where they cover no time of it.
-
-    Where they do, they may be right and only recorded late: that is for the reader to decide.
-    """
+    """Stamps of another clock than the common one moved to it by the log times, where they cover no time of it; where
+    they do, they may be right and only recorded late."""
     if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= LATE_NS:
         return stamp_ns
     shift = skew_ns - common.skew_ns
@@ -267,10 +252,8 @@ def rows_of(known_ns: Ints, wanted_ns: Ints, log: str) -> list[int]:
 
 
 def nearest(stamp_ns: Ints, other_ns: Ints) -> Ints:
-    """For each stamp the row of the nearest other stamp, -1 where it is further than half the median period.
-
-    Both increase. A single stamp has no period of its own; half the others' period is its limit.
-    """
+    """For each stamp the row of the nearest other stamp, -1 where it is further than half the median period, that of
+    the others for a single stamp. Both increase."""
     if not len(other_ns):
         return np.full(len(stamp_ns), -1)
     right = np.searchsorted(other_ns, stamp_ns).clip(0, len(other_ns) - 1)

@@ -1,11 +1,9 @@
-"""Frames that move: the transforms of tf topics become an odometry, by the chain from its root to the body.
-
-Those of a tf topic that never change are static transforms: logs older than tf_static have no others.
-"""
+"""Frames of tf: the tree of static ones, and the odometry by the chain of moving ones from the root to the body."""
 
 from __future__ import annotations
 
 from array import array
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -13,21 +11,81 @@ import numpy as np
 
 from vplog.data import Odometry
 from vplog.geometry import se3
-from vplog.logs.stamps import Stamps
-from vplog.logs.static_transforms import are_usable, clean
+from vplog.logs.stamps import NONE, Stamps
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from vplog.data import Floats, Ints
     from vplog.logs.formats.container import Notes
     from vplog.logs.messages.records import PoseMessage
-    from vplog.logs.static_transforms import FrameTree
 
 _BODIES = ("base_link", "base_footprint")
 """Names of the body, ROS REP 105 and 120, in order of preference."""
 _ROOTS = ("odom", "map", "world")
 """Names of frames that stand still (ROS REP 105): odom first, whose poses do not jump."""
+_FARTHEST_M = 1e9
+"""m; positions in map coordinates reach 1e7, so a coordinate beyond this is damage."""
+_SMALLEST = 1e-6
+"""Largest component of a quaternion below which none was set; real ones have length 1, to a few digits."""
 Edge = tuple[str, str]
 """Parent and child."""
+
+
+class FrameTree:
+    """Static transforms between named frames; a later transform of the same pair replaces an earlier one."""
+
+    def __init__(self, transforms: Iterable[PoseMessage]) -> None:
+        self._from: defaultdict[str, dict[str, Floats]] = defaultdict(dict)
+        self.edges: list[tuple[str, str]] = []
+        """Parent and child of each transform."""
+        self.dropped = 0
+        """Transforms that were NaN, infinite or without rotation."""
+        for transform in transforms:
+            parent, child = clean(transform.frame), clean(transform.child)
+            parent_from_child = usable_pose(transform.position, transform.quaternion)
+            if parent_from_child is None or parent == child:
+                self.dropped += 1
+                continue
+            self.edges.append((parent, child))
+            self._from[parent][child], self._from[child][parent] = parent_from_child, se3.inverse(parent_from_child)
+
+    def __contains__(self, frame: str) -> bool:
+        return clean(frame) in self._from
+
+    def __len__(self) -> int:
+        return len(self._from)
+
+    def between(self, a: str, b: str) -> Floats | None:
+        """a_from_b (4, 4) by the shortest chain, up and down the tree; None where there is none."""
+        start, goal = clean(a), clean(b)
+        reached = {start: np.eye(4)}
+        queue = deque([start])
+        while queue and goal not in reached:
+            here = queue.popleft()
+            for frame, here_from_frame in sorted(self._from.get(here, {}).items()):
+                if frame not in reached:
+                    reached[frame] = reached[here] @ here_from_frame
+                    queue.append(frame)
+        return reached.get(goal)
+
+
+def clean(frame: str) -> str:
+    """tf1 wrote frames with a leading slash, tf2 without."""
+    return frame.lstrip("/")
+
+
+def usable_pose(position: Sequence[float], quaternion: Sequence[float]) -> Floats | None:
+    """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond _FARTHEST_M) or no rotation is set."""
+    pose = np.array([*position, *quaternion], np.float64)
+    return se3.pose(se3.rotation(pose[3:]), pose[:3]) if are_usable(pose[None]).all() else None
+
+
+def are_usable(poses: Floats) -> np.ndarray:
+    """(K,) bool: whether `usable_pose` of x y z, x y z w in each row of (K, 7) is one."""
+    sizes = np.abs(poses)
+    placed, largest = (sizes[:, :3] < _FARTHEST_M).all(1), sizes[:, 3:].max(1)  # NaN where one is
+    return placed & (largest > _SMALLEST) & (largest < 1 / _SMALLEST)
 
 
 @dataclass
@@ -86,10 +144,8 @@ class MovingFrames:
         return [link.stamps for link in self._links.values() if len(link.stamps.log_ns)]
 
     def odometry(self, tree: FrameTree, topic: str, notes: Notes) -> tuple[Odometry | None, list[str]]:
-        """The poses of the body in the frame that stands still, and the frames from there down to the body.
-
-        None and no frames where no chain moves.
-        """
+        """The poses of the body in the frame that stands still, and the frames from there to the body; None and none
+        where no chain moves."""
         chain = self._chain(tree, topic, notes)
         moving = [edge for edge in chain if edge in self._links and self._links[edge].moves]
         if not moving:
@@ -98,11 +154,10 @@ class MovingFrames:
         names = " -> ".join(frames)
         tracks = {edge: self._track(edge, topic, notes) for edge in moving}
         pace = max(moving, key=lambda edge: len(tracks[edge][0]))
-        first_ns = max((stamps[0] for stamps, _ in tracks.values() if len(stamps)), default=0)
-        last_ns = min((stamps[-1] for stamps, _ in tracks.values() if len(stamps)), default=0)
         at_ns = tracks[pace][0]
-        at_ns = at_ns[(at_ns >= first_ns) & (at_ns <= last_ns)]
-        if not len(at_ns) or not all(len(stamps) for stamps, _ in tracks.values()):
+        for stamps, _ in tracks.values():
+            at_ns = at_ns[(at_ns >= stamps[0]) & (at_ns <= stamps[-1])] if len(stamps) else NONE
+        if not len(at_ns):
             notes.add(f"{topic}: the transforms {names} have no time in common; there is no odometry.")
             return None, []
         poses = np.tile(np.eye(4), (len(at_ns), 1, 1))
@@ -160,10 +215,9 @@ def _upwards(frame: str, parents: dict[str, str]) -> list[Edge]:
     """Edges from a frame to the top of its tree; in a circle, up to the frame that comes twice."""
     result: list[Edge] = []
     passed = {frame}
-    while frame in parents and parents[frame] not in passed:
-        result.append((parents[frame], frame))
-        frame = parents[frame]
-        passed.add(frame)
+    while (parent := parents.get(frame, frame)) not in passed:
+        result.append((parent, frame))
+        passed.add(frame := parent)
     return result
 
 

@@ -111,13 +111,9 @@ class Selection:
 
 
 _NAMES = {
-    "image": "Image",
-    "depth": "Depth",
-    "right": "Image",
-    "camera_info": "Calibration",
-    "odometry": "Odometry",
+    "image": "Image", "depth": "Depth", "right": "Image", "camera_info": "Calibration", "odometry": "Odometry",
     "gps": "GPS",
-}
+}  # fmt: skip
 _ROLES = {"right": "image"}
 """What a topic of a part is taken for before parts are given out, where it is called otherwise."""
 _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"))
@@ -143,23 +139,20 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
             raise LogError(_refusal(named, wanted, role, [c.channel.topic for c in found], log))
         return fitting[0]
 
-    def by_size(c: Candidate) -> tuple:
-        return -c.count, c.channel
-
     def calibrations(image: Candidate) -> list[Candidate]:
         return _calibrations(image, [c for c in candidates if c.role == "camera_info" and c.count])
 
     def as_image(c: Candidate) -> tuple:
         uncalibrated = not any(info.calibrated for info in calibrations(c)[:1])
         sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
-        return not c.supported, sixteen_bits, uncalibrated, _partner(c, candidates, back=True) is not None, *by_size(c)
+        return not c.supported, sixteen_bits, uncalibrated, _partner(c, candidates, back=True) is not None, *_by_size(c)
 
     image = pick("image", as_image, "depth")
     depth = calibration = right = right_info = None
     if image is not None:
         if choice.depth is not None or not choice.right:
-            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *by_size(c)), "image", image)
-        right = pick("right", by_size) if choice.right is not None else _partner(image, candidates)
+            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *_by_size(c)), "image", image)
+        right = pick("right", _by_size) if choice.right is not None else _partner(image, candidates)
         if right is not None and depth is not None:
             if choice.right and choice.depth:
                 raise LogError(
@@ -174,17 +167,17 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
                 raise LogError(_two("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic"))
             calibration = right_info = None
         elif choice.camera_info is not None:
-            calibration = pick("camera_info", by_size)
+            calibration = pick("camera_info", _by_size)
     if choice.odometry_file is not None:
         if choice.odometry:
             raise LogError(_two("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
         choice = choice.model_copy(update={"odometry": ""})
-    requested = pick("odometry", by_size, "tf") if choice.odometry is not None else None
-    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=by_size)
+    requested = pick("odometry", _by_size, "tf") if choice.odometry is not None else None
+    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size)
     sources = [requested] if requested else []
     if choice.odometry is None:
-        sources = [*sorted((c for c in candidates if c.role == "odometry" and c.count), key=by_size), *moving[:1]]
-    gps = pick("gps", by_size)
+        sources = [*sorted((c for c in candidates if c.role == "odometry" and c.count), key=_by_size), *moving[:1]]
+    gps = pick("gps", _by_size)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     parts = {
         "image": image, "depth": depth, "camera_info": calibration, "odometry": requested, "gps": gps,
@@ -193,6 +186,10 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     found = {name: part.channel for name, part in parts.items() if part is not None}
     tf = tuple(c.channel for c in moving) if not static or any(c.role == "tf" for c in sources) else ()
     return Selection(**found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf)
+
+
+def _by_size(c: Candidate) -> tuple:
+    return -c.count, c.channel
 
 
 def _partner(image: Candidate, candidates: list[Candidate], back: bool = False) -> Candidate | None:
@@ -209,13 +206,9 @@ def _partner(image: Candidate, candidates: list[Candidate], back: bool = False) 
 def _calibrations(image: Candidate, infos: list[Candidate]) -> list[Candidate]:
     """The calibrations that belong to an image, the most likely first."""
     same_frame = [c for c in infos if c.frame and c.frame == image.frame]
-    unplaced = [
-        c for c in infos if not c.frame and "/" not in c.channel.topic.strip("/")
-    ]  # `/camera_info`, no frame_id
-    best = [c for c in infos if _above(c, image)] or same_frame or unplaced
-    return sorted(
-        best, key=lambda c: (-_shared(c, image), c.frame != image.frame, not c.calibrated, -c.count, c.channel)
-    )
+    alone = [c for c in infos if not c.frame and "/" not in c.channel.topic.strip("/")]  # `/camera_info`, no frame_id
+    best = [c for c in infos if _above(c, image)] or same_frame or alone
+    return sorted(best, key=lambda c: (-_shared(c, image), c.frame != image.frame, not c.calibrated, *_by_size(c)))
 
 
 def _above(info: Candidate, image: Candidate) -> bool:

@@ -14,9 +14,9 @@ from vplog.data import Gps, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.logs.formats.container import Notes, plural
-from vplog.logs.messages.odometry import Poses
+from vplog.logs.messages.decode import Poses
 from vplog.logs.stamps import Stamps
-from vplog.logs.static_transforms import are_usable, clean
+from vplog.logs.tf_odometry import are_usable, clean
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -24,13 +24,10 @@ if TYPE_CHECKING:
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
-
 _BLOCK = 2048
 """Poses that are converted at once: 0.6 MB of covariances."""
 _LARGEST = 1e15
 """m^2 or rad^2; drivers write up to 1e12 for "any", so an element beyond this is damage."""
-
-
 _NULL_ISLAND_DEG = 1e-6
 """Degrees, 0.1 m: nobody drives that near to (0, 0), which lies in the Atlantic."""
 _HIGHEST_M = 1e5
@@ -77,15 +74,12 @@ class PoseTrack:
             return
         usable = are_usable(poses.poses)
         self._dropped += int((~usable).sum())
-        every = usable.tolist()
-        at = None if positions is None else list(compress(positions, every))
-        self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, every)), at)
+        at = None if positions is None else list(compress(positions, usable))
+        self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable)), at)
         self._poses.frombytes(poses.poses[usable].tobytes())
-        if poses.covariances is None:
-            self._covariances.frombytes(np.full((int(usable.sum()), 36), np.nan).tobytes())
-        else:
-            self._covariances.frombytes(poses.covariances[usable].tobytes())
-            self._bare = self._bare and not usable.any()
+        known = poses.covariances
+        self._bare &= known is None or not usable.any()
+        self._covariances.frombytes((np.full((len(usable), 36), np.nan) if known is None else known)[usable].tobytes())
 
     def finish(self, notes: Notes) -> Odometry | None:
         """The odometry, or None where no pose is usable."""
@@ -104,15 +98,14 @@ class PoseTrack:
             poses[part] = se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
             covariance[part] = body_covariance(poses[part], logged[1][rows[part]])
         usable = np.isfinite(covariance).all((1, 2))
-        if usable.all():
-            return Odometry(stamp_ns, poses, covariance)
-        if usable.any():
+        if not usable.any():
+            why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
+            notes.add(f"{self.topic} {why}; its noise is that of the drift model.")
+            return Odometry(stamp_ns, poses, None)
+        if not usable.all():
             bad = plural(int((~usable).sum()), "covariance")
             notes.add(f"{self.topic}: {bad} with zero, negative or not finite values taken as unknown.")
-            return Odometry(stamp_ns, poses, covariance)
-        why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
-        notes.add(f"{self.topic} {why}; its noise is that of the drift model.")
-        return Odometry(stamp_ns, poses, None)
+        return Odometry(stamp_ns, poses, covariance)
 
     def give_places(self) -> None:
         """Give the stamps the position of each pose."""
@@ -179,11 +172,8 @@ class FixTrack:
             covariance[~known] = _without_altitude(covariance[~known])
         gps = Gps(stamp_ns, latitude, longitude, altitude, covariance)
         near = _reachable(gps)
-        if bool(near.all()):
-            return gps
-        notes.add(
-            f"{self.topic}: {int((~near).sum())} of {len(near)} fixes left out: nothing moves that far in the time."
-        )
+        if far := int((~near).sum()):
+            notes.add(f"{self.topic}: {far} of {len(near)} fixes left out: nothing moves that far in the time.")
         return Gps(stamp_ns[near], latitude[near], longitude[near], altitude[near], covariance[near])
 
 

@@ -1,8 +1,7 @@
 """Maps, run folders and libraries may come from anyone: they hold regular files, and nothing that leads elsewhere.
 
-A link inside a stranger's folder would make vplog copy, send or overwrite a file of its user; a pipe or a device would
-be waited for. Every verb that is given such a folder checks it here first. The folder itself may be a link: that is
-its user's own.
+A link inside would make vplog copy, send or overwrite a file of its user; a pipe or a device would be waited for. The
+folder itself may be a link of its user's own.
 """
 
 from __future__ import annotations
@@ -24,11 +23,7 @@ _KINDS = {
 
 def regular_files(folder: Path) -> Iterator[str]:
     """Names of the files in a folder and below it, hidden ones too, in order, relative to it; none where there is no
-    such folder.
-
-    Links are not followed. What goes away meanwhile, as while a map is written, is left out. Raises ResultError at the
-    first link, pipe, socket or device.
-    """
+    such folder. Links are not followed. Raises ResultError at the first link, pipe, socket or device."""
     try:
         with os.scandir(folder) as found:
             entries = sorted(found, key=lambda entry: entry.name)

@@ -1,8 +1,7 @@
 """gs:// through pyarrow: where the server is, who asks, and a bound on every wait.
 
-pyarrow's client of Google Cloud Storage goes on for 15 minutes with what cannot succeed, looks for credentials by the
-same rule, and says what is wrong in some thousand characters. So it is given less time, the server is greeted first,
-and what has no credentials asks without any, as public data allow.
+pyarrow's client goes on for 15 minutes with what cannot succeed, and looks for credentials as long. So it is given less
+time, the server is greeted first, and what has no credentials asks without any, as public data allow.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ _METADATA_S = 2.0
 """It is on the machine itself: google-auth waits 3 s."""
 _RETRY_S = 20
 """What fails for so long is given up; a request that says nothing is given up by the client after 120 s."""
-_SAID = re.compile(
+_REASON = re.compile(
     r"(?:.*underlying error message was: |.*?last message of )(.*?)(?: error_info=|,? gcloud-cpp|}}|$)", re.S
 )
 """The part of a google::cloud::Status that says what is wrong: the innermost message."""
 
 
 def google_place() -> str:
-    """Where the server is, as Google's own tools are told it."""
+    """Where the server is, by the variable of Google's own tools."""
     given = os.environ.get("STORAGE_EMULATOR_HOST") or _PUBLIC
     return given if "://" in given else f"http://{given}"
 
@@ -117,11 +116,11 @@ def plain(text: str) -> str:
     """One line of a google::cloud::Status, and what to do where it is about who asks."""
     if "google::cloud::Status" not in text:
         return text
-    found = _SAID.search(text)
-    said = " ".join((found[1] if found else text).split())[:200].rstrip(". ")
+    found = _REASON.search(text)
+    why = " ".join((found[1] if found else text).split())[:200].rstrip(". ")
     if "access token" in text or re.search(r"UNAUTHENTICATED|PERMISSION_DENIED", text):
         return (
-            f"Google Cloud answers: {said}. Log in with `gcloud auth application-default login`, or set "
+            f"Google Cloud answers: {why}. Log in with `gcloud auth application-default login`, or set "
             "GOOGLE_APPLICATION_CREDENTIALS to the key of an account that may"
         )
-    return said
+    return why

@@ -24,19 +24,17 @@ _CONTENT_RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
 
 
 def head(url: str) -> dict[str, str]:
-    """What is said of a file, empty where there is none. Raises OSError.
-
-    Links that are signed for reading alone allow no HEAD: then one byte is asked for.
-    """
+    """The headers of a file, empty where there is none. Links that are signed for reading alone allow no HEAD: then one
+    byte is requested. Raises OSError."""
     try:
-        with _asked("HEAD", url) as answer:
+        with _requested("HEAD", url) as answer:
             return dict(answer.headers)
     except _StatusError as refused:
         if refused.code in (404, 410):
             return {}
         if refused.code not in (403, 405, 501):
             raise
-    with _asked("GET", url, {"Range": "bytes=0-0"}) as answer:
+    with _requested("GET", url, {"Range": "bytes=0-0"}) as answer:
         found = _CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
         return {**dict(answer.headers), "Content-Length": found[3] if found else ""}
 
@@ -44,7 +42,7 @@ def head(url: str) -> dict[str, str]:
 def get_range(url: str, start: int, count: int, length: int) -> bytes:
     """Bytes of a file of this length, from `start`: `count` of them, or fewer, but not none. Raises OSError."""
     data, began = bytearray(), time.monotonic()
-    with _asked("GET", url, {"Range": f"bytes={start}-{start + count - 1}"}) as answer:
+    with _requested("GET", url, {"Range": f"bytes={start}-{start + count - 1}"}) as answer:
         if answer.status != 206 and not (start == 0 and count == length):
             raise OSError("the server does not answer range requests; download the file first")
         found = _CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
@@ -68,7 +66,7 @@ class _StatusError(OSError):
 
 
 @contextmanager
-def _asked(method: str, url: str, headers: dict[str, str] | None = None) -> Iterator[Any]:
+def _requested(method: str, url: str, headers: dict[str, str] | None = None) -> Iterator[Any]:
     """The answer to a request. Raises OSError of one line without control characters, which a server may send."""
     request = urllib.request.Request(url, method=method, headers=headers or {})  # noqa: S310 (the opener knows http only)
     try:

@@ -92,18 +92,18 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
     """Width and height that an image file claims in its header; None where it is of another kind or damaged."""
     if data[:2] == JPEG:
         return _jpeg_size(data)
-    size, data = None, bytes(data)
+    data = bytes(data)
     if data.startswith(PNG):
-        size = _png_size(data)
-    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
-        size = _webp_size(data)
-    elif data[:2] == b"BM" and len(data) >= 26:
-        size = tuple(abs(side) for side in struct.unpack_from("<ii", data, 18))  # rows from the top count negative
-    elif data[:4] in _TIFF_ORDERS:
-        size = _tiff_size(data)
-    elif match := re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD]):
-        size = int(match[1]), int(match[2])
-    return None if size is None else (size[0], size[1])
+        return _png_size(data)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
+        return _webp_size(data)
+    if data[:2] == b"BM" and len(data) >= 26:
+        width, height = struct.unpack_from("<ii", data, 18)
+        return abs(width), abs(height)  # rows from the top count negative
+    if data[:4] in _TIFF_ORDERS:
+        return _tiff_size(data)
+    found = re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD])
+    return (int(found[1]), int(found[2])) if found else None
 
 
 def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
@@ -149,11 +149,8 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _checked_png(data: bytes) -> bytes:
-    """The PNG with its pixels unpacked, in one IDAT of stored blocks, and with nothing beside them but its palette.
-    Raises BadImageError where libpng would find fault with either.
-
-    Pixels are grey by their values alone, as those of raw images are: not by the gamma and primaries of a file.
-    """
+    """The PNG with its pixels unpacked, in one IDAT of stored blocks, and with nothing beside them but its palette: not
+    the gamma and primaries. Raises BadImageError where libpng would find fault with it."""
     view = memoryview(data)
     found: dict[bytes, list[memoryview]] = {b"IHDR": [], b"PLTE": [], b"IDAT": []}
     for kind, start, stop in _png_chunks(data):

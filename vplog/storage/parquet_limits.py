@@ -1,12 +1,10 @@
 """Parquet files: their checksums, the version of their columns, and what they may take in memory.
 
-Every page has a CRC-32 as the format has it, which any reader may check. Headers of pages and the footer have none, so
-a seal of 16 bytes stands in the gap before the footer, where other readers do not look: CRC-32 of all before it, and of
-all behind it. A file without a seal was written by another program and is read by its page checksums alone.
+Every page has a CRC-32. Headers of pages and the footer have none, so a seal of 16 bytes stands in the gap before the
+footer, where other readers do not look: CRC-32 of all before it, and of all behind it.
 
-Equal values are one number and a count in Parquet, so 200 kB may say four million rows. Files may come from anyone, so
-what their rows come to is reckoned from the footer before any is read. Texts are read as numbers of a dictionary, whose
-entries are in the file, and checked before each row gets its own.
+Equal values are one number and a count in Parquet, so 200 kB may say four million rows: what the rows come to is
+reckoned from the footer before any is read. Texts are read as numbers of a dictionary, whose entries are in the file.
 """
 
 from __future__ import annotations
@@ -35,11 +33,9 @@ MOST_TIMES = 200
 1.4; a ledger of which every candidate failed alike to 64."""
 _NARROW = {"INT_8": 1, "UINT_8": 1, "INT_16": 2, "UINT_16": 2}
 _LEAF_BYTES = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
-
-
 TABLE_VERSION = 1
-"""Version of the columns of all tables. A new nullable column does not raise it: older programs pass it over, and newer
-ones read null where it is missing. Any other change of a column does, and is refused by older programs."""
+"""Version of the columns of all tables. A new nullable column does not raise it; any other change of a column does, and
+is refused by older programs."""
 VERSION_KEY = "vplog.table_version"
 """In the header of a file; a file without it is of version 1."""
 VERSION_ABOUT = (
@@ -56,7 +52,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 class _Sealed(io.RawIOBase):
-    """A stream that sums up what is written to it, and keeps back the footer."""
+    """A stream that sums up what is written to it, and holds back the footer."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self._crc, self.footer = stream, 0, bytearray()
@@ -151,8 +147,9 @@ def _summed(stream: BinaryIO, count: int) -> int:
 
 def _check_version(path: Path, schema: pa.Schema) -> None:
     header = schema.metadata or {}
-    said, maker = (header.get(key, b"").decode(errors="replace") for key in (VERSION_KEY.encode(), b"vplog.version"))
-    check_version(path, int(said or 1) if said.isdecimal() or not said else said, TABLE_VERSION, maker)
+    version, maker = (header.get(key, b"").decode(errors="replace") for key in (VERSION_KEY.encode(), b"vplog.version"))
+    version = version or "1"
+    check_version(path, int(version) if version.isdecimal() else version, TABLE_VERSION, maker)
 
 
 def check_version(path: Path, version: object, newest: int, maker: object = None) -> None:
@@ -226,17 +223,14 @@ def read_table(path: Path, file: pq.ParquetFile, columns: Collection[str] | None
     texts = [name for name in names if _is_text(schema.field(name).type)]
     if not texts:
         return file.read(columns=names)
-    with pq.ParquetFile(
-        path, metadata=file.metadata, read_dictionary=texts, page_checksum_verification=True
-    ) as numbered:
+    options: dict[str, Any] = {"read_dictionary": texts, "page_checksum_verification": True}
+    with pq.ParquetFile(path, metadata=file.metadata, **options) as numbered:
         table = numbered.read(columns=names)
     for name in texts:
-        column = table[name]
+        column, text = table[name], schema.field(name)
         lengths = [pc.call_function("binary_length", [part.dictionary]).to_numpy() for part in column.chunks]
         _check(sum(len(part) * int(own.max(initial=0)) for part, own in zip(column.chunks, lengths, strict=True)), path)
-        table = table.set_column(
-            table.schema.get_field_index(name), schema.field(name), column.cast(schema.field(name).type)
-        )
+        table = table.set_column(table.schema.get_field_index(name), text, column.cast(text.type))
     return table
 
 

@@ -1,8 +1,7 @@
 """Files by URL: s3:// and gs:// through pyarrow, http(s):// by range requests; read in parts, written when finished.
 
-A RemotePath answers as much of pathlib's Path as logs are read with. What is asked for is read, in blocks; nothing is
-kept on disk. Credentials and endpoints come from where each service's own tools look for them (AWS_ACCESS_KEY_ID,
-AWS_ENDPOINT_URL, GOOGLE_APPLICATION_CREDENTIALS, STORAGE_EMULATOR_HOST, ...).
+Credentials and endpoints come from where each service's own tools look for them (AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL,
+GOOGLE_APPLICATION_CREDENTIALS, STORAGE_EMULATOR_HOST, ...).
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ import shutil
 import urllib.parse
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
 
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.storage.gcs import google_file_system, google_place, plain, plain_errors
@@ -25,7 +24,7 @@ from vplog.storage.scratch import scratch
 from vplog.storage.urls import shown, without_secrets
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from pyarrow.fs import FileInfo, FileSystem
 
@@ -38,18 +37,15 @@ _DENIED = re.compile(r"ACCESS_DENIED|AccessDenied|PERMISSION_DENIED|HTTP respons
 """What pyarrow's clients say of a request that this account may not make."""
 
 
-@dataclass(frozen=True)
-class Stat:
-    """What `Path.stat` is asked for."""
+class Stat(NamedTuple):
+    """The part of `Path.stat` that is used."""
 
     st_size: int
 
 
 def located(text: str | Path | RemotePath) -> Path:
-    """A local path, or where the text is a URL, a RemotePath, which answers like one.
-
-    Raises SettingsError for a scheme that is not known.
-    """
+    """A local path, or where the text is a URL, a RemotePath, which answers like one. Raises SettingsError for a scheme
+    that is not known."""
     if isinstance(text, RemotePath):
         return cast("Path", text)
     if "://" not in str(text):
@@ -80,45 +76,35 @@ def _checked(url: str, scheme: str) -> str:
     return url.replace("#", "%23") if store else url
 
 
+@dataclass(frozen=True, order=True, repr=False)
 class RemotePath:
     """One object, or what has this prefix, on a server. A URL has % for what it cannot spell; names here have not."""
 
-    def __init__(self, url: str) -> None:
-        self._url = url if "?" in url else url.rstrip("/")
+    url: str
+    """With its query, which may hold a token."""
 
-    @property
-    def url(self) -> str:
-        """With its query, which may hold a token."""
-        return self._url
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "url", self.url if "?" in self.url else self.url.rstrip("/"))
 
     def __str__(self) -> str:
         """As it is stored and shown: without its query."""
-        return shown(self._url)
+        return shown(self.url)
 
     def __repr__(self) -> str:
         return f"RemotePath({str(self)!r})"
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RemotePath) and self._url == other._url
-
-    def __hash__(self) -> int:
-        return hash(self._url)
-
-    def __lt__(self, other: RemotePath) -> bool:
-        return self._url < other._url
-
     def __truediv__(self, name: str) -> RemotePath:
-        place, mark, query = self._url.partition("?")
+        place, mark, query = self.url.partition("?")
         quoted = str(name).replace("%", "%25").replace("?", "%3F").replace("#", "%23")
         return RemotePath(f"{place}/{quoted}{mark}{query}")
 
     @property
     def scheme(self) -> str:
-        return self._url.split("://", 1)[0]
+        return self.url.split("://", 1)[0]
 
     @property
     def name(self) -> str:
-        return PurePosixPath(urllib.parse.unquote(urllib.parse.urlsplit(self._url).path)).name
+        return PurePosixPath(urllib.parse.unquote(urllib.parse.urlsplit(self.url).path)).name
 
     @property
     def stem(self) -> str:
@@ -154,10 +140,16 @@ class RemotePath:
         return f"length {self._length}, time {self._info.mtime_ns}"
 
     def open(self, mode: str = "rb") -> BinaryIO:
-        """A stream that reads what is asked for. Raises OSError."""
+        """A stream that reads by requests for blocks. Raises OSError."""
         if mode != "rb":
             raise ValueError(f"a remote file is opened with mode rb, not {mode}")
-        raw: Any = _HttpRanges(self._url, self._length) if self._is_http else _Ranges(*self.place, self._length)
+        if self._is_http:
+            raw: Any = _Ranges(self._length, partial(get_range, self.url, length=self._length))
+        else:
+            system, place = self.place
+            with plain_errors():
+                file = system.open_input_file(place)
+            raw = _Ranges(self._length, lambda start, count: file.read_at(count, start), file.close)
         return io.BufferedReader(raw, _BLOCK_BYTES)
 
     def read_bytes(self) -> bytes:
@@ -169,10 +161,19 @@ class RemotePath:
 
     def iterdir(self) -> Iterator[RemotePath]:
         """What is right below, in order of names. HTTP servers do not list: nothing."""
-        yield from self._below(recursive=False)
+        for name in () if self._is_http else sorted(names_below(self)):
+            yield self / name
 
     def rglob(self, _: str = "*") -> Iterator[RemotePath]:
-        yield from self._below(recursive=True)
+        if self._is_http:
+            return
+        from pyarrow.fs import FileSelector
+
+        system, place = self.place
+        with plain_errors():
+            below = system.get_file_info(FileSelector(place, recursive=True))
+        for found in sorted(below, key=lambda one: one.path):
+            yield self / found.path[len(place) + 1 :]
 
     @property
     def _is_http(self) -> bool:
@@ -181,7 +182,7 @@ class RemotePath:
     @cached_property
     def place(self) -> tuple[FileSystem, str]:
         """The file system of an object store, and the path in it."""
-        place = urllib.parse.unquote(self._url.split("://", 1)[1])
+        place = urllib.parse.unquote(self.url.split("://", 1)[1])
         if self.scheme == "gs":
             return google_system(google_place(), place.partition("/")[0]), place
         return file_system(*s3_place()), place
@@ -194,7 +195,7 @@ class RemotePath:
 
     @cached_property
     def _head(self) -> dict[str, str]:
-        return head(self._url)
+        return head(self.url)
 
     @cached_property
     def _kind(self) -> str:
@@ -213,28 +214,15 @@ class RemotePath:
             raise OSError("the server does not say how long the file is")
         return int(length)
 
-    def _below(self, recursive: bool) -> Iterator[RemotePath]:
-        if self._is_http:
-            return
-        if not recursive:
-            for name in sorted(names_below(self)):
-                yield self / name
-            return
-        from pyarrow.fs import FileSelector
-
-        system, place = self.place
-        with plain_errors():
-            below = system.get_file_info(FileSelector(place, recursive=True))
-        for found in sorted(below, key=lambda one: one.path):
-            yield self / found.path[len(place) + 1 :]
-
 
 class _Ranges(io.RawIOBase):
-    """Random access to an object; every read is a request for just these bytes."""
+    """Random access to a remote file; every read is a request for just these bytes."""
 
-    def __init__(self, system: FileSystem, place: str, length: int) -> None:
-        with plain_errors():
-            self._file, self._at, self._length = system.open_input_file(place), 0, length
+    def __init__(
+        self, length: int, fetch: Callable[[int, int], bytes], close: Callable[[], None] = lambda: None
+    ) -> None:
+        """`fetch` gives bytes by their start and count, `close` is called at the end."""
+        self._at, self._length, self._fetch, self._close = 0, length, fetch, close
 
     def readable(self) -> bool:
         return True
@@ -254,36 +242,21 @@ class _Ranges(io.RawIOBase):
         wanted = min(len(buffer), max(self._length - self._at, 0))
         if wanted == 0:
             return 0
-        data = self._fetch(self._at, wanted)
+        with plain_errors():
+            data = self._fetch(self._at, wanted)
         buffer[: len(data)] = data
         self._at += len(data)
         return len(data)
 
     def close(self) -> None:
-        if not self.closed and getattr(self, "_file", None) is not None:
-            self._file.close()
+        if not self.closed:
+            self._close()
         super().close()
-
-    def _fetch(self, start: int, count: int) -> bytes:
-        with plain_errors():
-            return self._file.read_at(count, start)
-
-
-class _HttpRanges(_Ranges):
-    """The same of a file on a web server (RFC 9110, section 14)."""
-
-    def __init__(self, url: str, length: int) -> None:
-        self._url, self._at, self._length, self._file = url, 0, length, None
-
-    def _fetch(self, start: int, count: int) -> bytes:
-        return get_range(self._url, start, count, self._length)
 
 
 def names_below(path: RemotePath) -> dict[str, bool]:
-    """What is right below a prefix of an object store, and whether that has objects below. Raises OSError.
-
-    On gs:// pyarrow tells of no folder that is not an object itself, so there it is asked for all that is below.
-    """
+    """What is right below a prefix of an object store, and whether that has objects below, by which gs:// alone tells
+    folders. Raises OSError."""
     from pyarrow.fs import FileSelector, FileType
 
     system, place = path.place
@@ -297,15 +270,13 @@ def names_below(path: RemotePath) -> dict[str, bool]:
 
 
 def s3_place() -> tuple[str | None, str | None]:
-    """Endpoint and region of S3, as its own tools are told them; None where they are not told."""
+    """Endpoint and region of S3, by the variables of its own tools; None where they are not set."""
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
     return endpoint, os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
 
 
-@lru_cache
-def google_system(endpoint: str, bucket: str) -> FileSystem:
-    """One for all objects of a bucket. Raises OSError."""
-    return google_file_system(endpoint, bucket)
+google_system = lru_cache(google_file_system)
+"""One for all objects of a bucket."""
 
 
 @lru_cache
@@ -313,10 +284,9 @@ def file_system(endpoint: str | None, region: str | None) -> FileSystem:
     """One for all objects of a server that speaks S3: it keeps its connections."""
     from pyarrow import fs
 
-    known = {"endpoint_override": endpoint, "region": region}
     return fs.S3FileSystem(  # delayed: a small file is one request, not the three of an upload in parts
         request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, allow_delayed_open=True,
-        **{name: value for name, value in known.items() if value},
+        endpoint_override=endpoint or None, region=region or None,
     )  # fmt: skip
 
 
@@ -335,7 +305,7 @@ def original(path: Path) -> Path:
 
 @contextmanager
 def stands_for(path: Path, place: Path | RemotePath) -> Iterator[Path]:
-    """For the time of the block, what is recorded of `path` is said of `place`, where its files come from or go to."""
+    """For the time of the block, records name `place` for `path`, where its files come from or go to."""
     _STANDS_FOR[path] = place
     try:
         yield path
@@ -362,9 +332,8 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
 
 
 def _download(path: RemotePath, target: Path) -> None:
-    files = [path] if path.is_file() else [file for file in path.rglob() if file.is_file()]
-    for file in files:
-        place = target if path.is_file() else target / file.relative_to(path)
+    files = {path: target} if path.is_file() else {f: target / f.relative_to(path) for f in path.rglob() if f.is_file()}
+    for file, place in files.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         with file.open() as source, place.open("wb") as sink:
             shutil.copyfileobj(source, sink, _BLOCK_BYTES)
@@ -372,12 +341,9 @@ def _download(path: RemotePath, target: Path) -> None:
 
 @contextmanager
 def local_output(path: Path | RemotePath) -> Iterator[Path]:
-    """Where to write what is to end at `path`: there, or for a remote one a local folder that is sent when all is done.
-
-    The run's own account, run.json, is sent last: who finds it finds everything. Nothing is sent of what failed.
-    Raises ResultError where the server does not take it, before any work where there is none, SettingsError for one
-    that takes nothing.
-    """
+    """Where to write what is to end at `path`: there, or for a remote one a local folder that is sent when all is done,
+    run.json last; nothing of what failed. Raises ResultError where the server does not take it, before any work where
+    there is none, SettingsError for one that takes nothing."""
     if not isinstance(path, RemotePath):
         yield path
         return
@@ -410,8 +376,7 @@ def check_writable(path: RemotePath) -> None:
 
 
 def _check_bucket(path: RemotePath) -> None:
-    """Before an hour of work: raises ResultError where there is no server, or no such bucket on it. Whether this
-    account may write to it, only writing tells."""
+    """Raises ResultError where there is no server, or no such bucket on it; what may be written only writing tells."""
     from pyarrow.fs import FileType
 
     try:
@@ -427,5 +392,6 @@ def _check_bucket(path: RemotePath) -> None:
 
 
 def reason(error: OSError) -> str:
-    said = without_secrets(plain(error.strerror or str(error)))
-    return (said.splitlines()[0] if said else type(error).__name__)[:300].rstrip(".")
+    """Why something failed, in one line."""
+    text = without_secrets(plain(error.strerror or str(error)))
+    return (text.splitlines()[0] if text else type(error).__name__)[:300].rstrip(".")

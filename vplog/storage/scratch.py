@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     Bytes = NDArray[np.uint8]
 
 _PIECE_BYTES = 2**24
-"""Of a file that travels. Ray's smallest store of objects has 75 MiB, and needs room for several; 16 MiB take about
-10 ms to copy, which is more than the about 1 ms that an object costs by itself."""
+"""Bytes of a file sent at once: Ray's smallest store has 75 MiB and needs room for several; 16 MiB take 10 ms to
+copy."""
 
 
 def own_folder() -> Path:
@@ -86,10 +86,8 @@ def made_folder(folder: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A binary stream that becomes `path` when the block ends well; what was there before stays until then.
 
-    The bytes go to a hidden file beside it (a rename is atomic only within one file system), are synced, then
-    renamed. A link stays one: what it points to is replaced. A device or a pipe is written into, as renaming would put
-    a file in its place. Raises ResultError where the folder cannot be written or the disk is full; nothing is left
-    behind.
+    The bytes go to a hidden file beside it, are synced, then renamed. A link stays one: what it points to is replaced.
+    A device or a pipe is written into. Raises ResultError where the folder cannot be written or the disk is full.
     """
     if not path.name:
         raise ResultError("The name of a file to write is empty. Give one with -o.")
@@ -175,10 +173,8 @@ def packed(folder: Path) -> dict[str, Bytes]:
 
 
 def unpacked(files: dict[str, Bytes], name: str) -> Path:
-    """A folder of this machine with these files, which are written once for all that use the name. Raises ResultError.
-
-    The name must stand for the content. A machine may clean up old files one by one, so sizes are looked at.
-    """
+    """A folder of this machine with these files, which are written once for all that use the name, that of the content.
+    A machine may clean up old files one by one, so sizes are looked at. Raises ResultError."""
     place = own_folder() / name
     if not _is_whole(place, files):
         with scratch("unpack") as folder:

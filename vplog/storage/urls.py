@@ -1,8 +1,7 @@
 """URLs as they are stored and shown: scheme, host and path, without what may be a secret.
 
-Links that are signed for a while (AWS Signature, Google's, Azure SAS, CloudFront) and tokens of any server are in the
-query, and which of its keys are harmless nobody knows for all servers. So user, password and everything behind the path
-are cut: what is left names the file, and who needs to open it again gives the URL again.
+Links that are signed for a while and tokens of any server are in the query, and which of its keys are harmless nobody
+knows for all servers. So user, password and everything behind the path are cut.
 """
 
 from __future__ import annotations

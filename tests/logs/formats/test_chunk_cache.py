@@ -13,9 +13,9 @@ from tests.logs.drives import Drive, foxglove_messages, ros_messages, write_foxg
 from vplog.logs.formats import chunk_cache as chunks_module
 from vplog.logs.formats.chunk_cache import Chunks
 from vplog.logs.formats.compression import BadChunkError
-from vplog.logs.formats.container import Channel, Message, Notes, in_blocks
+from vplog.logs.formats.container import Channel, Message, Notes, in_blocks, messages_in
+from vplog.logs.formats.mcap_chunk import ChunkReader
 from vplog.logs.formats.mcap_file import McapFile
-from vplog.logs.formats.mcap_walk import ChunkReader
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -113,7 +113,7 @@ def test_messages_read_again_are_those_read_first(ros: bool, tmp_path: Path) -> 
         path = write_foxglove(tmp_path / "drive.mcap", foxglove_messages(Drive()), "protobuf", chunk_size=4096)
     file = McapFile(path, Notes())
     counts = file.contents().counts
-    found = [(message, bytes(message.data)) for message in file.messages(counts)]
+    found = [(message, bytes(message.data)) for message in messages_in(file, counts)]
     assert len(found) == sum(counts.values())
     assert all(file.read(message.place) == data for message, data in found)
     stamped = [m for block in file.blocks(counts, list(counts)) for m in block.messages()]

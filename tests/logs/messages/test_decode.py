@@ -18,8 +18,7 @@ from rosbags.interfaces import Nodetype
 
 from tests.logs.drives import store
 from vplog.logs.formats.container import Channel
-from vplog.logs.messages.decode import decode, stamp_of
-from vplog.logs.messages.odometry import read_poses
+from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, FixMessage, ImageMessage, PoseMessage
 
 if TYPE_CHECKING:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from vplog.execution.cores import allowed
 from vplog.logs.formats.compression import BadChunkError
-from vplog.logs.formats.container import part_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator
@@ -23,18 +22,18 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Octets
 
 MOST_BYTES = 64 * 2**20
-"""Bytes of unpacked chunks that a process keeps, whatever their number: drives of a few minutes are unpacked once, and
-in longer ones image and depth, which lie in neighbouring chunks, do not unpack their chunks twice."""
+"""Bytes of unpacked chunks that a process caches: neighbouring chunks of image and depth are not unpacked twice."""
 _THREADS = 2
-"""Threads that read ahead, where there may be as many: each unpacks about 1 GB/s, and images are gone through twice as
-fast. More cost more time of the processor than they save."""
+"""Threads that read ahead: each unpacks about 1 GB/s, and images are read twice as fast; more cost more than they
+save."""
 _ALONE_S = 0.02
-"""Seconds of unpacking before other threads help. To start them and to hand over costs a few ms; what takes long to
-unpack, by its size or its packing, is there soon."""
+"""Seconds of unpacking before other threads help: to start them and to hand over costs a few ms."""
 _LEAST_BYTES = 64 * 2**10
 """Size of a chunk from which another thread unpacks it: handing over takes as long as some 50 kB."""
 _AHEAD_BYTES = 32 * 2**20
 """Bytes of unpacked chunks that wait to be gone through; a chunk larger than that is unpacked when its turn comes."""
+_VIEWED = 4 * 2**20
+"""Bytes of a chunk up to which its images are not copied: each that waits to be decoded may keep another."""
 
 
 class _RecentChunks:
@@ -80,7 +79,7 @@ class Chunks:
         threads: bool,
     ) -> None:
         """`load` reads and unpacks one, in any thread where `threads`; for its BadChunkError `damaged` is called in the
-        thread of the caller. `size` says how many bytes there will be, `packed` whether to keep them."""
+        thread of the caller. `size` says how many bytes there will be, `packed` whether to cache them."""
         self._load, self._damaged, self._size, self._packed = load, damaged, size, packed
         self._threads = min(_THREADS, allowed()) if threads else 0
         self._file = next(_FILES)
@@ -91,8 +90,9 @@ class Chunks:
         return self._take(number, lambda: self._load(number)) if recent is None else recent
 
     def part(self, number: int, start: int, stop: int) -> Octets:
-        """Bytes of a chunk, as `part_of`."""
-        return part_of(self(number), start, stop)
+        """Bytes of a chunk where they lie, which keeps all of it; a copy of those of a large one."""
+        data = self(number)
+        return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
 
     def in_turn(
         self, numbers: Iterable[int], stays: Callable[[int], bool] | None = None
@@ -101,11 +101,8 @@ class Chunks:
         that saves time; who only looks for the first message of a topic starts no thread."""
         numbers, spent_s = iter(numbers), 0.0
         for number in numbers:
-            if stays and stays(number):
-                yield number, None
-                continue
             began_s = time.perf_counter()
-            data = self(number)
+            data = None if stays and stays(number) else self(number)
             spent_s += time.perf_counter() - began_s
             yield number, data
             if spent_s >= _ALONE_S and self._threads:
@@ -113,35 +110,31 @@ class Chunks:
         else:
             return
         with ThreadPoolExecutor(self._threads, "vplog-read-ahead") as pool:
-            yield from self._ahead(numbers, stays, pool)
+            yield from self._ahead(numbers, stays or (lambda _: False), pool)
 
     def _ahead(
-        self, numbers: Iterator[int], stays: Callable[[int], bool] | None, pool: ThreadPoolExecutor
+        self, numbers: Iterator[int], stays: Callable[[int], bool], pool: ThreadPoolExecutor
     ) -> Iterator[tuple[int, bytes | None]]:
         waiting: deque[tuple[int, Future[bytes] | None]] = deque()
-        waiting_bytes = 0
         following = next(numbers, None)
         try:
             while waiting or following is not None:
                 while following is not None and len(waiting) < 2 * self._threads:
                     size = self._size(following)
-                    if waiting and waiting_bytes + size > _AHEAD_BYTES:
+                    if waiting and sum(self._size(number) for number, _ in waiting) + size > _AHEAD_BYTES:
                         break
-                    handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not (stays and stays(following))
+                    handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not stays(following)
                     handed = handed and _RECENT.get((self._file, following)) is None
                     waiting.append((following, pool.submit(self._load, following) if handed else None))
-                    waiting_bytes += size
                     following = next(numbers, None)
                 number, future = waiting.popleft()
-                waiting_bytes -= self._size(number)
                 if future is not None:
                     yield number, self._take(number, future.result)
                 else:
-                    yield number, None if stays and stays(number) else self(number)
+                    yield number, None if stays(number) else self(number)
         finally:
-            for _, future in waiting:
-                if future is not None:
-                    future.cancel()
+            for future in (future for _, future in waiting if future is not None):
+                future.cancel()
 
     def _take(self, number: int, loaded: Callable[[], bytes]) -> bytes:
         try:

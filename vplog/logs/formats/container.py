@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from vplog.logs.formats.loss_account import Account
@@ -55,13 +56,14 @@ class Block(NamedTuple):
         return Message(self.channels[row], self.log_ns[row], data[start:stop], self.places[row])
 
 
-def part_of(data: Octets, start: int, stop: int) -> Octets:
-    """Bytes of a chunk where they lie, which keeps all of it; a copy of those of a large one."""
-    return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
+Row = tuple[Channel, int, int, int, Place]
+"""Channel, log time, start, stop and place of a message of a block."""
 
 
-_VIEWED = 4 * 2**20
-"""Bytes of a chunk up to which its images are not copied: each that waits to be decoded may keep another."""
+def block_of(data: Octets, rows: list[Row]) -> Block:
+    return Block(data, *map(list, zip(*rows, strict=True))) if rows else Block(data, [], [], [], [], [])
+
+
 _COPIED = 4096
 """Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
 _TOGETHER = 256
@@ -69,13 +71,16 @@ _TOGETHER = 256
 
 
 def in_blocks(messages: Iterable[Message]) -> Iterator[Block]:
-    """Blocks of messages that lie in no chunk: small ones together, up to the next large one, which is one alone."""
+    """Blocks of messages that lie in no chunk: small ones together, up to the next large one, which is one alone; few
+    at first, for who takes only the first of a topic."""
     waiting: list[Message] = []
+    together = 1
     for message in messages:
         large = len(message.data) >= _COPIED
-        if waiting and (large or len(waiting) == _TOGETHER):
+        if waiting and (large or len(waiting) >= together):
             yield _joined(waiting)
             waiting.clear()
+            together = min(2 * together, _TOGETHER)
         if large:
             yield _joined([message])
         else:
@@ -86,9 +91,8 @@ def in_blocks(messages: Iterable[Message]) -> Iterator[Block]:
 
 def _joined(messages: list[Message]) -> Block:
     data = messages[0].data if len(messages) == 1 else b"".join(message.data for message in messages)
-    stops = list(accumulate(len(message.data) for message in messages))
-    channels, log_ns, _, places = (list(column) for column in zip(*messages, strict=True))
-    return Block(data, channels, log_ns, [0, *stops[:-1]], stops, places)
+    bounds = pairwise(accumulate((len(message.data) for message in messages), initial=0))
+    return block_of(data, [(m.channel, m.log_ns, *ends, m.place) for m, ends in zip(messages, bounds, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -132,19 +136,21 @@ class Container(Protocol):
 
     def contents(self) -> Contents: ...
 
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        """The messages of these channels in file order, one in memory at a time."""
-        ...
-
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        """Messages by the bytes they lie in, one block in memory at a time. Of large messages of `brief` channels, in
-        the encodings of ROS, only the header's stamp is there: what follows it, up to their stop and beyond the end of
-        the block, are bytes of others. `read` gives them whole."""
+        """The messages of these channels in file order, by the bytes they lie in, one block in memory at a time. Of
+        large messages of `brief` channels, in the encodings of ROS, only the header's stamp is there: what follows it,
+        up to their stop and beyond the end of the block, are bytes of others. `read` gives them whole."""
         ...
 
     def read(self, place: Place) -> Octets:
-        """The bytes of one message, from any place that `messages` gave."""
+        """The bytes of one message, from any place that `blocks` gave."""
         ...
+
+
+def messages_in(container: Container, channels: Collection[Channel]) -> Iterator[Message]:
+    """The messages of these channels in file order."""
+    for block in container.blocks(channels):
+        yield from block.messages()
 
 
 def ordered(counts: dict[Channel, int]) -> dict[Channel, int]:
@@ -158,28 +164,16 @@ def plural(count: int, noun: str) -> str:
 
 def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
     """Counts of topics, whatever the types under one name."""
-    result: dict[str, int] = {}
+    result: Counter[str] = Counter()
     for channel, count in counts.items():
-        result[channel.topic] = result.get(channel.topic, 0) + count
-    return result
+        result[channel.topic] += count
+    return dict(result)
 
 
 def topics_of(counts: Mapping[int, int], channels: Mapping[int, Channel]) -> dict[str, int]:
     """Counts by topic of counts by channel number, zero and less left out; those that nothing defines of no topic."""
-    result: dict[str, int] = {}
+    result: Counter[str] = Counter()
     for number, count in counts.items():
         if count > 0:
-            topic = channels[number].topic if number in channels else ""
-            result[topic] = result.get(topic, 0) + count
-    return result
-
-
-def count_messages(messages: Iterable[Message], channels: Iterable[Channel]) -> Contents:
-    """Contents by reading every message; `channels` may turn out to be empty."""
-    counts: dict[Channel, int] = {}
-    start_ns, end_ns = 2**64, 0
-    for message in messages:
-        counts[message.channel] = counts.get(message.channel, 0) + 1
-        start_ns, end_ns = min(start_ns, message.log_ns), max(end_ns, message.log_ns)
-    counts = dict.fromkeys(channels, 0) | counts
-    return Contents(ordered(counts), min(start_ns, end_ns), end_ns)
+            result[channels[number].topic if number in channels else ""] += count
+    return dict(result)

@@ -1,11 +1,10 @@
-"""What of a log could not be used: counted by topic, placed in time, in one sentence for each reason.
-
-Times are log times, as the recorder wrote them: they are there even where a message's own stamp is the damage.
-"""
+"""What of a log could not be used: counted by topic, placed in time by log times, in one sentence for each reason."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -91,10 +90,8 @@ class Account:
         spans: list[Span],
         detail: str = "",
     ) -> None:
-        """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all.
-
-        `key`, a file or topic and a place in it, makes the same loss found again replace itself.
-        """
+        """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all. `key`,
+        a file or topic and a place in it, makes the same loss found again replace itself."""
         if (reason, key) in self._settled:
             return
         self._found.get((reason, ""), {}).pop(key, None)  # their topic, or how many, may be known by now
@@ -113,15 +110,18 @@ class Account:
         """Add what another found."""
         for (reason, topic), places in other._found.items():
             for key, lost in places.items():
-                self.add(
-                    reason, {topic: lost.messages} if lost.messages is not None else None, key, lost.spans, lost.detail
-                )
+                counts = None if lost.messages is None else {topic: lost.messages}
+                self.add(reason, counts, key, lost.spans, lost.detail)
 
     def undecodable(self, stamp_ns: Collection[int]) -> list[tuple[str, int]]:
         """Topic and stamp of the images of frames with these stamps that were found not to decode."""
-        wanted = set(stamp_ns)
-        found = [places.copy() for (reason, _), places in self._found.copy().items() if reason == "undecodable_image"]
-        return sorted(key for places in found for key in places if key[1] in wanted)
+        wanted, found = set(stamp_ns), self._copy().items()
+        places = (key for (reason, _), places in found if reason == "undecodable_image" for key in places)
+        return sorted(key for key in places if key[1] in wanted)
+
+    def _copy(self) -> dict[tuple[str, str], dict[tuple[str, int], _Lost]]:
+        """What was found so far; workers that decode images may add to it meanwhile."""
+        return {key: places.copy() for key, places in self._found.copy().items()}
 
     def know(self, file: str, recorded: Mapping[str, int], start_ns: int) -> None:
         """How many messages of each topic were recorded in a file, as it says itself, and when the first."""
@@ -132,10 +132,8 @@ class Account:
     def settle(
         self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
     ) -> dict[str, int]:
-        """Make the losses in these files add up to what was recorded less what was found: those that nothing counted
-        get what is left, and those that were counted twice, by an index in the wrong place, lose it. `end_ns` is when
-        the recording ended. Gives what no loss explains.
-        """
+        """Make the losses in these files add up to what was recorded less what was found: uncounted ones get what is
+        left, those counted twice lose it. `end_ns` is when the recording ended. Returns what no loss explains."""
         if not recorded:
             return {}
         for topic, count in recorded.items():
@@ -188,29 +186,24 @@ class Account:
     @property
     def losses(self) -> list[Loss]:
         """By reason in the order of REASONS, then topic; the same for any order of reading."""
-        totals: dict[str, int] = {}
-        for recorded in self._recorded.values():
-            for topic, count in recorded.items():
-                totals[topic] = totals.get(topic, 0) + count
-        found = []
-        order = list(REASONS)
-        known = sorted(self._found.copy().items(), key=lambda item: (order.index(item[0][0]), item[0]))
-        for (reason, topic), places in known:  # copies: workers that decode images may add to them meanwhile
-            lost = [one for _, one in sorted(places.copy().items(), key=lambda item: item[0])]
-            if not lost:
-                continue
-            counts = [one.messages for one in lost if one.messages is not None]
-            messages = sum(counts) if len(counts) == len(lost) else None
-            spans = merged([span for one in lost for span in one.spans])
-            found.append(Loss(reason, topic, messages, totals.get(topic), tuple(spans), lost[0].detail))
-        return found
+        recorded: Counter[str] = Counter()
+        for counts in self._recorded.values():
+            recorded.update(counts)
+        order, found, result = list(REASONS), self._copy(), []
+        for reason, topic in sorted(found, key=lambda key: (order.index(key[0]), key)):
+            places = found[reason, topic]
+            lost = [places[key] for key in sorted(places)]
+            if lost:
+                messages = None if None in (counts := [one.messages for one in lost]) else sum(n or 0 for n in counts)
+                spans = tuple(merged([span for one in lost for span in one.spans]))
+                result.append(Loss(reason, topic, messages, recorded.get(topic), spans, lost[0].detail))
+        return result
 
     @property
     def sentences(self) -> list[str]:
         """One for each reason."""
-        losses = self.losses
-        groups = {reason: [loss for loss in losses if loss.reason == reason] for reason in REASONS}
-        return [self._sentence(reason, group) for reason, group in groups.items() if group]
+        groups = groupby(self.losses, key=lambda loss: loss.reason)
+        return [self._sentence(reason, list(group)) for reason, group in groups]
 
     def _sentence(self, reason: str, group: list[Loss]) -> str:
         known = [loss.messages for loss in group if loss.messages is not None]
@@ -221,7 +214,8 @@ class Account:
         if known and len(known) < len(group):
             what += " and more that cannot be counted,"
         named = [f"{loss.topic}{_count(loss)}" for loss in group if loss.topic]
-        which = ", ".join(named[:_NAMED]) + _more(len(named) - _NAMED)
+        which, more = ", ".join(named[:_NAMED]), len(named) - _NAMED
+        which += "" if more <= 0 else " and another topic" if more == 1 else f" and {more} more topics"
         spans = merged([span for loss in group for span in loss.spans_ns])
         when = f", {self._when(spans)}" if spans else ""
         detail = next((f" {loss.detail}" for loss in group if loss.detail), "")
@@ -231,10 +225,6 @@ class Account:
         first, last = (f"{(ns - (self.start_ns or 0)) / 1e9:.3f}" for ns in (spans[0][0], spans[-1][1]))
         where = f" in {len(spans)} places" if len(spans) > 1 else ""
         return f"at t={first} s" if first == last else f"from t={first} to {last} s{where}"
-
-
-def _more(topics: int) -> str:
-    return "" if topics <= 0 else " and another topic" if topics == 1 else f" and {topics} more topics"
 
 
 def _count(loss: Loss) -> str:

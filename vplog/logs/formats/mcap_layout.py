@@ -1,23 +1,20 @@
 """Where the chunks of an MCAP file lie (mcap.dev/spec): read record by record, over damage too.
 
-Chunks are stepped over, so that it reads a few kB per MB. A record says its length twice, before its fields and by
-them: where the two differ, the one with a record behind it holds. Where neither has, reading goes on at the next chunk
-that the file's own index names, or else at the next bytes that can be a record.
+A record says its length twice, before its fields and by them: where the two differ, the one with a record behind it
+holds. Where neither has, reading goes on at the next chunk of the file's index, or the next bytes that can be a record.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from mcap.opcode import Opcode
 
 from vplog.errors import LogError
-from vplog.logs.formats.checksum import crc32
-from vplog.logs.formats.compression import KINDS
-from vplog.logs.formats.resync import MOST_GAPS, Search
+from vplog.logs.formats.compression import KINDS, crc32
+from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, Search
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,50 +71,6 @@ _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
 """The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
-
-
-@dataclass(slots=True)
-class Chunk:
-    """A chunk of messages; or, with compression None, message records outside any chunk."""
-
-    start: int
-    """Offset of its records in the file."""
-    stop: int
-    compression: str | None
-    size: int
-    crc: int
-    first_ns: int
-    last_ns: int
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages per channel id, from the message indexes behind it; empty where the writer left none."""
-    cut: bool = False
-    record: int = -1
-    """Offset of its record."""
-    doubtful: bool = False
-    """Damage lies between its message indexes, so that they may not be all."""
-
-
-@dataclass
-class Layout:
-    """Chunks and damage of a file."""
-
-    chunks: list[Chunk] = field(default_factory=list)
-    missing: list[Chunk] = field(default_factory=list)
-    """Chunks that lie in damaged bytes, as the index at the end or their own message indexes tell of them."""
-    recorded: dict[int, int] = field(default_factory=dict)
-    """Messages per channel id by the file's statistics; empty where it has none."""
-    gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Where damage may begin, and where reading goes on."""
-    cut_at: int | None = None
-    """Byte behind which nothing can be read, where messages may have been."""
-    unknown_at: int | None = None
-    """The first record of an unknown kind that would be a message if that byte were damaged."""
-    spare: list[tuple[int, bytes]] = field(default_factory=list)
-    """Schemas and channels of a summary whose checksum is wrong, for those that no other place defines."""
-    appended_at: int | None = None
-    """Byte behind the end of the recording where another one follows."""
-    index_cut_at: int | None = None
-    """Byte behind which nothing can be read, where the messages had ended."""
 
 
 def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None], name: str) -> Layout:
@@ -183,21 +136,21 @@ class _LayoutReader:
         for offset, (listed, indexes) in sorted(self._indexed.items()):
             if (chunk := found.get(offset)) is not None:
                 if chunk.counts and chunk.counts.keys() != indexes.keys():
-                    listed.counts = self._counts(indexes)
-                    chunk.doubtful |= chunk.counts != {i: n for i, n in listed.counts.items() if n}
-            elif (bounds := self._bounds(offset))[0] == Opcode.CHUNK and bounds[
-                1
-            ] <= self._length:  # it was jumped over
-                self._add_chunk(offset + RECORD.size, bounds[1], cut=False)
+                    chunk.doubtful |= chunk.counts != {i: n for i, n in self._counts(indexes).items() if n}
+            elif (stop := self._chunk_stop(offset)) is not None:  # it was jumped over
+                self._add_chunk(offset + RECORD.size, stop, cut=False)
                 self.layout.chunks[-1].counts = self._counts(indexes)
             elif any(start <= offset < stop for start, stop in self.layout.gaps):  # else the index is what is damaged
                 listed.counts = self._counts(indexes)
                 self.layout.missing.append(listed)
-        self.layout.chunks.sort(key=lambda chunk: chunk.start)
-        for chunk in self.layout.chunks:
-            chunk.counts = {} if chunk.doubtful else chunk.counts
+        self.layout.in_order()
         if found and self._indexed:  # they tell of every chunk in the gaps
             self.layout.gaps = []
+
+    def _chunk_stop(self, position: int) -> int | None:
+        """Where the chunk at `position` stops; None where none lies whole there."""
+        opcode, stop = self._bounds(position)
+        return stop if opcode == Opcode.CHUNK and stop <= self._length else None
 
     def _counts(self, indexes: dict[int, int]) -> dict[int, int]:
         """Messages per channel id by message indexes at these offsets; empty where one is not there."""
@@ -242,13 +195,10 @@ class _LayoutReader:
         """Bytes of a record whose fields begin at `start`, as the lengths among them say."""
         if opcode not in _SHAPES:
             return None
-        position = start
+        at = start
         for step in _SHAPES[opcode]:
-            if step > 0:
-                position += step
-            else:
-                position += int.from_bytes(self.at(position, -step), "little") - step
-        return position - start
+            at += step if step > 0 else int.from_bytes(self.at(at, -step), "little") - step
+        return at - start
 
     def _is_record(self, position: int, behind: int = 0, longer: bool = False) -> bool:
         """Whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of the
@@ -323,12 +273,12 @@ class _LayoutReader:
         if last and last.compression is None and last.stop == start - RECORD.size and stop - last.start < _RUN:
             last.stop, last.first_ns, last.last_ns = stop, min(last.first_ns, log_ns), max(last.last_ns, log_ns)
         else:
-            chunks.append(Chunk(start - RECORD.size, stop, None, 0, 0, log_ns, log_ns))
+            chunks.append(Chunk(start - RECORD.size, stop, None, first_ns=log_ns, last_ns=log_ns))
 
     def _add_index(self, data: bytes) -> None:
         first_ns, last_ns, offset, _, size = struct.unpack_from("<QQQQI", data)
         entries = data[36 : 36 + min(size, len(data) - 36) // 10 * 10]  # channel id and offset of its message index
-        chunk = Chunk(offset, offset, "", 0, 0, first_ns, last_ns)
+        chunk = Chunk(offset, offset, first_ns=first_ns, last_ns=last_ns)
         self._indexed[offset] = chunk, dict(struct.iter_unpack("<HQ", entries))
 
     def _resume(self, before: int, position: int) -> int | None:
@@ -356,7 +306,7 @@ class _LayoutReader:
         if chunks and chunks[-1].record >= 0:
             chunks[-1].doubtful = True
         if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
-            self._indexing = Chunk(position, found, "", 0, 0, 0, 0)
+            self._indexing = Chunk(position, found)
             self.layout.missing.append(self._indexing)
         self.layout.gaps.append((position, found))
         return found

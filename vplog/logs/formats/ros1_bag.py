@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Block, Channel, Contents, Notes, by_topic, ordered, plural, topics_of
+from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, ordered, topics_of
+from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
 
@@ -15,8 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.formats.container import Message, Octets, Place
-    from vplog.logs.formats.ros1_layout import Chunk
+    from vplog.logs.formats.container import Block, Octets, Place
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
 """What the header of each kind of record in the chunks has."""
@@ -28,13 +28,13 @@ class Ros1Bag:
 
     def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
         """`name` is what the file is called in remarks."""
-        self._name, self._notes = name or path.name, notes
+        self._name, self._account, length = name or path.name, notes.account, path.stat().st_size
         self._file = path.open("rb")
-        self._length = path.stat().st_size
         self._channels: dict[int, Channel] = {}
         self._doubtful: dict[int, Channel] = {}
         """Connections whose type is damaged, for those that no other record defines."""
-        self._layout = read_layout(self._file, self._length, self._connect, self._name)
+        self._layout = read_layout(self._file, length, self._connect, self._name)
+        self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
         local = not isinstance(path, RemotePath)
         self._at = reader_at(self._file, local)
         sizes = [chunk.size for chunk in self._layout.chunks]
@@ -43,102 +43,68 @@ class Ros1Bag:
     def contents(self) -> Contents:
         """Counted by the indexes; a chunk without is unpacked."""
         if self._doubtful.keys() - self._channels.keys():
-            for count in range(len(self._layout.chunks)):  # which define their connections too
-                self._messages(count, self._data(count))
-            self._channels = self._doubtful | self._channels
-        counts: dict[Channel, int] = {}
-        start_ns, end_ns = 2**64, 0
-        for count, chunk in enumerate(self._layout.chunks):
+            for row in range(len(self._layout.chunks)):  # which define their connections too
+                self._messages(row, self._data(row))
+            for connection, channel in self._doubtful.items():
+                self._channels.setdefault(connection, channel)
+        counts: Counter[Channel] = Counter()
+        times: list[int] = []
+        for row, chunk in enumerate(self._layout.chunks):
             if chunk.counts and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
                 found = chunk.counts
-                start_ns, end_ns = min(start_ns, chunk.first_ns), max(end_ns, chunk.last_ns)
+                times += chunk.first_ns, chunk.last_ns
             else:
-                found = {}
-                for connection, log_ns, _, _ in self._messages(count, self._data(count)):
-                    found[connection] = found.get(connection, 0) + 1
-                    start_ns, end_ns = min(start_ns, log_ns), max(end_ns, log_ns)
-                    chunk.first_ns, chunk.last_ns = min(chunk.first_ns or log_ns, log_ns), max(chunk.last_ns, log_ns)
+                messages = self._messages(row, self._data(row))
+                found = Counter(connection for connection, *_ in messages)
+                own = [log_ns for _, log_ns, _, _ in messages]
+                chunk.first_ns = min([*own, chunk.first_ns] if chunk.first_ns else own, default=0)
+                chunk.last_ns = max([*own, chunk.last_ns])
+                times += [min(own), max(own)] if own else []
             if chunk.damaged:
                 found = Counter(found) | Counter(chunk.counts)
             if chunk.listed and not chunk.damaged and found != chunk.listed:
                 self._layout.recorded = {}  # the bag's index is what is damaged
-            for connection, messages in found.items():
-                if connection in self._channels:
-                    channel = self._channels[connection]
-                    counts[channel] = counts.get(channel, 0) + messages
-        start_ns = min(start_ns, end_ns)
-        counts = ordered(dict.fromkeys(self._channels.values(), 0) | counts)
-        self._account_for(by_topic(counts), start_ns, end_ns)
-        return Contents(counts, start_ns, end_ns)
-
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        for block in self.blocks(channels):
-            yield from block.messages()
+            for connection in found.keys() & self._channels.keys():
+                counts[self._channels[connection]] += found[connection]
+        span = min(times, default=0), max(times, default=0)
+        result = Contents(ordered(dict.fromkeys(self._channels.values(), 0) | counts), *span)
+        self._account_for(by_topic(result.counts), span)
+        return result
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        wanted = set(channels)
-        chunks = self._layout.chunks
-        numbers = (count for count, chunk in enumerate(chunks) if self._may_hold(chunk, wanted))
-        for count, data in self._data.in_turn(numbers):
-            if data is None or not self._may_hold(chunks[count], wanted):  # by a connection that came meanwhile
+        wanted, chunks = set(channels), self._layout.chunks
+        rows = (row for row, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
+        for row, data in self._data.in_turn(rows):
+            if data is None or not self._losses.may_hold(chunks[row], wanted):  # by a connection that came meanwhile
                 continue
-            block = Block(data, [], [], [], [], [])
-            for connection, log_ns, start, stop in self._messages(count, data):
-                channel = self._channels.get(connection)
-                if channel in wanted and channel is not None:
-                    block.channels.append(channel)
-                    block.log_ns.append(log_ns)
-                    block.starts.append(start)
-                    block.stops.append(stop)
-                    block.places.append((count, start, stop))
-            yield block
+            found = [(self._channels.get(connection), *rest) for connection, *rest in self._messages(row, data)]
+            yield block_of(
+                data,
+                [(c, log_ns, start, stop, (row, start, stop)) for c, log_ns, start, stop in found if c in wanted and c],
+            )
 
     def read(self, place: Place) -> Octets:
         return self._data.part(*place)
 
-    def _account_for(self, found: dict[str, int], start_ns: int, end_ns: int) -> None:
-        layout, account, name = self._layout, self._notes.account, self._name
-        recorded = dict(found)
-        for chunk in layout.missing:
-            counts = topics_of(chunk.counts, self._channels)
-            before = max((c.last_ns for c in layout.chunks if c.stop <= chunk.record), default=start_ns)
-            behind = min((c.first_ns for c in layout.chunks if c.start > chunk.record and c.first_ns), default=end_ns)
-            first_ns, last_ns = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else (before, behind)
-            detail = f"{name} is damaged near byte {chunk.record}."
-            account.add("damaged_bytes", counts or None, (name, chunk.record), [(first_ns, last_ns)], detail)
-            for topic, messages in counts.items():
-                recorded[topic] = recorded.get(topic, 0) + messages
-        if layout.cut_at is not None:
-            detail = (
-                f"{name} is cut or damaged at byte {layout.cut_at} of {self._length}; "
-                f"the {plural(sum(found.values()), 'message')} before it are read."
-            )
-            account.add("cut", None, (name, layout.cut_at), [(end_ns, end_ns)] if end_ns else [], detail)
-        if layout.appended_at is not None:
-            account.add_appended(name, layout.appended_at, self._length)
-        if layout.index_cut_at is not None:
-            self._notes.add(f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message.")
+    def _account_for(self, found: dict[str, int], span: tuple[int, int]) -> None:
+        layout = self._layout
+        total = self._losses.add_missing(found, span, "is damaged near byte")
+        self._losses.add_end(sum(found.values()), [(span[1], span[1])] if span[1] else [])
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         listed = topics_of(layout.recorded, self._channels)
-        account.know(name, listed or (recorded if whole else {}), start_ns)
-        account.settle({name}, listed, found)
+        self._account.know(self._name, listed or (total if whole else {}), span[0])
+        self._account.settle({self._name}, listed, found)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
-        connection, about = number(header, b"conn"), fields(data)
-        channel = Channel(
-            header.get(b"topic", b"").decode("utf-8", "replace"),
-            (about or {}).get(b"type", b"").decode("utf-8", "replace"),
-            "ros1",
-        )
-        if about is None or b"type" not in about:
-            self._doubtful.setdefault(connection, channel)
-        else:
-            self._channels.setdefault(connection, channel)
+        about = fields(data) or {}
+        topic, kind = (each.decode("utf-8", "replace") for each in (header.get(b"topic", b""), about.get(b"type", b"")))
+        known = self._channels if b"type" in about else self._doubtful
+        known.setdefault(number(header, b"conn"), Channel(topic, kind, "ros1"))
 
-    def _messages(self, count: int, data: bytes) -> list[tuple[int, int, int, int]]:
+    def _messages(self, row: int, data: bytes) -> list[tuple[int, int, int, int]]:
         """Connection, log time, start and stop of every message in a chunk; what it was short of is accounted for."""
-        chunk = self._layout.chunks[count]
+        chunk = self._layout.chunks[row]
         found: list[tuple[int, int, int, int]] = []
         position = 0
         while position < len(data):
@@ -156,34 +122,24 @@ class Ros1Bag:
         damaged = position < len(data) and not chunk.cut
         if damaged and found:
             found.pop()  # its length may be what is damaged
-        key, account = (self._name, chunk.start), self._notes.account
-        counts = Counter(connection for connection, _, _, _ in found)
+        counts = Counter(connection for connection, *_ in found)
         last_ns = found[-1][1] if found else chunk.first_ns
         span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
-        unknown = sum(messages for connection, messages in counts.items() if connection not in self._channels)
         if damaged:
             chunk.damaged = True
-            short = topics_of({i: messages - counts[i] for i, messages in chunk.counts.items()}, self._channels)
-            detail = f"{self._name} has a damaged chunk at byte {chunk.start}; the rest of it is left out."
-            account.add("damaged_chunk", short if chunk.counts else None, key, span, detail)
-        if unknown:
-            account.add("unknown_channel", {"": unknown}, key, span)
+            short = {i: count - counts[i] for i, count in chunk.counts.items()}
+            self._losses.add_chunk(chunk, short, span, "; the rest of it is left out")
+        self._losses.add_unknown(chunk, sum(n for i, n in counts.items() if i not in self._channels), span)
         return found
 
-    def _may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
-        """Not where its indexes name only connections that are known and not wanted."""
-        return not chunk.counts or any(self._channels.get(i) in wanted or i not in self._channels for i in chunk.counts)
-
-    def _unpack(self, count: int) -> bytes:
+    def _unpack(self, row: int) -> bytes:
         """The records of one chunk. Raises BadChunkError where it is damaged."""
-        chunk = self._layout.chunks[count]
-        return unpack(chunk.compression, self._at(chunk.start, chunk.stop - chunk.start), chunk.size, chunk.cut)
+        chunk = self._layout.chunks[row]
+        data = self._at(chunk.start, chunk.stop - chunk.start)
+        return unpack(chunk.compression or "", data, chunk.size, chunk.cut)
 
-    def _add_damaged_chunk(self, count: int, error: BadChunkError) -> None:
-        """Account for a damaged chunk."""
-        chunk = self._layout.chunks[count]
+    def _add_damaged_chunk(self, row: int, error: BadChunkError) -> None:
+        chunk = self._layout.chunks[row]
         chunk.damaged = True
-        detail = f"{self._name} has a damaged chunk at byte {chunk.start}, left out: {error}."
         span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
-        counts = topics_of(chunk.counts, self._channels) if chunk.counts else None
-        self._notes.account.add("damaged_chunk", counts, (self._name, chunk.start), span, detail)
+        self._losses.add_chunk(chunk, chunk.counts, span, f", left out: {error}")

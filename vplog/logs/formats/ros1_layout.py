@@ -1,7 +1,7 @@
 """Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): read record by record, over damage too.
 
-A record is believed where another lies behind it. Where none does, reading goes on at the next bytes that can be the
-head of a chunk, or of a record of an index; what lay between is held against the index at the end.
+A record holds where another lies behind it. Where none does, reading goes on at the next bytes that can be the head of
+a chunk, or of a record of an index.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.formats.resync import MOST_GAPS, Search
+from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, Search
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,48 +49,6 @@ _NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn
 
 _Head = tuple[dict[bytes, bytes] | None, int, int]
 """Header of a record, None where it is damaged, and where its data start and stop."""
-
-
-@dataclass(slots=True)
-class Chunk:
-    start: int
-    """Offset of its data in the file."""
-    stop: int
-    compression: str
-    size: int
-    cut: bool
-    record: int = -1
-    """Offset of its record."""
-    doubtful: bool = False
-    """Damage lies between the index records behind it, so that they may not be all."""
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages per connection, from the index records behind it; empty where there are none."""
-    listed: dict[int, int] = field(default_factory=dict)
-    """Messages per connection by the bag's index."""
-    damaged: bool = False
-    """Not all of it could be unpacked and read."""
-    first_ns: int = 0
-    """From the indexes; 0 where there are none."""
-    last_ns: int = 0
-
-
-@dataclass
-class Layout:
-    """Chunks and damage of a file."""
-
-    chunks: list[Chunk] = field(default_factory=list)
-    missing: list[Chunk] = field(default_factory=list)
-    """Chunks that lie in damaged bytes, as the bag's index or the index records behind them tell."""
-    recorded: dict[int, int] = field(default_factory=dict)
-    """Messages per connection by the bag's index; empty where it is not whole."""
-    gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Bytes without a record, from and to."""
-    cut_at: int | None = None
-    """Byte behind which nothing can be read, where messages may have been."""
-    appended_at: int | None = None
-    """Byte behind the end of the recording where another one follows."""
-    index_cut_at: int | None = None
-    """Byte behind which nothing can be read, where all chunks that the bag had were found before."""
 
 
 def read_layout(file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None], name: str) -> Layout:
@@ -166,7 +123,7 @@ class _LayoutReader:
         if self._indexing is not None and named is not None and named[1] is None:
             self._indexing.doubtful = True
         if named is None or named[1] is not None:
-            self._indexing = Chunk(position, found, "", 0, False, record=position)
+            self._indexing = Chunk(position, found, record=position)
             self.layout.missing.append(self._indexing)
 
     def finish(self) -> None:
@@ -192,9 +149,7 @@ class _LayoutReader:
                 listed = False
         if self._index_sound and len(self._infos) == self._chunk_count:
             layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
-        layout.chunks.sort(key=lambda chunk: chunk.start)
-        for chunk in layout.chunks:
-            chunk.counts = {} if chunk.doubtful else chunk.counts
+        layout.in_order()
         layout.missing = [
             chunk
             for offset, chunk in sorted(skipped.items())
@@ -259,7 +214,7 @@ class _LayoutReader:
             kind = header[b"compression"].decode("ascii", "replace")
             cut, stop = stop > self._length, min(stop, self._length)
             size = stop - start if kind == "none" and not cut else number(header, b"size")
-            self._indexing = Chunk(start, stop, kind, size, cut, record=position)
+            self._indexing = Chunk(start, stop, kind, size, cut=cut, record=position)
             self.layout.chunks.append(self._indexing)
         elif op == _INDEX and self._indexing is not None:
             chunk, connection, count = self._indexing, number(header, b"conn"), (stop - start) // 12
@@ -281,7 +236,7 @@ class _LayoutReader:
 
     def _add_info(self, header: dict[bytes, bytes], data: bytes) -> None:
         position, span = number(header, b"chunk_pos"), (time_ns(header, b"start_time"), time_ns(header, b"end_time"))
-        info = Chunk(position, position, "", 0, False, position, first_ns=span[0], last_ns=span[1])
+        info = Chunk(position, position, first_ns=span[0], last_ns=span[1], record=position)
         for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
             if 0 < count <= self._length:
                 info.counts[connection] = count

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import yaml
 import zstandard
 
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, ordered
+from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, messages_in, ordered
 from vplog.logs.formats.loss_account import Runs
 
 if TYPE_CHECKING:
@@ -22,15 +23,11 @@ if TYPE_CHECKING:
 
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
-
-
 _MOST_MESSAGES = 2**48
 """Messages of a topic that are believed: more than a recorder writes in its life."""
 _DEEPEST = 64
 """Levels of lists and maps in metadata.yaml; rosbag2 writes 8."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
 _TRIED = 10
 """Messages that are looked at for whether each is packed: a damaged one does not decide it."""
 
@@ -59,25 +56,20 @@ class Metadata:
 class Chain:
     """A Container over several, one after the other."""
 
-    def __init__(self, parts: Sequence[Container]) -> None:
-        self._parts = parts
+    def __init__(self, parts: Sequence[Container], notes: Notes, metadata: Metadata | None = None) -> None:
+        """`metadata` that say how much was recorded let what is lost be counted."""
+        self._parts, self._notes, self._metadata = parts, notes, metadata
 
     def contents(self) -> Contents:
-        counts: dict[Channel, int] = {}
-        spans: list[tuple[int, int]] = []
-        for part in self._parts:
-            contents = part.contents()
-            for channel, count in contents.counts.items():
-                counts[channel] = counts.get(channel, 0) + count
-            if contents.messages:
-                spans.append((contents.start_ns, contents.end_ns))
+        found = [part.contents() for part in self._parts]
+        counts: Counter[Channel] = Counter()
+        for contents in found:
+            counts.update(contents.counts)
+        spans = [(contents.start_ns, contents.end_ns) for contents in found if contents.messages]
         start_ns = min((start for start, _ in spans), default=0)
+        if self._metadata is not None and self._metadata.recorded:
+            self._settle(self._metadata, by_topic(counts), start_ns)
         return Contents(ordered(counts), start_ns, max((end for _, end in spans), default=0))
-
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        for number, part in enumerate(self._parts):
-            for message in part.messages(channels):
-                yield message._replace(place=(number, *message.place))
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         for number, part in enumerate(self._parts):
@@ -87,62 +79,30 @@ class Chain:
     def read(self, place: Place) -> Octets:
         return self._parts[place[0]].read(place[1:])
 
-
-class Counted:
-    """A Container whose metadata say how much was recorded, so that what is lost can be counted."""
-
-    def __init__(self, found: Container, metadata: Metadata, files: Collection[str], notes: Notes) -> None:
-        self._found, self._metadata, self._files, self._notes = found, metadata, files, notes
-
-    def contents(self) -> Contents:
-        contents, known = self._found.contents(), self._metadata
-        account, found = self._notes.account, by_topic(contents.counts)
-        unexplained = account.settle(self._files, known.recorded, found, known.end_ns or None)
+    def _settle(self, known: Metadata, found: dict[str, int], start_ns: int) -> None:
+        """Count what is lost by what the metadata say."""
+        account, files = self._notes.account, [*(file.name for file in known.files), *known.missing]
+        unexplained = account.settle(files, known.recorded, found, known.end_ns or None)
         if unexplained:
             more = sum(unexplained.values())
             self._notes.add(f"metadata.yaml counts {more} messages more than its undamaged storage files hold.")
         elif account.losses:
-            for file in self._files:
-                account.know(file, {}, contents.start_ns)
-            account.know("metadata.yaml", known.recorded, contents.start_ns or known.start_ns)
-        return contents
-
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        return self._found.messages(channels)
-
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return self._found.blocks(channels, brief)
-
-    def read(self, place: Place) -> Octets:
-        return self._found.read(place)
+            for file in files:
+                account.know(file, {}, start_ns)
+            account.know("metadata.yaml", known.recorded, start_ns or known.start_ns)
 
 
 class ZstdMessages:
     """A Container whose messages are each a zstd frame (rosbag2's compression mode MESSAGE)."""
 
     def __init__(self, packed: Container, notes: Notes) -> None:
-        self._packed, self._notes = packed, notes
+        self._packed, self._account = packed, notes.account
 
     def contents(self) -> Contents:
         return self._packed.contents()
 
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
-        lost: dict[str, Runs] = {}
-        reason = ""
-        for message in self._packed.messages(channels):
-            topic = message.channel.topic
-            try:
-                yield message._replace(data=unpack_zstd_message(message.data))
-            except BadChunkError as error:
-                reason = reason or f"The first does not unpack: {error}."
-                lost.setdefault(topic, Runs()).lost(message.log_ns)
-                self._notes.account.add("packed", {topic: lost[topic].messages}, (topic, 0), lost[topic].spans, reason)
-            else:
-                if topic in lost:
-                    lost[topic].sound()
-
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self.messages(channels))
+        return in_blocks(self._unpacked(channels))
 
     def read(self, place: Place) -> bytes:
         try:
@@ -150,12 +110,26 @@ class ZstdMessages:
         except BadChunkError:
             return b""
 
+    def _unpacked(self, channels: Collection[Channel]) -> Iterator[Message]:
+        lost: defaultdict[str, Runs] = defaultdict(Runs)
+        reason = ""
+        for message in messages_in(self._packed, channels):
+            topic = message.channel.topic
+            try:
+                yield message._replace(data=unpack_zstd_message(message.data))
+            except BadChunkError as error:
+                reason = reason or f"The first does not unpack: {error}."
+                lost[topic].lost(message.log_ns)
+                self._account.add("packed", {topic: lost[topic].messages}, (topic, 0), lost[topic].spans, reason)
+            else:
+                lost[topic].sound()
+
 
 def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
-    """The container, or one that unpacks its messages where each is a zstd frame: a storage file of rosbag2's
-    compression mode MESSAGE, given without the metadata that say so. No CDR begins as a frame of zstd does."""
+    """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: a storage
+    file of rosbag2's compression mode MESSAGE without its metadata."""
     channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
-    firsts = islice(container.messages(channels), _TRIED) if channels else ()
+    firsts = islice(messages_in(container, channels), _TRIED) if channels else ()
     packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)
     return ZstdMessages(container, notes) if packed else container
 
@@ -166,12 +140,11 @@ def read_metadata(folder: Path) -> Metadata:
     listed = tree.get("relative_file_paths")
     names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
     # Names only: the first writers put the folder before them, and a stranger's list must not lead elsewhere.
-    files = [folder / name.replace("\\", "/").rpartition("/")[2] for name in names]
-    missing = [file.name for file in files if not file.is_file()]
-    files = [file for file in files if file.is_file()]
+    named = [folder / name.replace("\\", "/").rpartition("/")[2] for name in names]
+    files, missing = [file for file in named if file.is_file()], [file.name for file in named if not file.is_file()]
     if not files:
-        named = ", ".join(missing[:3]) or "no storage file"
-        raise MetadataError(f"{folder / 'metadata.yaml'} names {named}, and no such file is in the folder.")
+        lacks = ", ".join(missing[:3]) or "no storage file"
+        raise MetadataError(f"{folder / 'metadata.yaml'} names {lacks}, and no such file is in the folder.")
     mode = str(tree.get("compression_mode") or "").lower()
     start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
     end_ns = start_ns + length_ns if start_ns and length_ns else 0
@@ -180,15 +153,13 @@ def read_metadata(folder: Path) -> Metadata:
 
 def _recorded(tree: dict) -> dict[str, int]:
     """Messages by topic; empty where the list is not one."""
-    result: dict[str, int] = {}
+    result: Counter[str] = Counter()
     topics = tree.get("topics_with_message_count")
     for topic in topics if isinstance(topics, list) else []:
-        about = topic.get("topic_metadata") if isinstance(topic, dict) else None
-        name = about.get("name") if isinstance(about, dict) else None
-        count = topic.get("message_count") if isinstance(topic, dict) else None
-        if isinstance(name, str) and isinstance(count, int) and 0 <= count < _MOST_MESSAGES:
-            result[name] = result.get(name, 0) + count
-    return result
+        match topic:
+            case {"topic_metadata": {"name": str(name)}, "message_count": int(count)} if 0 <= count < _MOST_MESSAGES:
+                result[name] += count
+    return dict(result)
 
 
 def _nanoseconds(tree: Any) -> int:

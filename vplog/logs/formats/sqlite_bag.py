@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks, ordered
-from vplog.logs.formats.resync import Search
+from vplog.logs.formats.layout import Search
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -59,9 +59,8 @@ class SqliteBag:
             notes.account.add_appended(self._name, appended_at, path.stat().st_size)
 
     def contents(self) -> Contents:
-        counts = dict.fromkeys(self._topics.values(), 0)
+        by_id = Counter(dict.fromkeys(self._topics, 0))
         times: list[int] = []
-        unknown = 0
         query = "SELECT topic_id, count(*), min(timestamp), max(timestamp), max(rowid) FROM messages GROUP BY topic_id"
         try:
             found = self._db.execute(query).fetchall()
@@ -72,20 +71,19 @@ class SqliteBag:
         except _DAMAGE:
             rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
         for topic, count, first, last in rows:
-            if topic not in self._topics:
-                unknown += count
-                continue
-            counts[self._topics[topic]] += count
-            times = [min(*times, _integer(first)), max(*times, _integer(last))] if times else [first, last]
-            times = [_integer(time_ns) for time_ns in times]
+            by_id[topic] += count
+            if topic in self._topics:
+                times = [min(*times, _integer(first), 2**63), max(*times, _integer(last), -(2**63))]
         start_ns, end_ns = times or (0, 0)
         account, name = self._notes.account, self._name
-        missing = 0 if self._damaged else self._missing_by_index(sum(counts.values()) + unknown)
-        if missing:
+        if missing := 0 if self._damaged else self._missing_by_index(by_id.total()):
             self._damaged = True
             detail = f"{name} is damaged: an index of its messages lists more of them."
             account.add("damaged_bytes", {"": missing}, (name, 0), [], detail)
-        if unknown:
+        counts: Counter[Channel] = Counter()
+        for topic, channel in self._topics.items():
+            counts[channel] += by_id.pop(topic)
+        if unknown := by_id.total():
             account.add("unknown_channel", {"": unknown}, (name, 0), [])
         account.know(name, {} if self._damaged else by_topic(counts), start_ns)
         return Contents(ordered(counts), start_ns, end_ns)
@@ -104,7 +102,10 @@ class SqliteBag:
                 continue  # the index is what is damaged
         return 0
 
-    def messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+        return in_blocks(self._messages(channels))
+
+    def _messages(self, channels: Collection[Channel]) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
         for row, topic, time_ns, data in self._salvaged("rowid, topic_id, timestamp, data", ids):
             if isinstance(data, bytes) and isinstance(time_ns, int):
@@ -112,23 +113,14 @@ class SqliteBag:
             else:
                 self._add_damaged_row(row, f"{self._name} is damaged: row {row} holds no message.")
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self.messages(channels))
-
     def read(self, place: Place) -> bytes:
-        try:
-            query = "SELECT data FROM messages WHERE rowid = ? AND timestamp = ?"
-            found = self._db.execute(query, list(place)).fetchone()
-        except _DAMAGE:
-            return b""
+        found = self._row(place[0], "data", " AND timestamp = ?", place[1])
         return found[0] if found and isinstance(found[0], bytes) else b""
 
     def _salvaged(self, columns: str, topics: list[int] | None = None) -> Iterator[tuple]:
-        """Rows of the table of messages in its order: row id, topic, time, and more columns; over damage, row by row.
-
-        Recorders number the rows without a gap, so that a number that is not there is a message that is lost. A row
-        before one of a lower number is taken to have a wrong one, and looked for again by the numbers between.
-        """
+        """Rows of the table of messages: row id, topic, time, and more columns; over damage, row by row. Recorders
+        number them without a gap: a missing number is a lost message, and a row before one of a lower number has a
+        wrong one."""
         last, last_ns, tried = 0, 0, 0
         while True:
             waiting = None
@@ -210,9 +202,11 @@ class SqliteBag:
             return []
         return ['"' + name.replace('"', '""') + '"' for _, name, *_ in found]
 
-    def _row(self, row: int, columns: str) -> tuple | None:
+    def _row(self, row: int, columns: str, also: str = "", *values: int) -> tuple | None:
+        """Columns of a row, None where it is not there or damaged; `also` are further conditions on it."""
+        query = f"SELECT {columns} FROM messages WHERE rowid = ?{also}"  # noqa: S608 - names of ours
         try:
-            return self._db.execute(f"SELECT {columns} FROM messages WHERE rowid = ?", [row]).fetchone()  # noqa: S608
+            return self._db.execute(query, [row, *values]).fetchone()
         except _DAMAGE:
             return None
 
@@ -245,17 +239,16 @@ class SqliteBag:
                 f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages."
             )
         # All columns, as SQLite holds the lengths of a row's against its own only where it reads the last.
-        rows = (row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics"))
+        rows = [row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics")]
         # damage may have put anything, or nothing, in any column
-        rows = sorted(row for row in rows if [type(value) for value in row] == [int, str, str, str])
+        rows = [row for row in rows if [type(value) for value in row] == [int, str, str, str]]
         times = Counter(row[0] for row in rows)  # of two topics of one number, none can be distinguished
-        rows = [row for row in rows if times[row[0]] == 1]
-        return {number: Channel(name, kind, encoding) for number, name, kind, encoding in rows}
+        return {number: Channel(*about) for number, *about in sorted(rows) if times[number] == 1}
 
-    def _rows(self, query: str, values: list[int] | None = None) -> Iterator[tuple]:
+    def _rows(self, query: str) -> Iterator[tuple]:
         """Rows as far as the file is sound; a note where it is not."""
         try:
-            yield from self._db.execute(query, values or [])
+            yield from self._db.execute(query)
         except _DAMAGE as error:
             self._damaged = True
             self._notes.add(f"{self._name}: the list of topics is damaged, read as far as it goes: {error}.")

@@ -6,20 +6,12 @@ The file's descriptors are not built: these types are fixed by their names, and 
 from __future__ import annotations
 
 import base64
-import binascii
 import json
+from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
-from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from vplog.logs.messages.flatbuffers import fill_flat
 from vplog.logs.messages.records import (
@@ -40,6 +32,8 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Octets
     from vplog.logs.messages.records import Record
 
+_UNKNOWN_COVARIANCE = 0
+"""LocationFix.PositionCovarianceType.UNKNOWN."""
 _LENGTH = 2
 """Wire type of protobuf's fields that are bytes behind their length (protobuf.dev/programming-guides/encoding)."""
 _FIXED = {1: 8, 5: 4}
@@ -47,33 +41,32 @@ _FIXED = {1: 8, 5: 4}
 
 
 def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
-    """A record of type `foxglove.RawImage` and so on; in protobuf, the bytes of images are a view of `data`.
-
-    Raises BadMessageError or what the parsers raise.
-    """
-    make, read = _READERS[kind]
-    message: Any = make()
+    """A record of type `foxglove.RawImage` and so on; in protobuf, the bytes of images are a view of `data`. Raises
+    BadMessageError or what the parsers raise."""
+    message, read = _message_class(kind)(), _READERS[kind]
     if encoding == "json":
         _fill(message, json.loads(bytes(data)))
     elif encoding == "flatbuffer":
         fill_flat(message, bytes(data))
-    elif read in (_raw, _compressed) and (
-        found := _find_data(message, data)
-    ):  # all but a few bytes are pixels, which the parser would copy twice
-        at, start, stop = found
-        message.ParseFromString(bytes(data[:at]) + bytes(data[stop:]))
-        if not message.data:
+    else:
+        at, start, stop = (read in (_raw, _compressed) and _find_data(message, data)) or (len(data), 0, len(data))
+        message.ParseFromString(bytes(data[:at]) + bytes(data[stop:]))  # pixels the parser would copy twice
+        if start and not message.data:
             image: Any = read(message)
             return image._replace(data=memoryview(data)[start:stop])
-        message.ParseFromString(bytes(data))  # of a field that comes twice, the last one counts
-    else:
-        message.ParseFromString(bytes(data))
+        if start:  # of a field that comes twice, the last one counts
+            message.ParseFromString(bytes(data))
     return read(message)
 
 
+@cache
+def _message_class(kind: str) -> Any:
+    name = kind.removeprefix("foxglove.")
+    return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+
+
 def _find_data(message: Proto, data: Octets) -> tuple[int, int, int] | None:
-    """Where the field `data` of an image lies in protobuf: its tag, its first byte and its end. None where it is left
-    out, or bytes before it are odd."""
+    """Where the field `data` of an image lies in protobuf: its tag, first byte and end. None where it is left out."""
     tag, at = message.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH, 0
     try:
         while data[at] != tag:
@@ -85,7 +78,7 @@ def _find_data(message: Proto, data: Octets) -> tuple[int, int, int] | None:
 
 
 def _skipped(data: Octets, at: int, tag: int) -> int:
-    """Where the value of a field ends that begins at `at`. Raises IndexError where that cannot be told."""
+    """Where the value of a field ends that begins at `at`. Raises IndexError where the tag is of another message."""
     if tag >= 0x80:  # a field number above 15, which none of these types has
         raise IndexError
     if tag & 7 == _LENGTH:
@@ -138,7 +131,7 @@ def _fill(message: Proto, tree: Any) -> None:
 def _bytes(value: Any) -> bytes:
     try:
         return base64.b64decode(value, validate=True)
-    except (binascii.Error, TypeError, ValueError):
+    except (TypeError, ValueError):
         raise BadMessageError("its data are not base64") from None
 
 
@@ -179,17 +172,9 @@ def _placed(m: Any, frame: str, child: str, p: Any, q: Any, covariance: list[flo
 
 
 def _fix(m: Any) -> Record:
-    known = m.position_covariance_type != LocationFix.PositionCovarianceType.UNKNOWN
+    known = m.position_covariance_type != _UNKNOWN_COVARIANCE
     covariance = _matrix(m.position_covariance, (3, 3)) if known else np.full((3, 3), np.nan)
     return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance, m.frame_id)
-
-
-def _one_transform(m: Any) -> Record:
-    return [_transform(m)]
-
-
-def _transforms(m: Any) -> Record:
-    return [_transform(t) for t in m.transforms]
 
 
 def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
@@ -197,14 +182,14 @@ def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
     return np.array(values, np.float64).reshape(shape) if len(values) else np.zeros(shape)
 
 
-_READERS: dict[str, tuple[type[Proto], Callable[[Any], Record]]] = {
-    "foxglove.RawImage": (RawImage, _raw),
-    "foxglove.CompressedImage": (CompressedImage, _compressed),
-    "foxglove.CompressedVideo": (CompressedVideo, _compressed),
-    "foxglove.CameraCalibration": (CameraCalibration, _calibration),
-    "foxglove.PoseInFrame": (PoseInFrame, _pose),
-    "foxglove.Odometry": (Odometry, _odometry),
-    "foxglove.LocationFix": (LocationFix, _fix),
-    "foxglove.FrameTransform": (FrameTransform, _one_transform),
-    "foxglove.FrameTransforms": (FrameTransforms, _transforms),
+_READERS: dict[str, Callable[[Any], Record]] = {
+    "foxglove.RawImage": _raw,
+    "foxglove.CompressedImage": _compressed,
+    "foxglove.CompressedVideo": _compressed,
+    "foxglove.CameraCalibration": _calibration,
+    "foxglove.PoseInFrame": _pose,
+    "foxglove.Odometry": _odometry,
+    "foxglove.LocationFix": _fix,
+    "foxglove.FrameTransform": lambda m: [_transform(m)],
+    "foxglove.FrameTransforms": lambda m: [_transform(t) for t in m.transforms],
 }

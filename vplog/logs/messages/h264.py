@@ -48,8 +48,7 @@ class FrameNumbers:
     def _slice(self, bits: _Bits, idr: bool, reference: bool) -> bool:
         if not self._bits:
             return True
-        for _ in range(3):  # first_mb_in_slice, slice_type, pic_parameter_set_id
-            bits.exp_golomb()
+        bits.exp_golomb(3)  # first_mb_in_slice, slice_type, pic_parameter_set_id
         if self._separate:
             bits.read(2)
         number = bits.read(self._bits)
@@ -68,23 +67,20 @@ class FrameNumbers:
         if profile in _HIGH_PROFILES:
             chroma = bits.exp_golomb()
             self._separate = chroma == 3 and bool(bits.read(1))
-            bits.exp_golomb()  # bit depths of luma and chroma
-            bits.exp_golomb()
+            bits.exp_golomb(2)  # bit depths of luma and chroma
             bits.read(1)  # lossless transform
             if bits.read(1):
                 for i in range(8 if chroma != 3 else 12):
                     if bits.read(1):
                         _skip_scaling_list(bits, 16 if i < 6 else 64)
         size = bits.exp_golomb() + 4
-        order = bits.exp_golomb()
+        order = bits.exp_golomb()  # pic_order_cnt_type
         if order == 0:
             bits.exp_golomb()
         elif order == 1:
             bits.read(1)
-            bits.exp_golomb()
-            bits.exp_golomb()
-            for _ in range(bits.exp_golomb()):
-                bits.exp_golomb()
+            bits.exp_golomb(2)
+            bits.exp_golomb(bits.exp_golomb())
         bits.exp_golomb()  # max_num_ref_frames
         self._bits = size if size <= 16 and not bits.read(1) else 0
 
@@ -103,12 +99,15 @@ class _Bits:
             self._at += 1
         return value
 
-    def exp_golomb(self) -> int:
-        """ue(v), 9.1; of se(v) it is the code number."""
-        zeros = 0
-        while not self.read(1):
-            zeros += 1
-        return (1 << zeros) - 1 + self.read(zeros)
+    def exp_golomb(self, count: int = 1) -> int:
+        """The last of so many ue(v), 9.1; of se(v) it is the code number."""
+        value = 0
+        for _ in range(count):
+            zeros = 0
+            while not self.read(1):
+                zeros += 1
+            value = (1 << zeros) - 1 + self.read(zeros)
+        return value
 
 
 def _skip_scaling_list(bits: _Bits, size: int) -> None:

@@ -29,8 +29,8 @@ _SAMPLED = 16
 """Images that tell the levels of a drive: day and night, sun and tunnel are among them."""
 _LEAST_UNKNOWN = 0.001
 """Share of px without measurement that depth images have at least; a camera has a few dead ones in a million."""
-_INVALID_MM = (0, 65535)
-"""Depth values in mm that mean no measurement: 0 in ROS REP 118 and cameras' firmware, 65535 in 7-Scenes."""
+_INVALID_MM = 65535
+"""Depth in mm that means no measurement in 7-Scenes; 0 does in ROS REP 118 and cameras' firmware."""
 _LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "mono8": ("u1", 1, None),
     "8UC1": ("u1", 1, None),
@@ -88,8 +88,8 @@ def is_image(message: ImageMessage) -> bool:
 
 
 def may_be_thermal(message: ImageMessage) -> bool:
-    """Whether it has 16 bits that may be depth in mm or a thermal camera's counts: depth has px without measurement
-    (ROS REP 118), where nothing reflects, in shadow of the emitter and at edges; every px of a camera counts."""
+    """Whether it has 16 bits that may be a thermal camera's counts: depth has px without measurement (ROS REP 118),
+    where nothing reflects and at edges; every px of a camera counts."""
     if not message.encoding.startswith(_SIXTEEN_BITS) or "compresseddepth" in message.encoding.lower():
         return False
     try:
@@ -177,10 +177,8 @@ def _pixels(message: ImageMessage) -> tuple[Any, int | None]:
 
 
 def depth_m(message: ImageMessage) -> Float32s:
-    """(H, W) float32 m, NaN where unknown: 16UC1 and 16SC1 hold mm, 32FC1 and 64FC1 m (ROS REP 118).
-
-    Raises BadMessageError.
-    """
+    """(H, W) float32 m, NaN where unknown: 16UC1 and 16SC1 hold mm, 32FC1 and 64FC1 m (ROS REP 118). Raises
+    BadMessageError."""
     if not message.compressed:
         pixels, _ = _raw(message)
         return _metres(pixels, message.encoding)
@@ -198,22 +196,18 @@ def depth_m(message: ImageMessage) -> Float32s:
     _, a, b = struct.unpack_from("<iff", message.data)
     if pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise BadMessageError("its PNG is not a 16-bit image")
-    raw = pixels.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        depth = np.float32(a) / (raw - np.float32(b))
+        depth = np.float32(a) / (pixels.astype(np.float32) - np.float32(b))
     return np.where((pixels != 0) & np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan)).astype(np.float32)
 
 
 def _metres(pixels: Any, encoding: str) -> Float32s:
     if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.int16, np.float32, np.float64):
         raise BadMessageError(f"{encoding[:40]!r} with {pixels.ndim} dimensions of {pixels.dtype} is not a depth image")
-    if pixels.dtype == np.uint16:
-        unknown = np.logical_or.reduce([pixels == value for value in _INVALID_MM])  # np.isin takes ten times as long
-        return np.where(unknown, np.float32(np.nan), pixels * np.float32(0.001)).astype(np.float32)
-    if pixels.dtype == np.int16:
-        return np.where(pixels > 0, pixels * np.float32(0.001), np.float32(np.nan)).astype(np.float32)
-    known = np.isfinite(pixels) & (pixels > 0)
-    return np.where(known, pixels, np.nan).astype(np.float32)
+    if pixels.dtype in (np.uint16, np.int16):
+        known = (pixels > 0) & (pixels != _INVALID_MM) if pixels.dtype == np.uint16 else pixels > 0
+        return np.where(known, pixels * np.float32(0.001), np.float32(np.nan)).astype(np.float32)
+    return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.nan).astype(np.float32)
 
 
 def _raw(message: ImageMessage) -> tuple[Any, int | None]:

@@ -35,10 +35,8 @@ _ENCAPSULATION = 4
 
 
 def decode_ros(kind: str, encoding: str, data: Octets) -> Record:
-    """A record of type `sensor_msgs/Image` and so on; the bytes of images are a view of `data`.
-
-    Raises BadMessageError, struct.error, ValueError (UnicodeDecodeError) or LookupError on damaged bytes.
-    """
+    """A record of type `sensor_msgs/Image` and so on; the bytes of images are a view of `data`. Raises BadMessageError,
+    struct.error, ValueError (UnicodeDecodeError) or LookupError on damaged bytes."""
     fields = _Fields(data, encoding == "cdr")
     record = _READERS[kind](fields)
     fields.check_end()

@@ -1,14 +1,14 @@
 """Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
 
-foxglove.CompressedVideo, ffmpeg_image_transport's packets, and sensor_msgs/CompressedImage with such a format. Decoding
-runs forward only: for frames in order of time, every packet between two key frames is decoded at most once, and
-stretches between key frames without a frame of interest not at all. Behind a damaged or missing packet nothing is
-decoded up to the next key frame, since the pictures would be wrong; VP9 and AV1 do not tell a missing one.
+Decoding runs forward only: for frames in order of time every packet is decoded at most once, and stretches between key
+frames without a frame of interest not at all. Behind a damaged or missing packet, which VP9 and AV1 do not show,
+nothing is decoded up to the next key frame.
 """
 
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -32,6 +32,7 @@ _CODECS = {
     "av1": ("av1", "AV1"),
 }
 """What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
+_NAMES = dict(_CODECS.values())
 _DECODERS = {"av1": "libdav1d"}
 """FFmpeg's decoder where that of the codec's own name needs hardware: its `av1` is for graphics cards alone."""
 MAX_PIXELS = 2**25
@@ -73,18 +74,15 @@ class VideoStream:
         return next((row for row in range(self._count) if self._kind(row) >= _KEY), None)
 
     def frame(self, row: int) -> Bytes:
-        """(H, W) uint8 grey; rows are best read in increasing order.
-
-        Raises BadMessageError where it cannot be decoded, and LogError where PyAV is not installed.
-        """
+        """(H, W) uint8 grey; rows are best read in increasing order. Raises BadMessageError where it cannot be decoded,
+        and LogError where PyAV is not installed."""
         if row not in self._ready:
             self._advance(row)
         self._last = row
-        found = self._ready.get(row)
         self._ready = {later: image for later, image in self._ready.items() if later >= row}
-        if found is None:
+        if row not in self._ready:
             raise BadMessageError("its video packet decodes to no frame")
-        return found
+        return self._ready[row]
 
     def _advance(self, row: int) -> None:
         """Give the decoder packets until the frame of this row comes out."""
@@ -106,10 +104,10 @@ class VideoStream:
 
     def _run(self, row: int) -> None:
         while row not in self._ready and self._next < min(self._count, row + _DELAY):
-            self._feed(self._packet(self._next), self._next, row)
+            self._feed(self._next, row)
             self._next += 1
         if row not in self._ready and self._next == self._count:
-            self._keep(None, row, row)  # what the decoder held back
+            self._decode(None, row, row)  # what the decoder held back
             self._decoder = None
 
     def _restart(self, key: int) -> None:
@@ -119,7 +117,7 @@ class VideoStream:
             self._decoder = self._av.CodecContext.create(name, "r")
         except ValueError:  # PyAV's UnknownCodecError
             raise LogError(
-                f"{self._topic} is {_name(self._codec)} video, and the FFmpeg of this PyAV lacks its decoder, {name}. "
+                f"{self._topic} is {_NAMES[self._codec]} video, and the FFmpeg of this PyAV lacks its decoder, {name}. "
                 "Install PyAV's own wheel (pip install --force-reinstall av), or choose another topic with "
                 "--image-topic."
             ) from None
@@ -131,18 +129,19 @@ class VideoStream:
         if self._kind(key) == _KEY:  # its parameter sets came in a packet of their own
             before = (r for r in range(key - 1, -1, -1) if self._kind(r) in (_PARAMETERS, _WHOLE_KEY))
             if (row := next(before, None)) is not None:
-                self._feed(self._packet(row), row, key)
+                self._feed(row, key)
 
-    def _feed(self, data: bytes, number: int, row: int) -> None:
+    def _feed(self, number: int, row: int) -> None:
+        data = self._packet(number)
         follows = self._numbers is None or self._numbers.follows(data)
         if not data or not follows:  # FFmpeg takes an empty packet for the end
             return self._fail(number, row)
         packet = self._av.Packet(data)
         packet.pts = packet.dts = number
-        return self._keep(packet, number, row)
+        return self._decode(packet, number, row)
 
-    def _keep(self, packet: Any, number: int, row: int) -> None:
-        """Decode one packet, None at the end, and keep what comes out from this row on."""
+    def _decode(self, packet: Any, number: int, row: int) -> None:
+        """Decode one packet, None at the end; what comes out from this row on is ready."""
         try:
             for frame in self._decoder.decode(packet):
                 if frame.is_corrupt:
@@ -156,12 +155,10 @@ class VideoStream:
     def _fail(self, number: int, row: int) -> None:
         """Give the decoder up at this packet, with what it held back of those before."""
         decoder, self._decoder, self._damaged = self._decoder, None, number
-        try:
+        with suppress(self._av.error.FFmpegError):  # it held nothing
             for frame in decoder.decode(None) if decoder is not None else ():
                 if frame.pts is not None and row <= frame.pts < number and not frame.is_corrupt:
                     self._ready[frame.pts] = _grey(frame)
-        except self._av.error.FFmpegError:
-            pass  # it held nothing
         if row not in self._ready:
             raise BadMessageError(_BROKEN)
 
@@ -231,17 +228,13 @@ def _grey(frame: Any) -> Bytes:
     return rows.copy() if full else _STRETCH[rows]
 
 
-def _name(codec: str) -> str:
-    return next(name for known, name in _CODECS.values() if known == codec)
-
-
 def _av(codec: str, topic: str) -> Any:
     """PyAV, an extra. Raises LogError where it is not installed."""
     try:
         import av
     except ImportError:
         raise LogError(
-            f"{topic} is {_name(codec)} video, and PyAV, which decodes it, is not installed. Install vplog[video] "
+            f"{topic} is {_NAMES[codec]} video, and PyAV, which decodes it, is not installed. Install vplog[video] "
             "(pip install 'vplog[video]'), or choose another topic with --image-topic."
         ) from None
     return av

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from mcap.opcode import Opcode
 
-from vplog.logs.formats.container import Block
+from vplog.logs.formats.container import block_of
 from vplog.logs.formats.mcap_layout import RECORD
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from vplog.logs.formats.container import Channel, Place
+    from vplog.logs.formats.container import Block, Channel, Row
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
@@ -50,13 +50,9 @@ class ChunkReader:
         """Log time of the last message, on whatever channel."""
         self.number, self.end, self._channels, self._define = number, end, channels, define
         self._wanted, self._brief, self._cut = wanted, brief, cut
-        self._used = self._wanted_ids()
+        self._used = {i: channel for i, channel in channels.items() if wanted is None or channel in wanted}
         self._ids: list[int] = []
-        self._found: list[Channel] = []
-        self._log_ns: list[int] = []
-        self._starts: list[int] = []
-        self._stops: list[int] = []
-        self._places: list[Place] = []
+        self._rows: list[Row] = []
 
     @property
     def counts(self) -> Counter[int]:
@@ -66,8 +62,7 @@ class ChunkReader:
     def whole(self, data: bytes) -> Block:
         """The messages of the chunk, of which `data` are all bytes."""
         self._go(data, 0)
-        self._drop_doubtful()
-        return Block(data, self._found, self._log_ns, self._starts, self._stops, self._places)
+        return self._block(data)
 
     def in_place(self, read: Callable[[int, int], bytes]) -> Block:
         """The messages of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
@@ -87,16 +82,13 @@ class ChunkReader:
                     break
             parts.append(data)
             size += len(data)
-        self._drop_doubtful()
-        return Block(b"".join(parts), self._found, self._log_ns, self._starts, self._stops, self._places)
+        return self._block(b"".join(parts))
 
-    def _drop_doubtful(self) -> None:
-        """Leave out the message before damage: its length may be what is damaged."""
-        if self.position == self.end or self._cut or not self._ids:
-            return
-        if self._ids.pop() in self._used:
-            for column in (self._found, self._log_ns, self._starts, self._stops, self._places):
-                column.pop()
+    def _block(self, data: bytes) -> Block:
+        """What was found, without the message before damage: its length may be what is damaged."""
+        if self.position < self.end and not self._cut and self._ids and self._ids.pop() in self._used:
+            self._rows.pop()
+        return block_of(data, self._rows)
 
     def _go(self, data: bytes, shift: int) -> None:
         """On through `data`, which lie at `position` in the chunk and at `shift` in the block, up to the first record
@@ -116,11 +108,8 @@ class ChunkReader:
                 self._ids.append(channel_id)
                 self.last_ns = log_ns
                 if channel_id in used:
-                    self._found.append(used[channel_id])
-                    self._log_ns.append(log_ns)
-                    self._starts.append(shift + start)
-                    self._stops.append(shift + stop)
-                    self._places.append((self.number, base + start, base + stop))
+                    place = self.number, base + start, base + stop
+                    self._rows.append((used[channel_id], log_ns, shift + start, shift + stop, place))
                 elif channel_id not in self._channels:
                     self.unknown += 1
             elif opcode in _DEFINES:
@@ -146,10 +135,6 @@ class ChunkReader:
                 self._used[number] = channel
             else:
                 self._used.pop(number, None)
-
-    def _wanted_ids(self) -> dict[int, Channel]:
-        wanted = self._wanted
-        return {i: channel for i, channel in self._channels.items() if wanted is None or channel in wanted}
 
     def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
         """Whether more of a message is needed than the bytes that are there."""

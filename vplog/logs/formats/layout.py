@@ -1,0 +1,183 @@
+"""Chunks and damage of a recording, a bounded search behind damage for the next record, and what is lost by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from vplog.logs.formats.container import plural, topics_of
+
+if TYPE_CHECKING:
+    import re
+    from collections.abc import Callable, Mapping
+    from typing import BinaryIO
+
+    from vplog.logs.formats.container import Channel, Notes
+    from vplog.logs.formats.loss_account import Span
+
+MOST_GAPS = 1000
+"""Damaged places in one file behind which reading goes on; a file with more is read up to there."""
+_BLOCK = 2**20
+"""Bytes that are searched at once."""
+_WINDOW = 4096
+"""Bytes that are read at once: the head of a record, and those of the small ones behind it."""
+_MOST_TRIED = 500_000
+"""Places that are looked at in one file, about a second's work; a stranger's file may be made of false ones."""
+
+
+@dataclass(slots=True)
+class Chunk:
+    """A chunk of messages; or, with compression None, message records of MCAP outside any chunk."""
+
+    start: int
+    """Offset of its data in the file."""
+    stop: int
+    compression: str | None = ""
+    size: int = 0
+    """Bytes that it unpacks to."""
+    crc: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    cut: bool = False
+    record: int = -1
+    """Offset of its record."""
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages per channel id, from the indexes behind it; empty where the writer left none."""
+    listed: dict[int, int] = field(default_factory=dict)
+    """Messages per channel id by the index of a ROS 1 bag."""
+    doubtful: bool = False
+    """Damage lies between its indexes, so that they may not be all."""
+    damaged: bool = False
+    """Not all of it could be unpacked and read."""
+
+
+@dataclass
+class Layout:
+    """Chunks and damage of a file."""
+
+    chunks: list[Chunk] = field(default_factory=list)
+    missing: list[Chunk] = field(default_factory=list)
+    """Chunks that lie in damaged bytes, as the index at the end or their own indexes tell of them."""
+    recorded: dict[int, int] = field(default_factory=dict)
+    """Messages per channel id by the file's statistics or its whole index; else empty."""
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+    """Where damage may begin, and where reading goes on."""
+    cut_at: int | None = None
+    """Byte behind which nothing can be read, where messages may have been."""
+    appended_at: int | None = None
+    """Byte behind the end of the recording where another one follows."""
+    index_cut_at: int | None = None
+    """Byte behind which nothing can be read, where the messages had ended."""
+    unknown_at: int | None = None
+    """The first record of an unknown kind that would be a message if that byte were damaged."""
+    spare: list[tuple[int, bytes]] = field(default_factory=list)
+    """Opcode and data of schemas and channels of a damaged summary, for those that no other place defines."""
+
+    def in_order(self) -> None:
+        """Sort the chunks, and take back the counts of doubtful ones."""
+        self.chunks.sort(key=lambda chunk: chunk.start)
+        for chunk in self.chunks:
+            chunk.counts = {} if chunk.doubtful else chunk.counts
+
+
+class Search:
+    """One file: its bytes, and a search for patterns whose cost is bounded over the life of the object."""
+
+    def __init__(self, file: BinaryIO, length: int) -> None:
+        self._file, self._length, self._left = file, length, _MOST_TRIED
+        self._window, self._start = b"", 0
+
+    def at(self, position: int, length: int) -> bytes:
+        """Bytes from `position` on, fewer at the end of the file; offsets that it names itself may lie outside it."""
+        if not 0 <= position < self._length:
+            return b""
+        begin = position - self._start
+        if begin >= 0 and begin + length <= len(self._window):
+            return self._window[begin : begin + length]
+        self._file.seek(position)
+        if length > _WINDOW:
+            return self._file.read(length)
+        self._window, self._start = self._file.read(_WINDOW), position
+        return self._window[:length]
+
+    def first(
+        self,
+        pattern: re.Pattern[bytes],
+        start: int,
+        accept: Callable[[int], bool] = lambda _: True,
+        stop: int | None = None,
+    ) -> int | None:
+        """The first offset from `start` on, below `stop`, where the pattern, of at most 64 bytes, matches and
+        `accept(offset)` holds."""
+        position, stop = start, self._length if stop is None else stop
+        while position < stop and self._left > 0:
+            self._file.seek(position)
+            block = self._file.read(_BLOCK + 64)
+            for match in pattern.finditer(block):
+                if match.start() >= min(_BLOCK, stop - position):
+                    break
+                self._left -= 1
+                if self._left <= 0:
+                    return None
+                if accept(position + match.start()):
+                    return position + match.start()
+            position += _BLOCK
+        return None
+
+
+@dataclass
+class ChunkLosses:
+    """Adds the losses of one file to the account of its log."""
+
+    name: str
+    length: int
+    layout: Layout
+    channels: dict[int, Channel]
+    notes: Notes
+
+    def may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
+        """Not where the indexes of a chunk name only channels that are known and not wanted."""
+        known = self.channels
+        return not chunk.counts or any(known.get(i) in wanted or i not in known for i in chunk.counts)
+
+    def add_chunk(self, chunk: Chunk, counts: Mapping[int, int], spans: list[Span], what: str) -> None:
+        """Messages by channel id that are lost of a damaged chunk; `what` ends the sentence about it."""
+        lost = topics_of(counts, self.channels) if chunk.counts else None
+        detail = f"{self.name} has a damaged chunk at byte {chunk.start}{what}."
+        self.notes.account.add("damaged_chunk", lost, (self.name, chunk.start), spans, detail)
+
+    def add_unknown(self, chunk: Chunk, count: int, spans: list[Span]) -> None:
+        """Messages of channels that nothing defines."""
+        if count:
+            self.notes.account.add("unknown_channel", {"": count}, (self.name, chunk.start), spans)
+
+    def add_missing(self, found: Mapping[str, int], span: Span, detail: str) -> dict[str, int]:
+        """The chunks in damaged bytes, of a file whose messages cover `span`. Messages by topic, found or lost."""
+        total = dict(found)
+        for chunk in self.layout.missing:
+            counts = topics_of(chunk.counts, self.channels)
+            when = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else self.between(chunk.start, span)
+            about = detail and f"{self.name} {detail} {chunk.start}."
+            self.notes.account.add("damaged_bytes", counts or None, (self.name, chunk.start), [when], about)
+            for topic, count in counts.items():
+                total[topic] = total.get(topic, 0) + count
+        return total
+
+    def between(self, position: int, span: Span) -> Span:
+        """The time between the chunk before a damaged place and the one behind it; `span` is that of the file."""
+        chunks = [chunk for chunk in self.layout.chunks if chunk.last_ns]
+        before = max((chunk.last_ns for chunk in chunks if chunk.stop <= position), default=span[0])
+        behind = min((chunk.first_ns for chunk in chunks if chunk.start > position), default=span[1])
+        return before, behind
+
+    def add_end(self, messages: int, spans: list[Span]) -> None:
+        """Where the file is cut, or goes on with another recording, behind so many messages."""
+        layout, account, name = self.layout, self.notes.account, self.name
+        if layout.cut_at is not None:
+            before = f"the {plural(messages, 'message')} before it are read"
+            detail = f"{name} is cut or damaged at byte {layout.cut_at} of {self.length}; {before}."
+            account.add("cut", None, (name, layout.cut_at), spans, detail)
+        if layout.appended_at is not None:
+            account.add_appended(name, layout.appended_at, self.length)
+        if layout.index_cut_at is not None:
+            self.notes.add(f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message.")
