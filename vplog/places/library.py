@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.relearn import keep_references
+from vplog.places.library_files import keep_references
 from vplog.settings import Settings
 
 if TYPE_CHECKING:

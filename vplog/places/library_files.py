@@ -1,4 +1,4 @@
-"""A reference library on disk, for every recogniser: images, features and settings."""
+"""A reference library on disk, for every recogniser: images, features and settings. Loading it learns again."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -16,16 +17,15 @@ import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
+from vplog.settings import Settings
 from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
-
-    from vplog.settings import Settings
 
 _FORMAT = 1
 """Version of library.json. A reader refuses a newer one."""
@@ -33,9 +33,51 @@ _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
 
-def strongest(reference: Reference, count: int) -> Reference:
-    """The reference with at most its `count` strongest features."""
-    return replace(reference, features=reference.features.rows(slice(count)))
+class RelearnedSettings(Settings):
+    """Settings of a recogniser that is saved as its references."""
+
+    def load(self, folder: Path, execution: Execution) -> Any:
+        """A library saved by its state. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(type(self), folder, execution)
+
+
+class ReferencesState:
+    """A state that follows from settings and references: its hash, and how it is saved."""
+
+    settings: Any
+    references: list[Reference]
+
+    @property
+    def hash(self) -> str:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> str:
+        return references_hash(self.references, self.settings)
+
+    def save(self, folder: Path) -> None:
+        save_references(self.references, self.settings, folder)
+
+
+def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:
+    """The references with their `features` strongest features, None for all. Raises LibraryError for none."""
+    found = [replace(one, features=one.features.rows(slice(features))) for one in references]
+    if not found:
+        raise LibraryError("A library needs at least one reference image; none was given.")
+    return found
+
+
+def relearn(settings: Any, folder: Path, execution: Execution, learn: Callable[..., Any] | None = None) -> Any:
+    """State of a folder written by `save_references`, whose own settings count; `settings` is their class, and `learn`
+    its method that makes the state. Raises LibraryError where the folder is damaged or gives another hash."""
+    record = read_library_record(folder)
+    own = settings.read(record["settings"], f"{folder}/library.json")
+    state = (learn or settings.learn)(own, load_references(folder, execution), execution)
+    if state.hash != record["hash"]:
+        raise LibraryError(
+            f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
+        )
+    return state
 
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:

@@ -106,7 +106,7 @@ def _search_segment(
     segment: Segment, numbers: Int32s, shard: Shard, best: Answers, pool: ThreadPoolExecutor
 ) -> list[Answers]:
     """The best of a segment for each view: by view where they are many, else by view and stretch of blocks."""
-    index = CodeIndex.of(segment.lists, shard.overlap, shard.pairing)
+    index = CodeIndex(segment.lists, shard.overlap, shard.pairing)
     runs = segment.first[:-1], numbers >= 0
     pieces = 1 if len(shard.views) >= 2 * shard.threads else shard.threads
     cuts = np.linspace(0, index.blocks, pieces + 1).astype(int).tolist()
