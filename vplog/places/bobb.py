@@ -274,8 +274,8 @@ class BobbState(ReferencesState):
     def lists(self, *columns: pa.Array) -> CodeLists:
         """The inverted lists of the places of tables' columns, one after the other: what an index on disk holds.
         Raises LibraryError where one is of another kind or library."""
-        arrays = [self.checked(from_column(column, self.arrow_type)) for column in columns]
-        references, weights, boxes = map(np.concatenate, zip(*arrays, strict=True))
+        arrays: Any = [self.checked(from_column(column, self.arrow_type)) for column in columns]
+        references, weights, boxes = (np.concatenate(part) for part in zip(*arrays, strict=True))
         return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
 
     def overlaps(self) -> Bytes:
@@ -311,7 +311,6 @@ class BobbState(ReferencesState):
         return to_column(self.arrow_type, iter(self.arrays(descriptors)))
 
     def from_arrow(self, column: pa.Array) -> list[Place]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         return list(map(Place, *self.checked(from_column(column, self.arrow_type))))
 
     def checked(self, values: Sequence[Any]) -> tuple[Uint16s, Bytes, Bytes]:

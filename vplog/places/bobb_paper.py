@@ -226,7 +226,6 @@ class PaperBobbState(ReferencesState):
         return to_column(self.arrow_type, iter(self._arrays(descriptors)))
 
     def from_arrow(self, column: pa.Array) -> list[BoxPlace]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         s = self.settings
         references, boxes = from_column(column, self.arrow_type)
         if len(references) and (references.max() >= len(self.library) or references.min() < -1):
@@ -260,16 +259,16 @@ def _count_matches(start, words, reference_start):
 
 
 @numba.njit(cache=True, nogil=True)
-def _histogram(start, words, inside, known):
+def _histogram(start, words, inside, vocabulary):
     """(U,) int32 counts of the reference's words among the features inside, and the count of all their words."""
-    H = np.zeros(known.shape[0], np.int32)
+    H = np.zeros(vocabulary.shape[0], np.int32)
     size = 0
     for f in range(start.shape[0] - 1):
         if not inside[f]:
             continue
         size += start[f + 1] - start[f]
         for e in range(start[f], start[f + 1]):
-            u = np.searchsorted(known, words[e])
-            if u < known.shape[0] and known[u] == words[e]:
+            u = np.searchsorted(vocabulary, words[e])
+            if u < vocabulary.shape[0] and vocabulary[u] == words[e]:
                 H[u] += 1
     return H, size

@@ -130,7 +130,6 @@ class BovfState(ReferencesState):
         return to_lists(items, [len(place.words) for place in descriptors], _PLACE)
 
     def from_arrow(self, column: pa.Array) -> list[WordCounts]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         check_type(column, _PLACE)
         items = column.flatten()
         parts = items.field("word"), items.field("count")
@@ -162,7 +161,6 @@ class WordIndex:
         return _products(descriptor.words, _weights(descriptor, self._state), *lists, stop)
 
     def query(self, descriptor: WordCounts, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that share a word; ties go to the earlier row."""
         return best_rows(self.scores(descriptor, stop), k)
 
 

@@ -146,7 +146,6 @@ class CodeIndex:
         return result
 
     def query(self, descriptor: Place, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that overlap at all; ties go to the earlier row."""
         return self.best(descriptor, k, stop=self._end(stop))
 
     def best(
@@ -178,10 +177,10 @@ class CodeIndex:
         any number shares with the box of each of the query's windows, their words, and what sums are divided by beside
         the length of the place's own weights."""
         weights = descriptor.weights.astype(np.int64)
-        known = np.flatnonzero(descriptor.references < len(self._lists.start))
-        cells = _cells(self._overlap, descriptor.boxes[known], -(-len(self._windows) // _LANES) * _LANES)
+        used = np.flatnonzero(descriptor.references < len(self._lists.start))
+        cells = _cells(self._overlap, descriptor.boxes[used], -(-len(self._windows) // _LANES) * _LANES)
         scale = np.sqrt(max(int((weights**2).sum()), 1)) * self._whole
-        return descriptor.references[known].astype(np.int64), weights[known], cells, cells.view(np.uint64), scale
+        return descriptor.references[used].astype(np.int64), weights[used], cells, cells.view(np.uint64), scale
 
 
 @numba.njit(cache=True, nogil=True)
@@ -286,7 +285,7 @@ def _entries(start, offset, b, reference, rows):
 
 @numba.njit(cache=True, nogil=True)
 def _score_all(
-    known, weights, cells, words, scale, windows, pairing, block,
+    references, weights, cells, words, scale, windows, pairing, block,
     start, offset, weight, share, coded, square, result,
 ):  # fmt: skip
     """Write the scores of the first rows into `result`."""
@@ -295,8 +294,8 @@ def _score_all(
     for b in range((stop + block - 1) // block):
         rows = min(stop - b * block, block)
         total[:rows] = 0
-        for j in range(known.shape[0]):
-            first, last = _entries(start, offset, b, known[j], rows)
+        for j in range(references.shape[0]):
+            first, last = _entries(start, offset, b, references[j], rows)
             row, mass, boxes = offset[first:last], weight[first:last], coded[first:last]
             here, word = cells[j], words[j]
             for e in range(last - first):
@@ -322,34 +321,34 @@ def _reach(weights, cells, pairing, scale):
 
 @numba.njit(cache=True, nogil=True)
 def _find_best(
-    known, weights, cells, words, scale, windows, pairing, block,
+    references, weights, cells, words, scale, windows, pairing, block,
     start, offset, weight, share, coded, square, longest, begin, end, stop, k, floor, runs, counts,
 ):  # fmt: skip
     """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach `floor`, in no order."""
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
     reach = _reach(weights, cells, pairing, scale)
     bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores
-    touched, keep = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
+    touched, candidates = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
     worst = floor
     least = _reached(worst)
     for b in range(begin, end if k > 0 else begin):
         rows = min(stop - b * block, block)
         bound[:rows] = 0
-        for j in range(known.shape[0]):
-            first, last = _entries(start, offset, b, known[j], rows)
+        for j in range(references.shape[0]):
+            first, last = _entries(start, offset, b, references[j], rows)
             row, part, step = offset[first:last], share[first:last], reach[j]
             for e in range(last - first):
                 bound[row[e]] += step * np.int32(part[e])
         count = 0
-        for j in range(known.shape[0]):
-            first, last = _entries(start, offset, b, known[j], rows)
+        for j in range(references.shape[0]):
+            first, last = _entries(start, offset, b, references[j], rows)
             row, mass, boxes = offset[first:last], weight[first:last], coded[first:last]
             here, word = cells[j], words[j]
-            kept = 0
+            reaching = 0
             for e in range(last - first):  # without a branch, which could not be foreseen
-                keep[kept] = e
-                kept += bound[row[e]] >= least
-            for e in keep[:kept]:
+                candidates[reaching] = e
+                reaching += bound[row[e]] >= least
+            for e in candidates[:reaching]:
                 more = weights[j] * np.int64(mass[e]) * _compare(here, word, boxes, e, windows, pairing)
                 if more > 0 and total[row[e]] == 0:
                     touched[count] = row[e]

@@ -80,5 +80,4 @@ class VectorState(ReferencesState):
         return to_column(self.arrow_type, iter([self.matrix(descriptors, dtype)]))
 
     def from_arrow(self, column: pa.Array) -> list[Any]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or length."""
         return list(*from_column(column, self.arrow_type))

@@ -150,7 +150,6 @@ class FabmapState(ReferencesState):
         return to_lists(pa.array(words), [len(place) for place in descriptors], _PLACE)
 
     def from_arrow(self, column: pa.Array) -> list[Words]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         check_type(column, _PLACE)
         check_values(column)
         words = column.flatten().to_numpy()

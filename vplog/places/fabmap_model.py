@@ -122,7 +122,7 @@ def _span(image_start, values, posting_start, postings, times_log):
 
 
 def log_likelihood_table(tree: ChowLiuTree, seen_if_there: float, seen_if_absent: float) -> Floats:
-    """(V, 3, 2, 2) ln p(z_q | z_p, L): by what is known of q at L (unseen, seen, nothing), then z_p, then z_q.
+    """(V, 3, 2, 2) ln p(z_q | z_p, L): by the state of q at L (absent, present, average), then z_p, then z_q.
 
     The word may or may not exist at the place (2008, section on the observation likelihood):
     p(z_q | z_p, L) = sum over e_q of p(z_q | e_q, z_p) p(e_q | L).
@@ -137,9 +137,9 @@ def log_likelihood_table(tree: ChowLiuTree, seen_if_there: float, seen_if_absent
     # The place model: the prior p(e_q = 1) is how often the word occurs at all, and the place's one image updates it
     # by Bayes' rule (2008, on the update of the place model).
     exists = np.empty((len(tree), 3))
-    for known in (_ABSENT, _PRESENT):
-        there, absent = detector[1, known] * tree.present, detector[0, known] * (1 - tree.present)
-        exists[:, known] = there / (there + absent)
+    for observed_z in (_ABSENT, _PRESENT):
+        there, absent = detector[1, observed_z] * tree.present, detector[0, observed_z] * (1 - tree.present)
+        exists[:, observed_z] = there / (there + absent)
     exists[:, _AVERAGE] = tree.present
     exists = exists[:, :, None, None]
     return np.log(exists * observed[:, None, 1] + (1 - exists) * observed[:, None, 0])
@@ -250,8 +250,8 @@ def calibrate(
     ]
     weight = float(_WEIGHTS[np.argmin(surprise)])
     # both questions together have a new place half of the time: even odds against the mean of the places
-    known = [_log_sum(weight * log_ratio, places) - np.log(places.sum(axis=1)) for places in (others, far)]
-    return weight, _even_odds(np.concatenate(known), len(queries)) / weight
+    logs = [_log_sum(weight * log_ratio, places) - np.log(places.sum(axis=1)) for places in (others, far)]
+    return weight, _even_odds(np.concatenate(logs), len(queries)) / weight
 
 
 def _by_time(references: Sequence[Reference]) -> tuple[NDArray[np.int64], Bools, Bools, Bools]:
@@ -274,12 +274,12 @@ def _log_sum(logs: Floats, chosen: Bools) -> Floats:
     return np.logaddexp.reduce(logs, axis=1, where=chosen, initial=-np.inf)
 
 
-def _even_odds(known: Floats, new_places: int) -> float:
-    """The log likelihood of a new place at which its probabilities against `known` sum to `new_places`."""
-    low, high = known.min() - 50.0, known.max() + 50.0  # e^-50 is nothing beside 1
+def _even_odds(logs: Floats, new_places: int) -> float:
+    """The log likelihood of a new place at which its probabilities against `logs` sum to `new_places`."""
+    low, high = logs.min() - 50.0, logs.max() + 50.0  # e^-50 is nothing beside 1
     for _ in range(60):  # halvings: to the last bit of a sum that grows with the answer
         middle = (low + high) / 2
-        if np.exp(-np.logaddexp(0, known - middle)).sum() < new_places:
+        if np.exp(-np.logaddexp(0, logs - middle)).sum() < new_places:
             low = middle
         else:
             high = middle

@@ -250,19 +250,15 @@ class HybridState(ReferencesState):
         return HybridIndex(boxes, self._signs(descriptors), self.share)
 
     def windows(self, rank: int) -> Floats:
-        """(I, 4) windows of the boxes."""
         return self.bobb.windows(rank)
 
     def boxes(self, place: HybridPlace) -> Boxes:
-        """The boxes of a place as shares of the reference's sides."""
         return self.bobb.boxes(place.boxes)
 
     def voting_map(self, features: Features, reference: int) -> Floats:
-        """(rows, columns) votes of the boxes' matches."""
         return self.bobb.voting_map(features, reference)
 
     def shared(self, places: Sequence[HybridPlace], query: Int32s, match: Int32s) -> SharedReferences:
-        """The references that explain both places of pairs (C,) of rows, by the boxes."""
         return self.bobb.shared([place.boxes for place in places], query, match)
 
     def to_arrow(self, descriptors: Sequence[HybridPlace]) -> pa.Array:
@@ -270,7 +266,6 @@ class HybridState(ReferencesState):
         return to_column(self.arrow_type, iter((*boxes, self._signs(descriptors))))
 
     def from_arrow(self, column: pa.Array) -> list[HybridPlace]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         *boxes, signs = from_column(column, self.arrow_type)
         return list(map(HybridPlace, map(Place, *self.bobb.checked(boxes)), signs))
 
@@ -298,7 +293,6 @@ class HybridIndex:
         return ((1 - self._share) * boxes + self._share * words).astype(np.float32)
 
     def query(self, descriptor: HybridPlace, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that are alike at all; ties go to the earlier row."""
         return best_rows(self.scores(descriptor, stop), k)
 
 

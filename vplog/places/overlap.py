@@ -56,7 +56,6 @@ class BoxIndex:
         return (overlap / (boxes.shape[0] * boxes.shape[1] * self._area)).astype(np.float32)
 
     def query(self, descriptor: BoxPlace, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that overlap at all; ties go to the earlier row."""
         return best_rows(self.scores(descriptor, stop), k)
 
 

@@ -119,13 +119,13 @@ class Whitening:
         centred = (raw - mean).astype(np.float64)
         variance, sides = np.linalg.eigh(centred @ centred.T / len(raw))
         variance = np.maximum(variance, 0)
-        kept = np.argsort(-variance, kind="stable")[: min(dimensions, len(raw) - 1)]
-        directions = sides[:, kept].T @ centred
+        order = np.argsort(-variance, kind="stable")[: min(dimensions, len(raw) - 1)]
+        directions = sides[:, order].T @ centred
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
         # an eigenvector's sign is a matter of the machine: let its largest entry be positive
         largest = np.argmax(np.abs(directions), axis=1)
-        directions *= np.sign(directions[np.arange(len(kept)), largest])[:, None]
-        weight = 1 / np.sqrt(np.maximum(variance[kept] + shrinkage * variance.mean(), 1e-12))
+        directions *= np.sign(directions[np.arange(len(order)), largest])[:, None]
+        weight = 1 / np.sqrt(np.maximum(variance[order] + shrinkage * variance.mean(), 1e-12))
         return cls(mean.astype(np.float32), (directions * weight[:, None]).astype(np.float32))
 
     def apply(self, raw: Float32s) -> Float32s:
