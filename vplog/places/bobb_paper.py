@@ -7,8 +7,7 @@ I boxes: each where the features of one window of the image are found again (sec
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
 
 import numba
 import numpy as np
@@ -79,9 +78,8 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
         return PaperBobbState(self, library, patterns)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pattern:
-    """One reference, ready for discovery."""
+class _Pattern(NamedTuple):
+    """One reference, ready for discovery: its words, and what `rvp.vote` takes."""
 
     words: Int32s
     """(U,) its words, increasing."""
@@ -172,13 +170,10 @@ class PaperBobbState(ReferencesState):
         self, words: lib.Words, points: Float32s, size: tuple[int, int], reference: int, window: Floats
     ) -> Floats:
         """(G, G) votes that the features inside a window (x0 y0 x1 y1, shares of the image) give a reference."""
-        pattern = self.patterns[reference]
-        inside = _inside(points, size, window)
-        H, H_size = _histogram(words.start, words.values, inside, pattern.words)
-        return rvp.vote(
-            H, H_size, pattern.posting_start, pattern.posting, pattern.patches, pattern.totals,
-            pattern.x_cuts, pattern.y_cuts, pattern.grid_x, pattern.grid_y,
-        )  # fmt: skip
+        vocabulary, *pattern = self.patterns[reference]
+        shares = (points + 0.5) / np.array(size, points.dtype)
+        inside = ((shares >= window[:2]) & (shares < window[2:])).all(axis=1)
+        return rvp.vote(*_histogram(words.start, words.values, inside, vocabulary), *pattern)
 
     def windows(self, rank: int) -> Floats:
         """(I, 4) windows that are searched on the reference of that rank."""
@@ -235,12 +230,6 @@ class PaperBobbState(ReferencesState):
         if len(boxes) and boxes.max() > s.grid:
             raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
         return list(map(BoxPlace, references, boxes.reshape(-1, s.references, s.boxes, 4)))
-
-
-def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:
-    width, height = size
-    x, y = (points[:, 0] + 0.5) / width, (points[:, 1] + 0.5) / height
-    return (x >= window[0]) & (x < window[2]) & (y >= window[1]) & (y < window[3])
 
 
 @numba.njit(cache=True, nogil=True)

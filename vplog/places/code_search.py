@@ -82,13 +82,6 @@ class CodeLists:
         """The arrays, in the order in which kernels take them and files hold them."""
         return self.start, self.offset, self.weight, self.share, self.boxes, self.square
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the places take: 13 a reference of a place with nine boxes, and 4 a place.
-
-        Beside it, 8 a reference of the library and block of rows: 1 a place where L = 1000."""
-        return sum(part.nbytes for part in self.parts)
-
 
 def build_lists(references: Uint16s, weights: Bytes, boxes: Bytes, library_size: int, block: int) -> CodeLists:
     """Lists of `references` and `weights` (N, J), a reference beyond the library is none, and `boxes` (N, J, I)."""
@@ -130,8 +123,9 @@ class CodeIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the map takes, in bytes."""
-        return self._lists.nbytes
+        """Bytes of the map: 13 a reference of a place with nine boxes, 4 a place, and 8 a reference of the library and
+        block of rows."""
+        return sum(part.nbytes for part in self._lists.parts)
 
     @property
     def blocks(self) -> int:

@@ -122,37 +122,14 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         features = [reference.features for reference in references]
         owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
         points = np.concatenate([f.points for f in features])
-        descriptors = np.concatenate([f.descriptors for f in features])
-        _write(
-            folder / "features.parquet",
-            pa.table(
-                {
-                    "reference": owners,
-                    "x": points[:, 0],
-                    "y": points[:, 1],
-                    "size": np.concatenate([f.sizes for f in features]),
-                    "descriptor": pa.FixedSizeBinaryArray.from_buffers(
-                        pa.binary(128), len(owners), [None, pa.py_buffer(np.ascontiguousarray(descriptors))]
-                    ),
-                },
-                schema=_FEATURES,
-            ),
-            compression="zstd",
-        )
-        _write(
-            folder / "references.parquet",
-            pa.table(
-                {
-                    "drive": [r.drive for r in references],
-                    "stamp_ns": [r.stamp_ns for r in references],
-                    "width": [f.width for f in features],
-                    "height": [f.height for f in features],
-                    "image": [cv2.imencode(".png", r.image)[1].tobytes() for r in references],
-                },
-                schema=_REFERENCES,
-            ),
-            compression="none",
-        )
+        sizes = np.concatenate([f.sizes for f in features])
+        descriptors = pa.py_buffer(np.ascontiguousarray(np.concatenate([f.descriptors for f in features])))
+        packed = pa.FixedSizeBinaryArray.from_buffers(pa.binary(128), len(owners), [None, descriptors])
+        _write(folder / "features.parquet", _FEATURES, [owners, *points.T, sizes, packed], compression="zstd")
+        images = [cv2.imencode(".png", r.image)[1].tobytes() for r in references]
+        entries = [(r.drive, r.stamp_ns, f.width, f.height) for r, f in zip(references, features, strict=True)]
+        columns = [*zip(*entries, strict=True), images]
+        _write(folder / "references.parquet", _REFERENCES, columns, compression="none")
         record = {
             "format": _FORMAT,
             "vplog": vplog.__version__,
@@ -171,7 +148,8 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         ) from None
 
 
-def _write(path: Path, table: pa.Table, compression: str) -> None:
+def _write(path: Path, schema: pa.Schema, columns: Sequence[Any], compression: str) -> None:
+    table = pa.table(dict(zip(schema.names, columns, strict=True)), schema=schema)
     with path.open("wb") as stream:
         write_table(stream, table, compression=compression)
 
