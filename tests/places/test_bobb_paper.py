@@ -57,8 +57,8 @@ def test_learning_with_many_threads_changes_nothing(state: PaperBobbState, refer
         np.testing.assert_array_equal(other.library.words.start, words.start)
         np.testing.assert_array_equal(other.library.words.values, words.values)
         for a, b in zip(other.patterns, state.patterns, strict=True):
-            for name in a.__dataclass_fields__:
-                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+            for part, same in zip(a, b, strict=True):
+                np.testing.assert_array_equal(part, same)
 
 
 def test_a_saved_library_describes_the_same(

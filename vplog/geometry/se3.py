@@ -107,7 +107,7 @@ def interpolate(a: Floats, b: Floats, share: Floats) -> Floats:
 
 
 def interpolate_at(stamp_ns: np.ndarray, poses: Floats, at_ns: np.ndarray) -> Floats:
-    """Poses at the stamps asked for, (len(at_ns), 4, 4); `stamp_ns` increases and covers them."""
+    """Poses at the stamps `at_ns`, (len(at_ns), 4, 4); `stamp_ns` increases and covers them."""
     right = np.clip(np.searchsorted(stamp_ns, at_ns), 1, len(stamp_ns) - 1)
     left = right - 1
     share = (at_ns - stamp_ns[left]) / (stamp_ns[right] - stamp_ns[left])

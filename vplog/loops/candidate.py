@@ -122,7 +122,7 @@ def check_back(
     result = []
     for match, row in zip(matches, rows, strict=True):
         if row.pairs is None:
-            raise ValueError("a row without a pose was to be checked the other way round")
+            raise ValueError("only a row with a pose is checked in reverse")
         mine, found = row.pairs
         there = None if row.pose.match_from_query is None else se3.inverse(row.pose.match_from_query)
         back = _check_metric(earlier, earlier.features(match), found, mine, landmarks, later.stereo, lenient, there)
@@ -180,7 +180,7 @@ def _check_metric(
 def _of_both(pose: Pose, back: Pose, share: float) -> Pose:
     """The pose of the query in the match and that of the match in the query as one, or their disagreement."""
     if pose.match_from_query is None or pose.covariance is None:
-        raise ValueError("a row without a pose was to be checked the other way round")
+        raise ValueError("only a row with a pose is checked in reverse")
     apart = replace(pose, verdict=Verdict.INCONSISTENT, match_from_query=None, covariance=None)
     if back.match_from_query is None or back.covariance is None:
         return apart
