@@ -10,25 +10,7 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
-    from vplog.data import (
-        Boxes,
-        Bytes,
-        Camera,
-        Features,
-        Float32s,
-        Floats,
-        Frame,
-        Gps,
-        Int32s,
-        Ints,
-        LogInfo,
-        Odometry,
-        PoseGraph,
-        Ranking,
-        Reference,
-        SharedReferences,
-        Solution,
-    )
+    from vplog import data
     from vplog.execution.execution import Execution
 
 
@@ -38,7 +20,7 @@ class EncodedFrame(Protocol):
     @property
     def stamp_ns(self) -> int: ...
 
-    def decode(self) -> Frame:
+    def decode(self) -> data.Frame:
         """The grey image with its depth. Raises LogError where the bytes are not an image."""
         ...
 
@@ -55,25 +37,25 @@ class Log(Protocol):
         """What was found wrong so far, one sentence each; grows while reading."""
         ...
 
-    def info(self) -> LogInfo: ...
+    def info(self) -> data.LogInfo: ...
 
-    def camera(self) -> Camera: ...
+    def camera(self) -> data.Camera: ...
 
-    def stamps(self) -> Ints:
+    def stamps(self) -> data.Ints:
         """(F,) header stamps of the chosen camera's frames in ns, increasing, without decoding one."""
         ...
 
-    def frames(self, stamp_ns: Ints) -> Iterator[EncodedFrame]:
+    def frames(self, stamp_ns: data.Ints) -> Iterator[EncodedFrame]:
         """The frames with these stamps, in order of time."""
         ...
 
-    def odometry(self) -> Odometry | None: ...
+    def odometry(self) -> data.Odometry | None: ...
 
-    def gps(self) -> Gps | None: ...
+    def gps(self) -> data.Gps | None: ...
 
 
 class Extractor(Protocol):
-    def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features: ...
+    def __call__(self, image: data.Bytes, depth_m: data.Float32s | None = None) -> data.Features: ...
 
 
 class PlaceIndex(Protocol):
@@ -81,11 +63,11 @@ class PlaceIndex(Protocol):
 
     def __len__(self) -> int: ...
 
-    def scores(self, descriptor: Any, stop: int | None = None) -> Float32s:
+    def scores(self, descriptor: Any, stop: int | None = None) -> data.Float32s:
         """(stop,) similarity to each of the rows below `stop` (all where None), comparable between queries."""
         ...
 
-    def query(self, descriptor: Any, k: int, stop: int | None = None) -> Ranking:
+    def query(self, descriptor: Any, k: int, stop: int | None = None) -> data.Ranking:
         """The k best rows below `stop` (all rows where None). Rows that share nothing are left out."""
         ...
 
@@ -94,7 +76,7 @@ class PlaceIndex(Protocol):
 class ProbableIndex(PlaceIndex, Protocol):
     """A map that also says how probable each of its places is."""
 
-    def posterior(self, descriptor: Any, stop: int | None = None) -> tuple[Floats, float]:
+    def posterior(self, descriptor: Any, stop: int | None = None) -> tuple[data.Floats, float]:
         """(stop,) float64 probability of each place, and that of a place that is not in the map; they sum to 1."""
         ...
 
@@ -117,11 +99,13 @@ class PlaceState(Protocol):
         """Size of one place descriptor, in bits."""
         ...
 
-    def describe(self, features: Features) -> Any: ...
+    def describe(self, features: data.Features) -> Any: ...
 
     def to_arrow(self, descriptors: Sequence[Any]) -> pa.Array: ...
 
-    def from_arrow(self, column: pa.Array) -> Sequence[Any]: ...
+    def from_arrow(self, column: pa.Array) -> Sequence[Any]:
+        """Raises LibraryError where the column is of another recogniser or library."""
+        ...
 
     def index(self, descriptors: Sequence[Any]) -> PlaceIndex: ...
 
@@ -133,22 +117,22 @@ class BoxState(PlaceState, Protocol):
     """A recogniser that explains an image by boxes on reference images."""
 
     @property
-    def references(self) -> Sequence[Reference]:
+    def references(self) -> Sequence[data.Reference]:
         """The library, in the order of the reference numbers of places."""
         ...
 
-    def windows(self, rank: int) -> Floats:
+    def windows(self, rank: int) -> data.Floats:
         """(I, 4) x0 y0 x1 y1, as shares of an image's sides: its windows that are searched on the reference of that
         rank."""
         ...
 
-    def boxes(self, place: Any) -> Boxes: ...
+    def boxes(self, place: Any) -> data.Boxes: ...
 
-    def voting_map(self, features: Features, reference: int) -> Floats:
+    def voting_map(self, features: data.Features, reference: int) -> data.Floats:
         """(rows, columns) votes of all features of an image for a reference, 1 at most; zeros without a vote."""
         ...
 
-    def shared(self, places: Sequence[Any], query: Int32s, match: Int32s) -> SharedReferences:
+    def shared(self, places: Sequence[Any], query: data.Int32s, match: data.Int32s) -> data.SharedReferences:
         """The references that explain both places of each of C pairs of rows of `places`."""
         ...
 
@@ -167,7 +151,7 @@ class CodedState(PlaceState, Protocol):
         """Which codes of two places are compared."""
         ...
 
-    def overlaps(self) -> Bytes:
+    def overlaps(self) -> data.Bytes:
         """(256, 256) similarity of two codes."""
         ...
 
@@ -183,10 +167,10 @@ def index_of_part(state: PlaceState, descriptors: Sequence[Any]) -> PlaceIndex:
 
 
 class Recogniser(Protocol):
-    def learn(self, references: Iterable[Reference], execution: Execution) -> PlaceState: ...
+    def learn(self, references: Iterable[data.Reference], execution: Execution) -> PlaceState: ...
 
     def load(self, folder: Path, execution: Execution) -> PlaceState: ...
 
 
 class Optimiser(Protocol):
-    def __call__(self, graph: PoseGraph) -> Solution: ...
+    def __call__(self, graph: data.PoseGraph) -> data.Solution: ...

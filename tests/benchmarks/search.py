@@ -26,7 +26,7 @@ import numpy as np
 from tests.benchmarks.measure import Figure, in_turns, one_thread, seconds
 from vplog.places import expected_votes
 from vplog.places.bobb import NOWHERE, Place
-from vplog.places.code_search import CodeIndex
+from vplog.places.code_search import BLOCK, CodeIndex, build_lists
 
 if TYPE_CHECKING:
     from vplog.places.bobb import BobbSettings
@@ -65,7 +65,7 @@ def make_places(count: int, settings: BobbSettings, seed: int, library: int = LI
     boxes = np.empty((count, J, settings.boxes), np.uint8)
     popularity = np.cumsum(1.0 / (np.arange(library) + library / 18))
     popularity /= popularity[-1]
-    positions = _positions(settings)[0] * _positions(settings)[1]
+    positions = settings.positions[0] * settings.positions[1]
     for number, at in enumerate(range(0, count, drive)):
         part = slice(at, min(at + drive, count))
         strength = np.empty((part.stop - at, J), np.float32)
@@ -138,19 +138,13 @@ def make_queries(places: Places, count: int, settings: BobbSettings, library: in
     return queries
 
 
-def _positions(settings: BobbSettings) -> tuple[int, int]:
-    return settings.columns - settings.box_columns + 1, settings.rows - settings.box_rows + 1
-
-
 def _table(settings: BobbSettings) -> np.ndarray:
-    return expected_votes.overlaps(*_positions(settings), settings.box_columns, settings.box_rows)
+    return expected_votes.overlaps(settings.positions, settings.box_columns, settings.box_rows)
 
 
 def make_index(places: Places, settings: BobbSettings, pairing: str, library: int = LIBRARY) -> CodeIndex:
-    return CodeIndex(
-        places.references, places.weights, places.boxes, _table(settings), library,
-        pairing,  # pyright: ignore[reportArgumentType]
-    )  # fmt: skip
+    lists = build_lists(places.references, places.weights, places.boxes, library, BLOCK)
+    return CodeIndex(lists, _table(settings), pairing)  # pyright: ignore[reportArgumentType]
 
 
 def plain_scores(places: Places, query: Place, settings: BobbSettings, pairing: str) -> np.ndarray:

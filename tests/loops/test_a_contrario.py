@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vplog.loops.a_contrario import log10_false_alarms
+from vplog.loops.verify_metric import log10_false_alarms
 
 
 @given(st.integers(8, 300), st.data(), st.sampled_from([(3, 4), (7, 3)]), st.floats(1e-6, 1.0))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vplog.geometry import se3
-from vplog.loops import p3p_ransac
+from vplog.loops import verify_metric
 
 
 def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -21,16 +21,16 @@ def test_the_pose_is_found_among_wrong_matches(wrong: int) -> None:
     true = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
     seen = project(true, points)
     seen[:wrong] = rng.uniform(-0.5, 0.5, (wrong, 2))
-    found = p3p_ransac.find_pose(points, seen, 0.005, 500)
+    found = verify_metric.find_pose(points, seen, 0.005, 500)
     assert found is not None
     pose, agree = found
     assert agree[wrong:].all()
     assert agree[:wrong].sum() <= 2
     np.testing.assert_allclose(pose, true, atol=1e-4)  # OpenCV samples in single precision
-    again = p3p_ransac.find_pose(points, seen, 0.005, 500)
+    again = verify_metric.find_pose(points, seen, 0.005, 500)
     assert again is not None
     assert again[0].tobytes() == pose.tobytes()
-    np.testing.assert_array_equal(p3p_ransac.inliers(pose, points, seen, 0.005), agree)
+    np.testing.assert_array_equal(verify_metric.inliers(pose, points, seen, 0.005), agree)
 
 
 @pytest.mark.parametrize(
@@ -45,4 +45,4 @@ def test_the_pose_is_found_among_wrong_matches(wrong: int) -> None:
     ],
 )
 def test_where_no_three_points_fix_a_pose_there_is_none(points: np.ndarray) -> None:
-    assert p3p_ransac.find_pose(points, np.zeros((len(points), 2)), 0.005, 50) is None
+    assert verify_metric.find_pose(points, np.zeros((len(points), 2)), 0.005, 50) is None

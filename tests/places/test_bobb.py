@@ -15,7 +15,7 @@ from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places import expected_votes
 from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, Place, _rarity
-from vplog.places.code_search import CodeIndex
+from vplog.places.code_search import BLOCK, CodeIndex, build_lists
 from vplog.places.matches import WeighedMatchSettings, _itself, _weigh, index_references, large_enough
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def test_matches_that_move_alike_count_more_than_a_stray() -> None:
 
 
 def test_overlaps_are_those_of_rectangles() -> None:
-    table = expected_votes.overlaps(5, 4, 3, 2)
+    table = expected_votes.overlaps((5, 4), 3, 2)
     for a in range(20):
         for b in range(20):
             field_a, field_b = np.zeros((5, 7), bool), np.zeros((5, 7), bool)
@@ -220,8 +220,9 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
     weights[references == NOBODY] = 0
     boxes = rng.integers(0, 20, (count, J, windows)).astype(np.uint8)
     boxes[rng.random(boxes.shape) < 0.1] = NOWHERE
-    table = expected_votes.overlaps(5, 4, 3, 2)
-    index = CodeIndex(references, weights, boxes, table, L, pairing)  # pyright: ignore[reportArgumentType]
+    table = expected_votes.overlaps((5, 4), 3, 2)
+    lists = build_lists(references, weights, boxes, L, BLOCK)
+    index = CodeIndex(lists, table, pairing)  # pyright: ignore[reportArgumentType]
     query = Place(references[0], weights[0], boxes[0])
     unit = weights / np.maximum(np.linalg.norm(weights.astype(float), axis=1, keepdims=True), 1)
     scores = index.scores(query, stop)

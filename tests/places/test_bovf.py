@@ -10,7 +10,7 @@ import pytest
 
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
-from vplog.places.bovf import BovfSettings, BovfState, Words
+from vplog.places.bovf import BovfSettings, BovfState, WordCounts
 
 if TYPE_CHECKING:
     from vplog.data import Reference
@@ -63,7 +63,7 @@ def test_a_cut_place_fits_its_bytes_and_keeps_the_weightiest(
 
 def test_damaged_tables_are_refused(learned: BovfState) -> None:
     def column(words: list[int], counts: list[int]) -> pa.Array:
-        return learned.to_arrow([Words(np.array(words, np.uint16), np.array(counts, np.uint8))])
+        return learned.to_arrow([WordCounts(np.array(words, np.uint16), np.array(counts, np.uint8))])
 
     assert len(learned.from_arrow(column([1, 2], [1, 1]))[0].words) == 2
     for words, counts in ([2, 1], [1, 1]), ([1, 1], [1, 1]), ([1, 2], [1, 0]):

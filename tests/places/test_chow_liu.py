@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from vplog.places.chow_liu import ChowLiuTree, learn_tree
+from vplog.places.fabmap_model import ChowLiuTree, learn_tree
 
 IMAGES = st.lists(st.sets(st.integers(0, 6)), min_size=1, max_size=12)
 

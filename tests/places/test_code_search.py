@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,23 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vplog.places import code_search, expected_votes
-from vplog.places.code_search import CodeIndex
+from vplog.places.code_search import CodeIndex, Place
 
 NOBODY, NOWHERE = 65_535, 255
 POSITIONS = 20
 """Boxes of 3 x 2 cells on a grid of 7 x 5."""
-TABLE = expected_votes.overlaps(5, 4, 3, 2)
+TABLE = expected_votes.overlaps((5, 4), 3, 2)
 Pairing = Literal["best", "same", "both"]
 PAIRINGS: tuple[Pairing, ...] = ("best", "same", "both")
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
+class Places(Place):
     """As a map (N, J), (N, J), (N, J, I); `place(n)` is one of them."""
-
-    references: np.ndarray
-    weights: np.ndarray
-    boxes: np.ndarray
 
     def __len__(self) -> int:
         return len(self.references)
@@ -39,7 +34,8 @@ class Places:
         return Places(self.references[:rows], self.weights[:rows], self.boxes[:rows])
 
     def index(self, library: int, pairing: Pairing) -> CodeIndex:
-        return CodeIndex(self.references, self.weights, self.boxes, TABLE, library, pairing)
+        lists = code_search.build_lists(self.references, self.weights, self.boxes, library, code_search.BLOCK)
+        return CodeIndex(lists, TABLE, pairing)
 
 
 def _places(rng: np.random.Generator, count: int, J: int, windows: int, library: int) -> Places:

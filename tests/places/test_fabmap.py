@@ -14,9 +14,8 @@ from pydantic import ValidationError
 from tests.places.pictures import noisy
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
-from vplog.places.chow_liu import ChowLiuTree
 from vplog.places.fabmap import FabmapSettings, FabmapState
-from vplog.places.fabmap_model import Model, log_likelihood_table
+from vplog.places.fabmap_model import ChowLiuTree, Model, log_likelihood_table
 from vplog.places.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
@@ -129,7 +128,7 @@ def test_inverted_evaluation_is_the_direct_one(seed: int, count: int, there: flo
         of_parent = np.where(shuffled < 0, 0, image[shuffled]).astype(int)
         direct = [table[words, place.astype(int), of_parent, image.astype(int)].sum() for place in images]
         average = table[words, 2, of_parent, image.astype(int)].sum()
-        found, new = state.index(places).log_likelihood(query)
+        found, new, _ = state.index(places).log_likelihood(query)
         assert found == pytest.approx(np.array(direct), rel=1e-9, abs=1e-9)
         assert new == pytest.approx(average, rel=1e-9, abs=1e-9)
         assert np.array_equal(state.index(places).log_likelihood(query, 3)[0], found[:3])
@@ -184,7 +183,7 @@ def test_a_sampled_new_place_converges_to_the_mean_over_all(references: list[Ref
             index = state.index([state.describe(reference.features) for reference in references])
             for _ in range(50):
                 query = np.flatnonzero(rng.random(len(state.vocabulary)) < 0.4).astype(np.uint16)
-                places, new = index.log_likelihood(query)
+                places, new, _ = index.log_likelihood(query)
                 distance.append(abs(new - np.log(np.exp(places - places.max()).mean()) - places.max()))
         errors.append(np.mean(distance))
     assert errors[0] > errors[1] > errors[2]

@@ -15,7 +15,7 @@ from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places.bobb import BobbSettings, Place
 from vplog.places.dense import thumbnail_of
-from vplog.places.hybrid import Described, HybridIndex, HybridSettings, HybridState, learn_words
+from vplog.places.hybrid import HybridIndex, HybridPlace, HybridSettings, HybridState, learn_vlad
 from vplog.places.matches import WeighedMatchSettings, patches_of
 from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift
@@ -47,12 +47,12 @@ class NoBoxes:
 
 def signs_alone(signs: Bytes) -> HybridIndex:
     boxes: CodeIndex = NoBoxes(len(signs))  # pyright: ignore[reportAssignmentType]
-    return HybridIndex(boxes, signs, signs.shape[1], 1.0)
+    return HybridIndex(boxes, signs, 1.0)
 
 
 def literal_signs(state: HybridState, features: Features) -> list[bool]:
-    """What `Words.signs` says, a feature and a bit at a time."""
-    words = state.words
+    """What `BinaryVlad.signs` says, a feature and a bit at a time."""
+    words = state.vlad
     residuals = [np.zeros(words.centres.shape[1]) for _ in words.centres]
     size = np.array([features.width, features.height])
     patches, middles = describe_patches(thumbnail_of(features))
@@ -64,7 +64,7 @@ def literal_signs(state: HybridState, features: Features) -> list[bool]:
         differences = [value - centre / 4096 for centre in words.centres]
         nearest = int(np.argmin([np.linalg.norm(difference) for difference in differences]))
         residuals[nearest] += differences[nearest] / np.linalg.norm(differences[nearest])
-    return [float(residual @ direction) > 0 for residual in residuals for direction in words.turn.T]
+    return [float(residual @ direction) > 0 for residual in residuals for direction in words.rotation.T]
 
 
 def test_signs_are_those_of_the_words_residuals(references: list[Reference]) -> None:
@@ -95,7 +95,7 @@ def test_agreement_counts_equal_bits(rows: list[bytes], query: int) -> None:
     signs = np.array([list(row) for row in rows], np.uint8)
     asked = signs[query % len(signs)]
     none = Place(np.zeros(0, np.uint16), np.zeros(0, np.uint8), np.zeros((0, 9), np.uint8))
-    _, agreement = signs_alone(signs).alike(Described(none, asked))
+    _, agreement = signs_alone(signs).alike(HybridPlace(none, asked))
     differ = np.unpackbits(signs ^ asked, axis=1).mean(axis=1)
     expected = np.maximum(1 - 2 * differ, 0) * signs.any(axis=1) * asked.any()
     np.testing.assert_allclose(agreement, expected, atol=1e-6)
@@ -145,7 +145,7 @@ def test_one_reference_is_enough(references: list[Reference]) -> None:
 
 def test_fewer_features_than_words_will_do(references: list[Reference]) -> None:
     described = patches_of(references[0].features, WeighedMatchSettings())
-    words = learn_words([described], HybridSettings(words=256, bits=8))
+    words = learn_vlad([described], HybridSettings(words=256, bits=8))
     assert words.signs(*described).shape == (256,)
 
 

@@ -12,7 +12,7 @@ import pytest
 from vplog.execution.execution import Execution
 from vplog.places import matches
 from vplog.places.bobb import BobbSettings
-from vplog.places.once import Once
+from vplog.places.matches import Once
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,7 +9,6 @@ import pytest
 
 from tests.places.pictures import noisy, nothing
 from vplog.execution.execution import Execution
-from vplog.places import shared_references
 from vplog.places.bobb import BobbSettings
 from vplog.places.bovf import BovfSettings
 from vplog.places.hybrid import HybridSettings
@@ -72,7 +71,7 @@ def test_pairs_are_compared_alike_however_many_at_once(
     places = [state.describe(noisy(r.features, 3)) for r in references]
     query, match = pairs(len(places))
     whole = state.shared(places, query, match)
-    monkeypatch.setattr(shared_references, "_PAIRS", 5)
+    monkeypatch.setattr("vplog.places.overlap._PAIRS", 5)
     parts = state.shared(places, query, match)
     for one, other in ((whole.references, parts.references), (whole.overlap, parts.overlap)):
         assert len(one) == len(other) == len(query)

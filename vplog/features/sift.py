@@ -44,11 +44,12 @@ class SiftSettings(Settings):
         height, width = image.shape
         thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
         pixels = self._reduced(image)
-        points, sizes, response, angles, descriptors = self._detect(pixels)
+        keypoints, descriptors = self._detect(pixels)
+        x, y, sizes, angles, response = keypoints.T
         # OpenCV keeps every feature that ties with the last; a full order makes the cut the same everywhere
-        order = np.lexsort((angles, sizes, points[:, 0], points[:, 1], -response))[: self.max_features]
+        order = np.lexsort((angles, sizes, x, y, -response))[: self.max_features]
         scale = np.array([width / pixels.shape[1], height / pixels.shape[0]], np.float32)
-        points = (points[order] + 0.5) * scale - 0.5  # pixel centres, not corners, are the origin
+        points = (keypoints[order, :2] + 0.5) * scale - 0.5  # pixel centres, not corners, are the origin
         return Features(
             points=points.astype(np.float32),
             sizes=sizes[order] * np.sqrt(scale[0] * scale[1]),
@@ -68,8 +69,8 @@ class SiftSettings(Settings):
         smaller = (max(round(width * share), 1), max(round(height * share), 1))
         return np.asarray(cv2.resize(image, smaller, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _detect(self, pixels: Bytes) -> tuple[Float32s, Float32s, Float32s, Float32s, Bytes]:
-        """Points (M, 2) px, sizes px, contrast, directions and descriptors (M, 128), strongest first."""
+    def _detect(self, pixels: Bytes) -> tuple[Float32s, Bytes]:
+        """Keypoints (M, 5) x y size px, direction and contrast, and descriptors (M, 128), strongest first."""
         detector = cv2.SIFT.create(
             nfeatures=self.max_features,
             contrastThreshold=self.contrast_threshold,
@@ -78,11 +79,8 @@ class SiftSettings(Settings):
         keypoints, found = detector.detectAndCompute(pixels, None)
         if not keypoints:
             found = np.zeros((0, 128), np.float32)
-        points = np.array([keypoint.pt for keypoint in keypoints], np.float32).reshape(-1, 2)
-        response = np.array([keypoint.response for keypoint in keypoints], np.float32)
-        sizes = np.array([keypoint.size for keypoint in keypoints], np.float32)
-        angles = np.array([keypoint.angle for keypoint in keypoints], np.float32)
-        return points, sizes, response, angles, found.astype(np.uint8)  # whole numbers already
+        rows = np.array([(*one.pt, one.size, one.angle, one.response) for one in keypoints], np.float32)
+        return rows.reshape(-1, 5), found.astype(np.uint8)  # whole numbers already
 
 
 def _depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:

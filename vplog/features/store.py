@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -17,13 +17,6 @@ if TYPE_CHECKING:
 _ROW_BYTES = 4 * 4 + 128
 """x, y, size, depth as float32, then the descriptor."""
 _THUMBNAIL_BYTES = THUMBNAIL_SIDE**2
-
-
-class FeaturesOf(Protocol):
-    """Features of images by their rows, from any thread."""
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, row: int, /) -> Features: ...
 
 
 def size_of(count: int, thumbnail: bool) -> int:
@@ -89,11 +82,6 @@ class FeatureStore:
                 f"They need about {_ROW_BYTES * 2000 // 1000} kB per keyframe while the run lasts."
             ) from None
         self._entries.append((offset, len(features), features.width, features.height, features.thumbnail is not None))
-
-    def extend(self, images: FeaturesOf) -> None:
-        """Store the features of several keyframes. Raises ResultError as `append` does."""
-        for row in range(len(images)):
-            self.append(images[row])
 
     def __getitem__(self, row: int) -> Features:
         """The features of keyframe `row`."""

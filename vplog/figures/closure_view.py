@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vplog.stages import BoxState
 
 SHOWN = 4
-"""References that are shown of a closure: more colours are not told apart."""
+"""References that are shown of a closure: more colours are not distinct."""
 _SAME_SPOT_M = 1e-6
 """Two cameras nearer than this differ by a turn alone."""
 
@@ -78,19 +78,19 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], cam
     match_from_query = se3.inverse(camera.body_from_camera) @ body @ camera.body_from_camera
     rays = [np.column_stack([undistort.rays(camera, points), np.ones(len(points))]) for points in (here, there)]
     turned = rays[0] @ match_from_query[:3, :3].T
-    shift, seen = match_from_query[:3, 3], rays[1]
+    shift, observed = match_from_query[:3, 3], rays[1]
     focal_px = undistort.focal_px(camera)
     with np.errstate(all="ignore"):
         if np.linalg.norm(shift) < _SAME_SPOT_M:
-            error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - seen[:, :2], axis=1)
+            error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - observed[:, :2], axis=1)
             return (error * focal_px < most_px) & (turned[:, 2] > 0)
         essential = se3.skew(shift) @ match_from_query[:3, :3]
-        line, back = rays[0] @ essential.T, seen @ essential
-        error = np.abs((line * seen).sum(axis=1)) / np.sqrt((line[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+        line, back = rays[0] @ essential.T, observed @ essential
+        error = np.abs((line * observed).sum(axis=1)) / np.sqrt((line[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
         # the depths at which both rays meet, times the square of the sine between them
-        across = np.cross(turned, seen)
+        across = np.cross(turned, observed)
         square = (across**2).sum(axis=1)
-        depth = (np.cross(seen, shift) * across).sum(axis=1), (np.cross(turned, shift) * across).sum(axis=1)
+        depth = (np.cross(observed, shift) * across).sum(axis=1), (np.cross(turned, shift) * across).sum(axis=1)
         ahead = (depth[0] > 0) & (depth[1] > 0)
         far = square < (most_px / focal_px) ** 2  # parallel within the noise: at infinity, on either side of it
         return (error * focal_px < most_px) & (ahead | far)
@@ -110,8 +110,8 @@ def find_boxes(state: BoxState, query: Any, match: Any, references: list[int]) -
         common = _common(here, there)
         if not (common > 0).any():
             continue
-        seen = np.isin(np.arange(len(here)), used)
-        i, j = np.unravel_index(np.argmax(common - 1e-6 * seen[:, None] + 1e-9 * np.eye(len(here))), common.shape)
+        repeated = np.isin(np.arange(len(here)), used)
+        i, j = np.unravel_index(np.argmax(common - 1e-6 * repeated[:, None] + 1e-9 * np.eye(len(here))), common.shape)
         used.append(int(i))
         windows = state.windows(int(rank))[i], state.windows(int(other))[j]
         image = state.references[reference].image

@@ -171,13 +171,13 @@ def _pose_columns(closures: Closures, row: int) -> dict[str, Any]:
     return {**columns, "inliers": int(closures.inliers[row])}
 
 
-def earth_of(trajectory: Trajectory, gps: Gps | None, known: dict[str, Any] | None) -> Earth | None:
-    """The pose of a trajectory on earth: that of the solve (`known`, the `gps` of run.json), else by alignment to the
+def earth_of(trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None) -> Earth | None:
+    """The pose of a trajectory on earth: that of the solve (`solved`, the `gps` of run.json), else by alignment to the
     fixes (Umeyama 1991). None without at least three fixes within the drive."""
-    if known is not None:
+    if solved is not None:
         try:
-            origin = [float(known["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]
-            world_from_enu = np.array(known["world_from_enu"], np.float64)
+            origin = [float(solved["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]
+            world_from_enu = np.array(solved["world_from_enu"], np.float64)
         except (KeyError, TypeError, ValueError, OverflowError):
             origin, world_from_enu = [], np.empty(0)
         if world_from_enu.shape != (4, 4) or not np.isfinite([*origin, *world_from_enu.ravel()]).all():

@@ -14,6 +14,7 @@ _SEMI_MAJOR_M = 6_378_137.0
 """m, WGS84 (NIMA TR8350.2, table 3.1)."""
 _FLATTENING = 1.0 / 298.257223563
 """WGS84 (NIMA TR8350.2, table 3.1)."""
+_ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +51,10 @@ def local_enu(gps: Gps) -> LocalFixes:
 
 def _earth_centred(latitude: Floats, longitude: Floats, altitude_m: Floats) -> Floats:
     """(T, 3) m from the centre of the earth; angles in rad, altitude above the ellipsoid."""
-    eccentricity_2 = _FLATTENING * (2.0 - _FLATTENING)
-    normal = _SEMI_MAJOR_M / np.sqrt(1.0 - eccentricity_2 * np.sin(latitude) ** 2)
-    return np.stack(
-        [
-            (normal + altitude_m) * np.cos(latitude) * np.cos(longitude),
-            (normal + altitude_m) * np.cos(latitude) * np.sin(longitude),
-            (normal * (1.0 - eccentricity_2) + altitude_m) * np.sin(latitude),
-        ],
-        axis=1,
-    )
+    normal = _SEMI_MAJOR_M / np.sqrt(1.0 - _ECCENTRICITY_2 * np.sin(latitude) ** 2)
+    x = (normal + altitude_m) * np.cos(latitude) * np.cos(longitude)
+    y = (normal + altitude_m) * np.cos(latitude) * np.sin(longitude)
+    return np.stack([x, y, (normal * (1.0 - _ECCENTRICITY_2) + altitude_m) * np.sin(latitude)], axis=1)
 
 
 def geodetic(enu_m: Floats, origin: tuple[float, float, float]) -> Floats:
@@ -71,17 +66,17 @@ def geodetic(enu_m: Floats, origin: tuple[float, float, float]) -> Floats:
     latitude, longitude = np.radians(origin[0]), np.radians(origin[1])
     at = _earth_centred(np.array([latitude]), np.array([longitude]), np.array([origin[2]]))[0]
     x, y, z = (enu_m @ _enu_from_earth(latitude, longitude) + at).T
-    semi_minor, eccentricity_2 = _SEMI_MAJOR_M * (1.0 - _FLATTENING), _FLATTENING * (2.0 - _FLATTENING)
-    second_2 = eccentricity_2 / (1.0 - eccentricity_2)
+    semi_minor = _SEMI_MAJOR_M * (1.0 - _FLATTENING)
+    second_2 = _ECCENTRICITY_2 / (1.0 - _ECCENTRICITY_2)
     axis = np.hypot(x, y)
     reduced = np.arctan2(z * _SEMI_MAJOR_M, axis * semi_minor)
     lat = np.arctan2(
         z + second_2 * semi_minor * np.sin(reduced) ** 3,
-        axis - eccentricity_2 * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
+        axis - _ECCENTRICITY_2 * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
     )
-    normal = _SEMI_MAJOR_M / np.sqrt(1.0 - eccentricity_2 * np.sin(lat) ** 2)
+    normal = _SEMI_MAJOR_M / np.sqrt(1.0 - _ECCENTRICITY_2 * np.sin(lat) ** 2)
     # by the larger of both, so that neither pole nor equator divides by zero
-    height = axis * np.cos(lat) + z * np.sin(lat) - normal * (1.0 - eccentricity_2 * np.sin(lat) ** 2)
+    height = axis * np.cos(lat) + z * np.sin(lat) - normal * (1.0 - _ECCENTRICITY_2 * np.sin(lat) ** 2)
     return np.stack([np.degrees(lat), np.degrees(np.arctan2(y, x)), height], axis=1)
 
 

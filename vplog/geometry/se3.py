@@ -107,7 +107,7 @@ def interpolate(a: Floats, b: Floats, share: Floats) -> Floats:
 
 
 def interpolate_at(stamp_ns: np.ndarray, poses: Floats, at_ns: np.ndarray) -> Floats:
-    """Poses at the stamps asked for, (len(at_ns), 4, 4); `stamp_ns` increases and covers them."""
+    """Poses at the stamps `at_ns`, (len(at_ns), 4, 4); `stamp_ns` increases and covers them."""
     right = np.clip(np.searchsorted(stamp_ns, at_ns), 1, len(stamp_ns) - 1)
     left = right - 1
     share = (at_ns - stamp_ns[left]) / (stamp_ns[right] - stamp_ns[left])
@@ -131,15 +131,9 @@ def quaternion(rotation: Floats) -> Floats:
     squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + trace], axis=-1)
     sum_xy, sum_xz, sum_yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     dif_x, dif_y, dif_z = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], sum_xy, sum_xz, dif_x], axis=-1),
-            np.stack([sum_xy, squares[..., 1], sum_yz, dif_y], axis=-1),
-            np.stack([sum_xz, sum_yz, squares[..., 2], dif_z], axis=-1),
-            np.stack([dif_x, dif_y, dif_z, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
+    xx, yy, zz, ww = np.moveaxis(squares, -1, 0)
+    rows = [[xx, sum_xy, sum_xz, dif_x], [sum_xy, yy, sum_yz, dif_y], [sum_xz, sum_yz, zz, dif_z]]
+    rows = _matrices([*rows, [dif_x, dif_y, dif_z, ww]])
     best = np.argmax(squares, axis=-1)[..., None, None]
     q = np.take_along_axis(rows, np.broadcast_to(best, (*best.shape[:-2], 1, 4)), axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -150,14 +144,18 @@ def rotation(q: Floats) -> Floats:
     """(..., 3, 3) of quaternions (..., 4) x y z w, normalised here; NaN where the quaternion is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    return np.stack(
+    return _matrices(
         [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
     )
+
+
+def _matrices(rows: list[list[Floats]]) -> Floats:
+    """(..., R, C) of entries (...)."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def umeyama(source: Floats, target: Floats, with_scale: bool = False) -> tuple[Floats, float]:

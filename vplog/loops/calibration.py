@@ -54,7 +54,7 @@ def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
 def rotation_share(driven: Floats, observed: Floats, settings: CalibrationSettings) -> float:
     """By what share the camera's rotations disagree with the odometry's, at least `least_share`.
 
-    `driven` and `seen` are (P, 4, 4) motions of the body over turning pairs, by odometry and by the images alone.
+    `driven` and `observed` are (P, 4, 4) motions of the body over turning pairs, by odometry and by the images alone.
     """
     if len(driven) < 8:  # the median of fewer says little
         return settings.least_share

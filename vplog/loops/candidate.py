@@ -1,4 +1,4 @@
-"""One candidate closure: matched, solved, solved again the other way round."""
+"""One candidate closure: matched, solved from query to match, and checked by the pose from match to query."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field
 from vplog.data import Verdict
 from vplog.features.matching import MatchSettings, first_matches, match_features
 from vplog.geometry import se3
-from vplog.loops import reverse_check, undistort, verify_epipolar, verify_metric
+from vplog.loops import undistort, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
 from vplog.loops.landmarks import Landmarks, LandmarkSettings, inverse_depth, landmarks_of
 from vplog.loops.verify_epipolar import EpipolarSettings
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 _ANY_POSE = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
 """Metric settings under which a pose is found wherever chance does not explain it."""
+_CHI2_6 = 22.458
+"""Mahalanobis^2 of a 6D error that 0.1 % of right pairs exceed: chi-square, 6 degrees of freedom, 99.9 %."""
+_HALVINGS = 20
+"""Bisections of the weight 0..1, to one in a million."""
 
 
 class VerifySettings(Settings):
@@ -71,7 +75,7 @@ class Row:
     pose: Pose
     scale: str = "none"
     pairs: tuple[np.ndarray, np.ndarray] | None = None
-    """Feature rows (K,) of the query and of the match that were matched, where a pose was believed."""
+    """Feature rows (K,) of the query and of the match that were matched, where a pose was accepted."""
     reverse_inliers: int = -1
 
 
@@ -82,7 +86,7 @@ def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[in
     """
     settings = later.settings
     theirs = earlier.features(match)
-    known = None
+    landmarks = None
     rows = []
     for query in queries:
         own = later.features(query)
@@ -99,30 +103,29 @@ def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[in
             )
             rows.append(Row(len(mine), 0, pose))
         else:
-            if known is None:
-                known = _landmarks(earlier, match)
-            rows.append(_check_metric(later, own, mine, found, known, earlier.stereo, settings.metric))
+            if landmarks is None:
+                landmarks = _landmarks(earlier, match)
+            rows.append(_check_metric(later, own, mine, found, landmarks, earlier.stereo, settings.metric))
     return rows
 
 
 def check_back(
     later: Drive, earlier: Drive, query: int, matches: Sequence[int], rows: Sequence[Row], share: float
 ) -> list[Row]:
-    """The believed rows of one query with what the query's own landmarks say of them.
+    """The accepted rows of one query, each fused with its pose in reverse, from the query's own landmarks.
 
-    `share` is the calibration's, by which both ways may be bent. Where the query has too few landmarks, one way has to
-    do, and the row keeps `reverse_inliers` -1.
+    `share` is the calibration's error. Where the query has too few landmarks the row is unchanged.
     """
-    known = _landmarks(later, query)
-    # where and how far apart the views are is decided already; what is asked is only whether the same pose comes out
+    landmarks = _landmarks(later, query)
+    # the limits have been checked in one direction; in reverse only the pose is compared
     lenient = later.settings.metric.model_copy(update=_ANY_POSE)
     result = []
     for match, row in zip(matches, rows, strict=True):
         if row.pairs is None:
-            raise ValueError("a row without a pose was to be checked the other way round")
+            raise ValueError("only a row with a pose is checked in reverse")
         mine, found = row.pairs
         there = None if row.pose.match_from_query is None else se3.inverse(row.pose.match_from_query)
-        back = _check_metric(earlier, earlier.features(match), found, mine, known, later.stereo, lenient, there)
+        back = _check_metric(earlier, earlier.features(match), found, mine, landmarks, later.stereo, lenient, there)
         if back.landmarks < later.settings.metric.min_inliers:
             result.append(row)
         else:
@@ -140,7 +143,7 @@ def _check_metric(
     own: Features,
     mine: np.ndarray,
     found: np.ndarray,
-    known: Landmarks,
+    landmarks: Landmarks,
     stereo: bool,
     metric: MetricSettings,
     start: Floats | None = None,
@@ -149,16 +152,16 @@ def _check_metric(
     depths, if it has any, are of a stereo pair or not; `start` is a pose to try first."""
     settings, camera = drive.settings, drive.camera
     rays = undistort.rays(camera, own.points[mine])
-    usable = known.known[found] & np.isfinite(rays).all(axis=1)
+    usable = landmarks.known[found] & np.isfinite(rays).all(axis=1)
     matches, count = len(mine), int(usable.sum())
     if count < metric.min_inliers:
         # features were followed, but none moved enough against the others to have a depth
-        still = not known.from_depth and known.tracked >= settings.min_matches > known.known.sum()
+        still = not landmarks.from_depth and landmarks.tracked >= settings.min_matches > landmarks.known.sum()
         verdict = Verdict.DEGENERATE_MOTION if still else Verdict.TOO_FEW_LANDMARKS
         return Row(matches, count, Pose(verdict, 0, 0.0))
     depth_m = own.depth_m[mine[usable]].astype(np.float64)
     pose = verify_metric.solve(
-        known,
+        landmarks,
         found[usable],
         rays[usable],
         inverse_depth(depth_m, settings.landmarks),
@@ -170,21 +173,63 @@ def _check_metric(
     )
     if pose.verdict is not Verdict.ACCEPTED:
         return Row(matches, count, pose)
-    scale = ("stereo" if stereo else "depth") if known.from_depth else "odometry"
+    scale = ("stereo" if stereo else "depth") if landmarks.from_depth else "odometry"
     return Row(matches, count, pose, scale, (mine.astype(np.int32), found.astype(np.int32)))
 
 
 def _of_both(pose: Pose, back: Pose, share: float) -> Pose:
     """The pose of the query in the match and that of the match in the query as one, or their disagreement."""
     if pose.match_from_query is None or pose.covariance is None:
-        raise ValueError("a row without a pose was to be checked the other way round")
+        raise ValueError("only a row with a pose is checked in reverse")
     apart = replace(pose, verdict=Verdict.INCONSISTENT, match_from_query=None, covariance=None)
     if back.match_from_query is None or back.covariance is None:
         return apart
-    other, covariance = reverse_check.reversed_pose(back.match_from_query, back.covariance)
-    # a wrong calibration bends the two ways differently, as their depths differ
-    bent = pose.covariance + motion_covariance(pose.match_from_query, share)
-    if not reverse_check.agree(pose.match_from_query, bent, other, covariance):
+    other, covariance = reversed_pose(back.match_from_query, back.covariance)
+    # a wrong calibration changes the two poses differently, as their depths differ
+    wider = pose.covariance + motion_covariance(pose.match_from_query, share)
+    if not agree(pose.match_from_query, wider, other, covariance):
         return apart
-    fused, joint = reverse_check.together(pose.match_from_query, pose.covariance, other, covariance)
+    fused, joint = covariance_intersection(pose.match_from_query, pose.covariance, other, covariance)
     return replace(pose, match_from_query=fused, covariance=joint)
+
+
+def reversed_pose(b_from_a: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """a_from_b (4, 4) of b_from_a, and its covariance (6, 6) moved from the frame of a to that of b.
+
+    (T exp(d))^-1 = T^-1 exp(-Ad_T d).
+    """
+    Ad = se3.adjoint(b_from_a)
+    return se3.inverse(b_from_a), Ad @ covariance @ Ad.T
+
+
+def agree(pose: Floats, covariance: Floats, other: Floats, other_covariance: Floats) -> bool:
+    """Whether two estimates a_from_b (4, 4), with covariances (6, 6) in b, are one pose within their joint noise.
+
+    They share pixels, whose errors partly cancel in the difference: the sum of the covariances is generous, and what
+    fails it is no noise.
+    """
+    apart = se3.log(se3.between(pose, other))
+    return bool(apart @ np.linalg.solve(covariance + other_covariance, apart) < _CHI2_6)
+
+
+def covariance_intersection(
+    pose: Floats, covariance: Floats, other: Floats, other_covariance: Floats
+) -> tuple[Floats, Floats]:
+    """One estimate of two of a_from_b that may share any part of their errors: pose (4, 4), covariance (6, 6).
+
+    Julier & Uhlmann 1997: information w A + (1 - w) B is never too sure, however the errors
+    are correlated; w is that of the smallest determinant of the covariance. Where one estimate is better in every
+    direction it is taken alone.
+    """
+    a, b = (np.asarray(np.linalg.inv(c), np.float64) for c in (covariance, other_covariance))
+    # det(w A + (1 - w) B) = det(B) prod(1 + w (r - 1)) over the eigenvalues r of B^-1 A; its log is concave in w
+    gain = np.linalg.eigvals(other_covariance @ a).real - 1.0
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        w = (low + high) / 2.0
+        low, high = (w, high) if (gain / (1.0 + w * gain)).sum() > 0 else (low, w)
+    w = (low + high) / 2.0
+    information = w * a + (1.0 - w) * b
+    joint = np.asarray(np.linalg.inv(information), np.float64)
+    step = joint @ ((1.0 - w) * b @ se3.log(se3.between(pose, other)))
+    return pose @ se3.exp(step), joint

@@ -58,7 +58,7 @@ class Landmarks:
     """What is known of the points behind M features of one keyframe."""
 
     rho: Floats
-    """(M,) inverse depth in 1/m along the camera's z, NaN where the feature was never seen twice."""
+    """(M,) inverse depth in 1/m along the camera's z, NaN where the feature was found in one view only."""
     rays: Floats
     """(M, 2) normalised image coordinates, refined by the other views where there are any."""
     covariance: Floats
@@ -84,22 +84,15 @@ def landmarks_of(
     rays = undistort.rays(camera, own.points)
     if np.isfinite(own.depth_m).any():
         return from_depth(rays, own.depth_m.astype(np.float64), undistort.focal_px(camera), settings)
-    rows = [
-        other
-        for other in range(row - settings.neighbours, row + settings.neighbours + 1)
-        if other != row and 0 <= other < len(keyframes.stamp_ns)
-    ]
+    first, last = max(row - settings.neighbours, 0), min(row + settings.neighbours + 1, len(keyframes.stamp_ns))
+    rows = [other for other in range(first, last) if other != row]
     observed = np.full((len(rows), len(rays), 2), np.nan)
     for view, other in enumerate(rows):
         theirs = features(other)
         mine, found = matching.match_features(own, theirs, match)
         observed[view, mine] = undistort.rays(camera, theirs.points[found])
-    camera_from_body = se3.inverse(camera.body_from_camera)
-    views = (
-        camera_from_body
-        @ se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
-        @ camera.body_from_camera
-    )
+    motion = se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
+    views = se3.inverse(camera.body_from_camera) @ motion @ camera.body_from_camera
     return from_motion(rays, observed, views, undistort.focal_px(camera), settings)
 
 
@@ -130,7 +123,7 @@ def inverse_depth(depth_m: Floats, settings: LandmarkSettings) -> tuple[Floats, 
 def from_motion(
     rays: Floats, observed: Floats, views: Floats, focal_px: float, settings: LandmarkSettings
 ) -> Landmarks:
-    """Landmarks of rays (M, 2), seen again at `observed` (V, M, 2), NaN where not, by cameras `views` (V, 4, 4).
+    """Landmarks of rays (M, 2), found again at `observed` (V, M, 2), NaN where not, by cameras `views` (V, 4, 4).
 
     `views` are view_from_camera by odometry, which fixes the scale; images refine them, together with the landmarks,
     by a bundle adjustment of the window with the odometry as prior (Triggs et al. 2000, section 6.1: the landmarks are
@@ -145,21 +138,21 @@ def from_motion(
     prior[:, [3, 4, 5], [3, 4, 5]] = (np.maximum(shift, 1e-6) ** -2)[:, None]  # 1 um: a camera that stood still
     # what odometry may be wrong by moves points by this much more
     loose = gate + settings.certainty * turn
-    seen = np.isfinite(observed).all(axis=2) & np.isfinite(rays).all(axis=1).reshape(1, -1)
+    visible = np.isfinite(observed).all(axis=2) & np.isfinite(rays).all(axis=1).reshape(1, -1)
     rho, refined, covariance = np.full(len(rays), np.nan), rays.copy(), np.zeros((len(rays), 3, 3))
-    tracked = np.flatnonzero(seen.any(axis=0))
+    tracked = np.flatnonzero(visible.any(axis=0))
     if len(tracked):
-        held, observed, seen = rays[tracked], observed[:, tracked], seen[:, tracked]
-        points = np.column_stack([held, _linear_inverse_depth(held, observed, views, seen)])
-        seen &= _errors(points, observed, views) < loose
+        own, observed, visible = rays[tracked], observed[:, tracked], visible[:, tracked]
+        points = np.column_stack([own, _linear_inverse_depth(own, observed, views, visible)])
+        visible &= _errors(points, observed, views) < loose
         start = views
-        spread = np.zeros((len(held), 3, 3))
+        spread = np.zeros((len(own), 3, 3))
         for step in range(settings.iterations):
             if step == settings.iterations - 1:  # the views are refined: now the pixels' own gate
-                seen &= _errors(points, observed, views) < gate
-            points, views, spread = _adjust(points, views, held, observed, seen, sigma, start, prior)
-        seen &= _errors(points, observed, views) < gate
-        found = seen.any(axis=0)
+                visible &= _errors(points, observed, views) < gate
+            points, views, spread = _adjust(points, views, own, observed, visible, sigma, start, prior)
+        visible &= _errors(points, observed, views) < gate
+        found = visible.any(axis=0)
         rho[tracked[found]] = points[found, 2]
         refined[tracked[found]] = points[found, :2]
         covariance[tracked[found]] = spread[found]
@@ -172,22 +165,19 @@ def _adjust(
     views: Floats,
     rays: Floats,
     observed: Floats,
-    seen: np.ndarray,
+    visible: np.ndarray,
     sigma: float,
     start: Floats,
     prior: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """One Gauss-Newton step over landmarks and views: both, moved, and the landmarks' covariance (M, 3, 3)."""
-    seen = seen & np.isfinite(_errors(points, observed, views))
+    visible = visible & np.isfinite(_errors(points, observed, views))
     residual, by_point, by_view = _linearise(points, observed, views)
     # whitened, and Huber at one sigma: beyond it an error counts linearly
-    error = np.where(seen[..., None], residual, 0.0) / sigma
-    root = np.where(seen, 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0)), 0.0)
-    error, by_point, by_view = (
-        error * root[..., None],
-        by_point * (root / sigma)[..., None, None],
-        by_view * (root / sigma)[..., None, None],
-    )
+    error = np.where(visible[..., None], residual, 0.0) / sigma
+    root = np.where(visible, 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0)), 0.0)
+    error, scale = error * root[..., None], (root / sigma)[..., None, None]
+    by_point, by_view = by_point * scale, by_view * scale
     by_view_t, by_point_t = np.swapaxes(by_view, 2, 3), np.swapaxes(by_point, 2, 3)
     # the keyframe's own observation holds x and y; a whisper on rho keeps what no view sees invertible
     point_hessian = (by_point_t @ by_point).sum(axis=0)
@@ -217,39 +207,42 @@ def _adjust(
     return points + point_step, views @ se3.exp(view_step.reshape(-1, 6)), covariance
 
 
+def _project(points: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
+    """Landmarks as rays (M, 3), and their image (V, M, 2) and depth times rho (V, M, 1) in each view; infinite depth
+    behind it."""
+    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
+    moved = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * views[:, None, :3, 3]
+    depth = np.where(moved[..., 2:] > 0, moved[..., 2:], np.inf)
+    return bearing, moved[..., :2] / depth, depth
+
+
 def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
     """Residuals (V, M, 2) and their derivatives by landmark (V, M, 2, 3) and by view (V, M, 2, 6).
 
     A view moves as view exp(d), d in the keyframe's camera.
     """
     rotation, translation = views[:, None, :3, :3], views[:, None, :3, 3]
-    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
-    seen = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * translation
-    depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.inf)  # behind a view: its error is infinite, its weight 0
-    image = seen[..., :2] / depth
-    by_seen = np.zeros((*seen.shape[:2], 2, 3))
-    by_seen[..., 0, 0] = by_seen[..., 1, 1] = 1.0 / depth[..., 0]
-    by_seen[..., :, 2] = -image / depth
-    moved = by_seen @ rotation
-    by_point = np.concatenate([moved[..., :2], by_seen @ translation[..., None]], axis=-1)
-    by_view = np.concatenate([-moved @ se3.skew(bearing), moved * points[:, 2, None, None]], axis=-1)
+    bearing, image, depth = _project(points, views)
+    by_moved = np.zeros((*image.shape, 3))
+    by_moved[..., 0, 0] = by_moved[..., 1, 1] = 1.0 / depth[..., 0]
+    by_moved[..., :, 2] = -image / depth
+    turned = by_moved @ rotation
+    by_point = np.concatenate([turned[..., :2], by_moved @ translation[..., None]], axis=-1)
+    by_view = np.concatenate([-turned @ se3.skew(bearing), turned * points[:, 2, None, None]], axis=-1)
     return image - observed, by_point, by_view
 
 
 def _errors(points: Floats, observed: Floats, views: Floats) -> Floats:
     """(V, M) reprojection errors in normalised coordinates; infinite behind a view, NaN where not observed."""
-    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
-    seen = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * views[:, None, :3, 3]
-    front = seen[..., 2] > 0
-    image = seen[..., :2] / np.where(front, seen[..., 2], 1.0)[..., None]
-    return np.where(front, np.linalg.norm(image - observed, axis=2), np.inf)
+    _, image, depth = _project(points, views)
+    return np.where(np.isfinite(depth[..., 0]), np.linalg.norm(image - observed, axis=2), np.inf)
 
 
-def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, seen: np.ndarray) -> Floats:
+def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, visible: np.ndarray) -> Floats:
     """(M,) inverse depth by least squares over all views: u (a_z + rho t_z) = a_xy + rho t_xy is linear in rho."""
     bearing = np.column_stack([rays, np.ones(len(rays))])
     turned = bearing @ np.swapaxes(views[:, :3, :3], 1, 2)
     translation = views[:, None, :3, 3]
-    slope = np.where(seen[..., None], translation[..., :2] - observed * translation[..., 2:], 0.0)
-    offset = np.where(seen[..., None], observed * turned[..., 2:] - turned[..., :2], 0.0)
+    slope = np.where(visible[..., None], translation[..., :2] - observed * translation[..., 2:], 0.0)
+    offset = np.where(visible[..., None], observed * turned[..., 2:] - turned[..., :2], 0.0)
     return (slope * offset).sum(axis=(0, 2)) / np.maximum((slope**2).sum(axis=(0, 2)), 1e-12)

@@ -1,7 +1,7 @@
 """The pose that fits matches best, by least squares, and which of them it explains: match after match, compiled.
 
-A landmark (x, y, rho) of the match's frame, normalised image coordinates and inverse depth in 1/m, is seen by the query
-as another such triple; poses move as match_from_query exp(d), d rotation first.
+A landmark (x, y, rho) of the match's frame, normalised image coordinates and inverse depth in 1/m, is observed by the
+query as another such triple; poses move as match_from_query exp(d), d rotation first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _CONVERGED = 1e-3
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def agreement(match_from_query, points, covariance, rays, sigma):
     """Squared Mahalanobis distance (K,) and length (K,) of the image errors of landmarks (K, 3) with `covariance`
-    (K, 3, 3), seen at (K, 2) with standard deviation `sigma`; NaN behind the query."""
+    (K, 3, 3), observed at (K, 2) with standard deviation `sigma`; NaN behind the query."""
     K = points.shape[0]
     squared, length = np.full(K, np.nan), np.full(K, np.nan)
     rotation, shift = _inverse(match_from_query)
@@ -46,8 +46,8 @@ def agreement(match_from_query, points, covariance, rays, sigma):
 def fit(match_from_query, points, covariance, rays, rho, variance, sigma):
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation.
 
-    Landmarks (K, 3) with covariance (K, 3, 3) were seen at (K, 2) with standard deviation `sigma`, and where the query
-    measured them too at inverse depths `rho` (K,) with `variance` (K,), NaN elsewhere.
+    Landmarks (K, 3) with covariance (K, 3, 3) were observed at (K, 2) with standard deviation `sigma`, and where the
+    query measured them too at inverse depths `rho` (K,) with `variance` (K,), NaN elsewhere.
     """
     K = points.shape[0]
     pose, hessian, excess = match_from_query.copy(), np.eye(6), 1.0
@@ -84,7 +84,7 @@ def fit(match_from_query, points, covariance, rays, rho, variance, sigma):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(by_point, covariance, square, variance, size, weight):
-    """Write the inverse covariance of a residual: the landmark's, seen through `by_point`, the pixels' and rho's."""
+    """Write the inverse covariance of a residual: the landmark's through `by_point`, the pixels' and rho's."""
     total = np.empty((3, 3))
     for i in range(size):
         for j in range(size):
@@ -133,7 +133,7 @@ def _inverse(pose):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _predict(rotation, shift, point, predicted, by_point, by_pose):
-    """Write where the query sees a landmark (x, y, rho), and the derivatives by landmark (3, 3) and by pose (3, 6).
+    """Write the query's observation of a landmark (x, y, rho), and its derivatives by landmark (3, 3) and pose (3, 6).
 
     False where that is behind it.
     """

@@ -75,10 +75,10 @@ def _newton_step(camera: Camera, at: Floats, error: Floats) -> Floats:
     dx = (_project_rays(camera, at + np.array([step, 0.0])) - here) / step
     dy = (_project_rays(camera, at + np.array([0.0, step])) - here) / step
     determinant = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
-    move_x = (error[:, 0] * dy[:, 1] - error[:, 1] * dy[:, 0]) / determinant
-    move_y = (dx[:, 0] * error[:, 1] - dx[:, 1] * error[:, 0]) / determinant
-    move = np.column_stack([move_x, move_y])
-    return np.where(np.isfinite(move).all(axis=1, keepdims=True), move, 0.0)
+    step_x = (error[:, 0] * dy[:, 1] - error[:, 1] * dy[:, 0]) / determinant
+    step_y = (dx[:, 0] * error[:, 1] - dx[:, 1] * error[:, 0]) / determinant
+    steps = np.column_stack([step_x, step_y])
+    return np.where(np.isfinite(steps).all(axis=1, keepdims=True), steps, 0.0)
 
 
 def _project_rays(camera: Camera, at: Floats) -> Floats:

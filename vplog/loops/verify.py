@@ -61,19 +61,17 @@ def verify_between(
     `share` is the larger `calibration_share` of the two drives, where it is known already.
     """
     total = len(proposals.query)
-    bent = 0.0
-    if share is not None:
-        bent = share
-    elif total and later.camera.matrix is not None and earlier.camera.matrix is not None:
+    if share is None:
+        calibrated = total and later.camera.matrix is not None and earlier.camera.matrix is not None
         drives = [later] if later is earlier else [later, earlier]
-        bent = max(calibration_share(drive, execution) for drive in drives)
+        share = max(calibration_share(drive, execution) for drive in drives) if calibrated else 0.0
 
     def check(group: Ints) -> list[Row]:
         return check_queries(later, earlier, int(proposals.match[group[0]]), proposals.query[group].tolist())
 
     def back(group: Ints) -> list[Row]:
         query, matches = int(proposals.query[group[0]]), proposals.match[group].tolist()
-        return check_back(later, earlier, query, matches, [rows[at] for at in group.tolist()], bent)
+        return check_back(later, earlier, query, matches, [rows[at] for at in group.tolist()], share)
 
     rows: dict[int, Row] = {}
     groups = _by(proposals.match, proposals.query, np.arange(total))
@@ -85,7 +83,7 @@ def verify_between(
         groups = _by(proposals.query, proposals.match, accepted)
         for group, found in zip(groups, list(execution.map(back, groups)), strict=True):
             rows.update(zip(group.tolist(), found, strict=True))
-    return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, bent)
+    return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, share)
 
 
 def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
@@ -136,8 +134,8 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
         if covariance is not None:
             total = body_from_camera @ (covariance + motion_covariance(found, share)) @ body_from_camera.T
             speeds = twists[0][proposals.match[at]], twists[1][proposals.query[at]]
-            known = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
-            information[at] = (known + known.T) / 2.0
+            inverse = np.linalg.inv(total + stamp_covariance(pose[at], *speeds, stamp_sigma_s))
+            information[at] = (inverse + inverse.T) / 2.0
     return Closures(
         **vars(proposals),
         shared_references=[np.empty(0, np.uint16)] * count,

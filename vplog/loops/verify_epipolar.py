@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Verdict
-from vplog.loops import a_contrario
-from vplog.loops.verify_metric import Pose
+from vplog.loops.verify_metric import Pose, log10_false_alarms
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -58,5 +57,5 @@ def agreeing(
     agrees = np.zeros(len(query), bool) if mask is None else np.asarray(mask).ravel().astype(bool)
     # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
     share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)
-    alarms = a_contrario.log10_false_alarms(len(query), int(agrees.sum()), _SAMPLE, _MODELS, share)
+    alarms = log10_false_alarms(len(query), int(agrees.sum()), _SAMPLE, _MODELS, share)
     return agrees, alarms > settings.log10_false_alarms

@@ -1,16 +1,22 @@
-"""The pose between two keyframes from matches of one's features to the other's landmarks, with its covariance."""
+"""The pose between two keyframes from matches of one's features to the other's landmarks, with its covariance.
+
+P3P in RANSAC is OpenCV's USAC with its local optimisation: PoseLib is as accurate and faster on few right matches, but
+has no wheel for Linux on ARM.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import lgamma, log, log10
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from pydantic import Field
 
 from vplog.data import Verdict
 from vplog.geometry import se3
-from vplog.loops import a_contrario, p3p_ransac, pose_refinement, undistort
+from vplog.loops import pose_refinement, undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -18,9 +24,11 @@ if TYPE_CHECKING:
     from vplog.loops.landmarks import Landmarks, LandmarkSettings
 
 _SAMPLE = 3
-"""Points that fix a calibrated camera's pose: P3P."""
+"""Points that fix a calibrated camera's pose: P3P; one more tells its up to four poses apart."""
 _MODELS = 4
 """Poses that three points allow: Gao et al. 2003."""
+_CONFIDENCE = 0.99
+"""RANSAC ends when three right matches would have been drawn with this probability."""
 _CHI2_2 = 9.210
 """Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
 _ROUNDS = 8
@@ -78,8 +86,8 @@ class Pose:
 def solve(
     landmarks: Landmarks,
     rows: np.ndarray,
-    seen: Floats,
-    seen_rho: tuple[Floats, Floats],
+    observed: Floats,
+    observed_rho: tuple[Floats, Floats],
     image_share: Floats,
     camera: Camera,
     noise: LandmarkSettings,
@@ -88,9 +96,9 @@ def solve(
 ) -> Pose:
     """The pose of the query's camera in the match's camera.
 
-    Known landmarks `rows` (K,) were matched to query rays `seen` (K, 2), whose inverse depths `seen_rho` are (K,) in
-    1/m and their variance (K,), NaN where unknown. `image_share` (K, 2) are the query's pixels as shares of its size.
-    The pose `start`, where given and enough matches agree with it, is improved instead of one found anew.
+    Known landmarks `rows` (K,) were matched to query rays `observed` (K, 2), whose inverse depths `observed_rho` are
+    (K,) in 1/m and their variance (K,), NaN where unknown. `image_share` (K, 2) are the query's pixels as shares of
+    its size. The pose `start`, where given and enough matches agree with it, is improved instead of sampling one.
     """
     focal_px, area_px = undistort.focal_px(camera), float(camera.width * camera.height)
     points = np.column_stack([landmarks.rays[rows], landmarks.rho[rows]])
@@ -99,9 +107,9 @@ def solve(
     cloud, near = bearing / points[:, 2:], settings.ransac_px / focal_px
     inlier = np.zeros(len(rows), bool)
     if start is not None:
-        inlier = p3p_ransac.inliers(se3.inverse(start), cloud, seen, near)
+        inlier = inliers(se3.inverse(start), cloud, observed, near)
     if start is None or inlier.sum() < settings.min_inliers:
-        found = p3p_ransac.find_pose(cloud, seen, near, settings.ransac_rounds)
+        found = find_pose(cloud, observed, near, settings.ransac_rounds)
         if found is None:
             return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
         start, inlier = se3.inverse(found[0]), found[1]
@@ -110,15 +118,21 @@ def solve(
     for _ in range(_ROUNDS):  # the pose decides who agrees, those decide the pose; it settles in two or three
         if inlier.sum() < _SAMPLE + 1:
             break
-        chosen = (points[inlier], covariance[inlier], seen[inlier], seen_rho[0][inlier], seen_rho[1][inlier])
+        chosen = (
+            points[inlier],
+            covariance[inlier],
+            observed[inlier],
+            observed_rho[0][inlier],
+            observed_rho[1][inlier],
+        )
         match_from_query, hessian, excess = pose_refinement.fit(match_from_query, *chosen, sigma)
-        distance, error = pose_refinement.agreement(match_from_query, points, covariance, seen, sigma)
+        distance, error = pose_refinement.agreement(match_from_query, points, covariance, observed, sigma)
         before, inlier = inlier, (distance < _CHI2_2) & (error < settings.max_error_px / focal_px)
         if np.array_equal(inlier, before):
             break
     count = int(inlier.sum())
     radius = settings.max_error_px
-    alarms = a_contrario.log10_false_alarms(len(rows), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
+    alarms = log10_false_alarms(len(rows), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
     if (
         not np.isfinite(match_from_query).all()
         or count < max(settings.min_inliers, settings.min_share * len(rows))
@@ -144,3 +158,54 @@ def solve(
         along = match_from_query[:3, :3].T @ moved * settings.scale_share
         pose_covariance[3:, 3:] += np.outer(along, along)
     return Pose(Verdict.ACCEPTED, count, spread, match_from_query, pose_covariance)
+
+
+def find_pose(points: Floats, rays: Floats, radius: float, rounds: int) -> tuple[Floats, np.ndarray] | None:
+    """query_from_match (4, 4) and its inliers (K,) bool; None where no three points fix a pose.
+
+    Points (K, 3) in the match's camera were observed as rays (K, 2) by the query; those within `radius` of their ray,
+    in normalised image coordinates, are inliers. At most `rounds` samples are drawn (Fischler & Bolles 1981), the same
+    ones for the same matches.
+    """
+    if len(points) <= _SAMPLE:
+        return None
+    usac = cv2.UsacParams()
+    usac.threshold, usac.confidence, usac.maxIterations = radius, _CONFIDENCE, rounds
+    try:
+        found, _, turn, moved, _ = cv2.solvePnPRansac(points, rays, np.eye(3), None, params=usac)
+    except cv2.error:  # points on one line
+        return None
+    if not found or not (np.isfinite(turn).all() and np.isfinite(moved).all()):
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
+    pose = se3.pose(rotation, np.asarray(moved, np.float64).ravel())
+    return pose, inliers(pose, points, rays, radius)
+
+
+def inliers(query_from_match: Floats, points: Floats, rays: Floats, radius: float) -> np.ndarray:
+    """(K,) bool: the matches in front of the camera and within `radius` of where the pose (4, 4) projects them."""
+    x, y, z = se3.transform(query_from_match, points).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (z > 0) & ((x / z - rays[:, 0]) ** 2 + (y / z - rays[:, 1]) ** 2 < radius**2)
+
+
+def log10_false_alarms(matches: int, inliers: int, sample: int, models: int, share: float) -> float:
+    """log10 of the number of false alarms of a model that `inliers` of `matches` agree with.
+
+    Moisan & Stival 2004, proposition 2; Moulon, Monasse & Marlet 2012, eq. 1. `sample` matches fix a model, in up to
+    `models` ways; a wrong match agrees with a given model with probability `share` (0..1), the share of the image that
+    lies within the tolerance.
+    """
+    if inliers <= sample:
+        return log10(max(models, 1)) + log10(max(matches, 1))  # the sample alone proves nothing
+    return (
+        log10(models)
+        + log10(max(matches - sample, 1))
+        + _log10_binomial(matches, inliers)
+        + _log10_binomial(inliers, sample)
+        + (inliers - sample) * log10(min(max(share, 1e-300), 1.0))
+    )
+
+
+def _log10_binomial(n: int, k: int) -> float:
+    return (lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)) / log(10)

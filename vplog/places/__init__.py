@@ -26,4 +26,4 @@ PlaceSettings = Annotated[
     | VladSettings,
     Field(discriminator="kind"),
 ]
-"""Every recogniser, told apart by `kind`."""
+"""Every recogniser, by its `kind`."""

@@ -7,8 +7,7 @@ to the letter; here votes have the closed form of `expected_votes.py`, and the o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numba
 import numpy as np
@@ -18,21 +17,19 @@ from pydantic import Field, model_validator
 from vplog.data import Boxes
 from vplog.errors import LibraryError
 from vplog.places import expected_votes
-from vplog.places.code_lists import BLOCK, CodeLists, build_lists
-from vplog.places.code_search import CodeIndex
-from vplog.places.columns import check_type, check_values, struct_of_lists
-from vplog.places.matches import Matches, WeighedMatchSettings, index_references
-from vplog.places.once import Once
-from vplog.places.relearn import ReferencesState, relearn
-from vplog.places.shared_references import list_shared
+from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
+from vplog.places.columns import from_column, to_column
+from vplog.places.library_files import ReferencesState, relearn
+from vplog.places.matches import Matches, Once, WeighedMatchSettings, index_references
+from vplog.places.overlap import list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
+    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences, Uint16s
     from vplog.execution.execution import Execution
-    from vplog.places.code_search import Pairing, Uint16s
+    from vplog.places.code_search import Pairing
     from vplog.places.matches import Matcher
 
 NOBODY = 65_535
@@ -96,9 +93,8 @@ class BobbSettings(WeighedMatchSettings):
             raise ValueError(
                 f"a box of {self.box_columns} x {self.box_rows} has more than 255 cells; use smaller boxes"
             )
-        boxes = (self.columns - self.box_columns + 1) * (self.rows - self.box_rows + 1)
-        if boxes > NOWHERE:
-            raise ValueError(f"a box has {boxes} positions, and {NOWHERE} is the most; use fewer columns or rows")
+        if (count := np.prod(self.positions)) > NOWHERE:
+            raise ValueError(f"a box has {count} positions, and {NOWHERE} is the most; use fewer columns or rows")
         return self
 
     @property
@@ -106,10 +102,15 @@ class BobbSettings(WeighedMatchSettings):
         """I: boxes on each reference."""
         return self.windows_along**2
 
+    @property
+    def positions(self) -> tuple[int, int]:
+        """Positions of a box along the width and along the height."""
+        return self.columns - self.box_columns + 1, self.rows - self.box_rows + 1
+
     def learn(self, references: Iterable[Reference], execution: Execution) -> BobbState:
         """Index the references, and how popular they are. Raises LibraryError where they have no features."""
         state = self.prepare(references, execution)
-        state.learned()
+        state.rarity()
         return state
 
     def prepare(self, references: Iterable[Reference], execution: Execution) -> BobbState:
@@ -156,36 +157,16 @@ def _rarity(explained: Floats, power: float) -> Floats:
     return 1.0 / np.maximum(part, 0.05) ** power
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """The descriptor: J references with a weight each and I boxes on it, 12 bytes a reference with nine boxes."""
-
-    references: Uint16s
-    """(J,) best first, NOBODY where fewer share anything."""
-    weights: Bytes
-    """(J,) how much each explains, in 255ths of the most."""
-    boxes: Bytes
-    """(J, I) number of the box that each window is found in, NOWHERE where it is not."""
-
-
-@dataclass(frozen=True, eq=False)
 class BobbState(ReferencesState):
     """A library, indexed when it first describes. Safe to share between threads."""
 
-    settings: BobbSettings
-    matcher: Matcher
-    learned: Once[Floats]
-    """(L,) weight of each reference."""
-
-    def __post_init__(self) -> None:
-        s = self.settings
-        object.__setattr__(self, "_windows", expected_votes.even_windows(s.windows_along, s.window_share))
-        object.__setattr__(self, "_along_x", expected_votes.box_sums(s.columns, s.patches_x, s.box_columns))
-        object.__setattr__(self, "_along_y", expected_votes.box_sums(s.rows, s.patches_y, s.box_rows))
-
-    _windows: Floats = field(init=False)
-    _along_x: Floats = field(init=False)
-    _along_y: Floats = field(init=False)
+    def __init__(self, settings: BobbSettings, matcher: Matcher, rarity: Once[Floats]) -> None:
+        """`rarity` is the weight (L,) of each reference."""
+        s = self.settings = settings
+        self.matcher, self.references, self.rarity = matcher, matcher.references, rarity
+        self._windows = expected_votes.even_windows(s.windows_along, s.window_share)
+        self._along_x = expected_votes.box_sums(s.columns, s.patches_x, s.box_columns)
+        self._along_y = expected_votes.box_sums(s.rows, s.patches_y, s.box_rows)
 
     @property
     def bits(self) -> int:
@@ -196,11 +177,11 @@ class BobbState(ReferencesState):
     def arrow_type(self) -> pa.StructType:
         s = self.settings
         return pa.struct(
-            [
-                pa.field("references", pa.list_(pa.uint16(), s.references)),
-                pa.field("weights", pa.list_(pa.uint8(), s.references)),
-                pa.field("boxes", pa.list_(pa.uint8(), s.references * s.boxes)),
-            ]
+            {
+                "references": pa.list_(pa.uint16(), s.references),
+                "weights": pa.list_(pa.uint8(), s.references),
+                "boxes": pa.list_(pa.uint8(), s.references * s.boxes),
+            }
         )
 
     def describe(self, features: Features) -> Place:
@@ -223,7 +204,7 @@ class BobbState(ReferencesState):
         The first 3 J by the sum of weights are looked at again, with matches that agree in their motion counting more.
         """
         s = self.settings
-        rarity = self.learned()
+        rarity = self.rarity()
         total = _sums(matches.start, matches.weight) * rarity
         found = []
         for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
@@ -251,11 +232,6 @@ class BobbState(ReferencesState):
         here, there, weight = matches.here[part], matches.there[part], matches.weight[part]
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
-    @property
-    def references(self) -> list[Reference]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The library."""
-        return self.matcher.references
-
     def windows(self, rank: int) -> Floats:
         """(I, 4) the same windows on the reference of any rank."""
         return self._windows
@@ -265,7 +241,7 @@ class BobbState(ReferencesState):
         s = self.settings
         used = place.references != NOBODY
         codes = place.boxes[used].astype(np.int64)
-        row, column = np.divmod(codes, s.columns - s.box_columns + 1)
+        row, column = np.divmod(codes, s.positions[0])
         ends = [column / s.columns, row / s.rows, (column + s.box_columns) / s.columns, (row + s.box_rows) / s.rows]
         corners = np.stack(ends, axis=-1)
         corners[codes == NOWHERE] = np.nan
@@ -282,7 +258,8 @@ class BobbState(ReferencesState):
         return votes / max(float(votes.max()), 1e-12)
 
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
-        return CodeIndex(*self._arrays(descriptors), self.overlaps(), len(self.matcher), self.settings.pairing)
+        lists = build_lists(*self.arrays(descriptors), len(self.matcher), BLOCK)
+        return CodeIndex(lists, self.overlaps(), self.pairing)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -297,20 +274,19 @@ class BobbState(ReferencesState):
     def lists(self, *columns: pa.Array) -> CodeLists:
         """The inverted lists of the places of tables' columns, one after the other: what an index on disk holds.
         Raises LibraryError where one is of another kind or library."""
-        references, weights, boxes = (np.concatenate(part) for part in zip(*map(self._coded, columns), strict=True))
+        arrays: Any = [self.checked(from_column(column, self.arrow_type)) for column in columns]
+        references, weights, boxes = (np.concatenate(part) for part in zip(*arrays, strict=True))
         return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
 
     def overlaps(self) -> Bytes:
         """(256, 256) cells that the boxes of two numbers share."""
         s = self.settings
-        return expected_votes.overlaps(
-            s.columns - s.box_columns + 1, s.rows - s.box_rows + 1, s.box_columns, s.box_rows
-        )
+        return expected_votes.overlaps(s.positions, s.box_columns, s.box_rows)
 
     def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> SharedReferences:
         """The parts of the score of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
         s = self.settings
-        references, weights, boxes = self._arrays(places)
+        references, weights, boxes = self.arrays(places)
         table = self.overlaps()
 
         def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
@@ -322,37 +298,30 @@ class BobbState(ReferencesState):
 
         return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
 
-    def _arrays(self, descriptors: Sequence[Place]) -> tuple[Uint16s, Bytes, Bytes]:
-        s = self.settings
+    def arrays(self, places: Sequence[Place]) -> tuple[Uint16s, Bytes, Bytes]:
+        """(N, J) references and weights, (N, J, I) boxes."""
+        shape = -1, self.settings.references
         return (
-            np.array([place.references for place in descriptors], np.uint16).reshape(-1, s.references),
-            np.array([place.weights for place in descriptors], np.uint8).reshape(-1, s.references),
-            np.array([place.boxes for place in descriptors], np.uint8).reshape(-1, s.references, s.boxes),
+            np.array([place.references for place in places], np.uint16).reshape(shape),
+            np.array([place.weights for place in places], np.uint8).reshape(shape),
+            np.array([place.boxes for place in places], np.uint8).reshape(*shape, self.settings.boxes),
         )
 
     def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
-        return struct_of_lists(self.arrow_type, *self._arrays(descriptors))
+        return to_column(self.arrow_type, iter(self.arrays(descriptors)))
 
     def from_arrow(self, column: pa.Array) -> list[Place]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
-        return [Place(r, w, b) for r, w, b in zip(*self._coded(column), strict=True)]
+        return list(map(Place, *self.checked(from_column(column, self.arrow_type))))
 
-    def _coded(self, column: pa.Array) -> tuple[Uint16s, Bytes, Bytes]:
-        """(N, J) references and weights, (N, J, I) boxes of a table's column, as `from_arrow`."""
-        s = self.settings
-        check_type(column, self.arrow_type)
-        lists = [column.field(part.name) for part in self.arrow_type]
-        check_values(column, *lists)
-        references, weights, boxes = (part.flatten().to_numpy() for part in lists)
+    def checked(self, values: Sequence[Any]) -> tuple[Uint16s, Bytes, Bytes]:
+        """(N, J) references and weights, (N, J, I) boxes of a column's values. Raises LibraryError where this library
+        has no such reference or box."""
+        references, weights, boxes = values
         if np.any((references >= len(self.matcher)) & (references != NOBODY)):
             raise LibraryError(
                 "The descriptors name references that this library lacks; compute them again with `vplog run`."
             )
-        positions = (s.columns - s.box_columns + 1) * (s.rows - s.box_rows + 1)
+        positions = np.prod(self.settings.positions)
         if np.any((boxes >= positions) & (boxes != NOWHERE)):
             raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")
-        return (
-            references.reshape(-1, s.references),
-            weights.reshape(-1, s.references),
-            boxes.reshape(-1, s.references, s.boxes),
-        )
+        return references, weights, boxes.reshape(*references.shape, self.settings.boxes)

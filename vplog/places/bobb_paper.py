@@ -7,8 +7,7 @@ I boxes: each where the features of one window of the image are found again (sec
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
 
 import numba
 import numpy as np
@@ -19,10 +18,9 @@ from vplog.data import Boxes
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp
-from vplog.places.columns import check_type, check_values, struct_of_lists
-from vplog.places.relearn import ReferencesState, RelearnedSettings
-from vplog.places.search import BoxIndex
-from vplog.places.shared_references import list_shared
+from vplog.places.columns import from_column, to_column
+from vplog.places.library_files import ReferencesState, RelearnedSettings
+from vplog.places.overlap import BoxIndex, BoxPlace, list_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -80,9 +78,8 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
         return PaperBobbState(self, library, patterns)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pattern:
-    """One reference, ready for discovery."""
+class _Pattern(NamedTuple):
+    """One reference, ready for discovery: its words, and what `rvp.vote` takes."""
 
     words: Int32s
     """(U,) its words, increasing."""
@@ -121,34 +118,16 @@ def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> _Pa
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """The descriptor: J references and I boxes on each."""
-
-    references: Int32s
-    """(J,) best first, -1 where fewer references share anything."""
-    boxes: Bytes
-    """(J, I, 4) x0 y0 x1 y1 in cells of the grid, all zero where nothing was found."""
-
-
-@dataclass(frozen=True, eq=False)
 class PaperBobbState(ReferencesState):
     """A library, indexed and partitioned. Shared freely between threads."""
 
-    settings: PaperBobbSettings
-    library: lib.Library
-    patterns: list[_Pattern]
-
-    def __post_init__(self) -> None:
-        s = self.settings
-        rng = np.random.default_rng([s.seed, 0])
+    def __init__(self, settings: PaperBobbSettings, library: lib.Library, patterns: list[_Pattern]) -> None:
+        s = self.settings = settings
+        self.library, self.references, self.patterns = library, library.references, patterns
         # Alg. 1 line 4 draws windows at random; one draw serves all images, so that no image's noise can change it
-        corners = rng.uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
-        object.__setattr__(self, "_windows", np.concatenate([corners, corners + s.window_share], axis=-1))
-        object.__setattr__(self, "_shapes", rvp.box_shapes(s.grid, s.max_box_share, s.aspects))
-
-    _windows: Floats = None  # pyright: ignore[reportAssignmentType]
-    _shapes: Int32s = None  # pyright: ignore[reportAssignmentType]
+        corners = np.random.default_rng([s.seed, 0]).uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
+        self._windows = np.concatenate([corners, corners + s.window_share], axis=-1)
+        self._shapes = rvp.box_shapes(s.grid, s.max_box_share, s.aspects)
 
     @property
     def bits(self) -> int:
@@ -160,14 +139,13 @@ class PaperBobbState(ReferencesState):
     @property
     def arrow_type(self) -> pa.StructType:
         s = self.settings
-        return pa.struct(
-            [
-                pa.field("references", pa.list_(pa.int32(), s.references)),
-                pa.field("boxes", pa.list_(pa.uint8(), s.references * s.boxes * 4)),
-            ]
-        )
+        lists = {
+            "references": pa.list_(pa.int32(), s.references),
+            "boxes": pa.list_(pa.uint8(), s.references * s.boxes * 4),
+        }
+        return pa.struct(lists)
 
-    def describe(self, features: Features) -> Place:
+    def describe(self, features: Features) -> BoxPlace:
         """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
         s = self.settings
         points = features.points[: s.features]
@@ -180,7 +158,7 @@ class PaperBobbState(ReferencesState):
             for i in range(s.boxes):
                 cells = self.votes(words, points, (features.width, features.height), reference, self._windows[j, i])
                 boxes[j, i] = rvp.dominant_box(cells, self._shapes)
-        return Place(references, boxes)
+        return BoxPlace(references, boxes)
 
     def _retrieve(self, words: lib.Words) -> Int32s:
         """At most J references, those that share words with most features first (Alg. 1 line 2)."""
@@ -192,24 +170,16 @@ class PaperBobbState(ReferencesState):
         self, words: lib.Words, points: Float32s, size: tuple[int, int], reference: int, window: Floats
     ) -> Floats:
         """(G, G) votes that the features inside a window (x0 y0 x1 y1, shares of the image) give a reference."""
-        pattern = self.patterns[reference]
-        inside = _inside(points, size, window)
-        H, H_size = _histogram(words.start, words.values, inside, pattern.words)
-        return rvp.vote(
-            H, H_size, pattern.posting_start, pattern.posting, pattern.patches, pattern.totals,
-            pattern.x_cuts, pattern.y_cuts, pattern.grid_x, pattern.grid_y,
-        )  # fmt: skip
-
-    @property
-    def references(self) -> list[Reference]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The library."""
-        return self.library.references
+        vocabulary, *pattern = self.patterns[reference]
+        shares = (points + 0.5) / np.array(size, points.dtype)
+        inside = ((shares >= window[:2]) & (shares < window[2:])).all(axis=1)
+        return rvp.vote(*_histogram(words.start, words.values, inside, vocabulary), *pattern)
 
     def windows(self, rank: int) -> Floats:
         """(I, 4) windows that are searched on the reference of that rank."""
         return self._windows[rank]
 
-    def boxes(self, place: Place) -> Boxes:
+    def boxes(self, place: BoxPlace) -> Boxes:
         """The boxes of a place as shares of the reference's sides."""
         used = place.references >= 0
         corners = place.boxes[used] / float(self.settings.grid)
@@ -224,17 +194,17 @@ class PaperBobbState(ReferencesState):
         votes = rvp.voting_map(cells, pattern.grid_x, pattern.grid_y)
         return votes / max(float(votes.max()), 1e-12)
 
-    def index(self, descriptors: Sequence[Place]) -> BoxIndex:
+    def index(self, descriptors: Sequence[BoxPlace]) -> BoxIndex:
         return BoxIndex(*self._arrays(descriptors), len(self.library), self.settings.grid)
 
-    def _arrays(self, places: Sequence[Place]) -> tuple[Int32s, Bytes]:
+    def _arrays(self, places: Sequence[BoxPlace]) -> tuple[Int32s, Bytes]:
         s = self.settings
         return (
             np.array([place.references for place in places], np.int32).reshape(-1, s.references),
             np.array([place.boxes for place in places], np.uint8).reshape(-1, s.references, s.boxes, 4),
         )
 
-    def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> SharedReferences:
+    def shared(self, places: Sequence[BoxPlace], query: Int32s, match: Int32s) -> SharedReferences:
         """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
         references, boxes = (part.astype(np.int64) for part in self._arrays(places))
 
@@ -247,30 +217,19 @@ class PaperBobbState(ReferencesState):
 
         return list_shared(references, query, match, compare)
 
-    def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
-        return struct_of_lists(self.arrow_type, *self._arrays(descriptors))
+    def to_arrow(self, descriptors: Sequence[BoxPlace]) -> pa.Array:
+        return to_column(self.arrow_type, iter(self._arrays(descriptors)))
 
-    def from_arrow(self, column: pa.Array) -> list[Place]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
+    def from_arrow(self, column: pa.Array) -> list[BoxPlace]:
         s = self.settings
-        check_type(column, self.arrow_type)
-        lists = column.field("references"), column.field("boxes")
-        check_values(column, *lists)
-        references = lists[0].flatten().to_numpy().reshape(-1, s.references)
-        boxes = lists[1].flatten().to_numpy().reshape(-1, s.references, s.boxes, 4)
+        references, boxes = from_column(column, self.arrow_type)
         if len(references) and (references.max() >= len(self.library) or references.min() < -1):
             raise LibraryError(
                 "The descriptors name references that this library lacks; compute them again with `vplog run`."
             )
         if len(boxes) and boxes.max() > s.grid:
             raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
-        return [Place(r, b) for r, b in zip(references, boxes, strict=True)]
-
-
-def _inside(points: Float32s, size: tuple[int, int], window: Floats) -> np.ndarray:
-    width, height = size
-    x, y = (points[:, 0] + 0.5) / width, (points[:, 1] + 0.5) / height
-    return (x >= window[0]) & (x < window[2]) & (y >= window[1]) & (y < window[3])
+        return list(map(BoxPlace, references, boxes.reshape(-1, s.references, s.boxes, 4)))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -289,16 +248,16 @@ def _count_matches(start, words, reference_start):
 
 
 @numba.njit(cache=True, nogil=True)
-def _histogram(start, words, inside, known):
+def _histogram(start, words, inside, vocabulary):
     """(U,) int32 counts of the reference's words among the features inside, and the count of all their words."""
-    H = np.zeros(known.shape[0], np.int32)
+    H = np.zeros(vocabulary.shape[0], np.int32)
     size = 0
     for f in range(start.shape[0] - 1):
         if not inside[f]:
             continue
         size += start[f + 1] - start[f]
         for e in range(start[f], start[f + 1]):
-            u = np.searchsorted(known, words[e])
-            if u < known.shape[0] and known[u] == words[e]:
+            u = np.searchsorted(vocabulary, words[e])
+            if u < vocabulary.shape[0] and vocabulary[u] == words[e]:
                 H[u] += 1
     return H, size

@@ -15,10 +15,10 @@ import pyarrow as pa
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.columns import check_type, check_values, words_by_place
+from vplog.places.columns import check_type, check_values, list_slices, to_lists
 from vplog.places.dense import best_rows
-from vplog.places.relearn import ReferencesState, RelearnedSettings, keep_references
-from vplog.places.vocabulary import Vocabulary, learn_vocabulary
+from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_references
+from vplog.places.vocabulary import Vocabulary, learn_vocabulary, postings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -60,23 +60,23 @@ class BovfSettings(RelearnedSettings):
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> BovfState:
         """Words and their idf from the references. Raises LibraryError where they are fewer than two or featureless."""
-        kept = keep_references(references, self.features)
-        if len(kept) < 2:
+        used = keep_references(references, self.features)
+        if len(used) < 2:
             raise LibraryError(
                 "bovf weighs a word by how few of the references have it, so it needs at least two; one was given."
             )
-        descriptors = np.concatenate([reference.features.descriptors for reference in kept])
+        descriptors = np.concatenate([reference.features.descriptors for reference in used])
         vocabulary = learn_vocabulary(descriptors, self.words, self.seed, execution)
         holders = np.zeros(len(vocabulary), np.int64)
-        for reference in kept:
+        for reference in used:
             holders[np.unique(vocabulary.quantise(reference.features.descriptors))] += 1
         # section 4.1: log N / n_i; the approximate search may leave a word to no reference, which is as rare as one
-        idf = np.log(len(kept) / np.maximum(holders, 1)).astype(np.float32)
-        return BovfState(self, kept, vocabulary, idf)
+        idf = np.log(len(used) / np.maximum(holders, 1)).astype(np.float32)
+        return BovfState(self, used, vocabulary, idf)
 
 
 @dataclass(frozen=True, eq=False)
-class Words:
+class WordCounts:
     """The descriptor: words of one image."""
 
     words: NDArray[np.uint16]
@@ -87,7 +87,7 @@ class Words:
 
 @dataclass(frozen=True, eq=False)
 class BovfState(ReferencesState):
-    """Words with their weights. Shared freely between threads."""
+    """WordCounts with their weights. Shared freely between threads."""
 
     settings: BovfSettings
     references: list[Reference]
@@ -110,62 +110,57 @@ class BovfState(ReferencesState):
     def arrow_type(self) -> pa.DataType:
         return _PLACE
 
-    def describe(self, features: Features) -> Words:
-        """Words with their counts; those of all references weigh nothing and are left out."""
+    def describe(self, features: Features) -> WordCounts:
+        """WordCounts with their counts; those of all references weigh nothing and are left out."""
         found = self.vocabulary.quantise(features.descriptors[: self.settings.features])
         words, counts = np.unique(found, return_counts=True)
         counts = np.minimum(counts, _MAX_COUNT).astype(np.uint8)
         weight = _tf_idf(words, counts, self)
         best = np.lexsort((words, -weight))[: self._most_words]
-        kept = np.sort(best[weight[best] > 0])
-        return Words(words[kept].astype(np.uint16), counts[kept])
+        best = np.sort(best[weight[best] > 0])
+        return WordCounts(words[best].astype(np.uint16), counts[best])
 
-    def index(self, descriptors: Sequence[Words]) -> WordIndex:
+    def index(self, descriptors: Sequence[WordCounts]) -> WordIndex:
         return WordIndex(descriptors, self)
 
-    def to_arrow(self, descriptors: Sequence[Words]) -> pa.Array:
-        start = np.concatenate([[0], np.cumsum([len(place.words) for place in descriptors])]).astype(np.int32)
+    def to_arrow(self, descriptors: Sequence[WordCounts]) -> pa.Array:
         words = np.concatenate([np.zeros(0, np.uint16), *(place.words for place in descriptors)])
         counts = np.concatenate([np.zeros(0, np.uint8), *(place.counts for place in descriptors)])
         items = pa.StructArray.from_arrays([pa.array(words), pa.array(counts)], fields=list(_PLACE.value_type))
-        return pa.ListArray.from_arrays(pa.array(start), items, type=_PLACE)
+        return to_lists(items, [len(place.words) for place in descriptors], _PLACE)
 
-    def from_arrow(self, column: pa.Array) -> list[Words]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
+    def from_arrow(self, column: pa.Array) -> list[WordCounts]:
         check_type(column, _PLACE)
         items = column.flatten()
         parts = items.field("word"), items.field("count")
         check_values(column, items, *parts)
         words, counts = (part.to_numpy() for part in parts)
-        places = words_by_place(column, words, len(self.vocabulary))
+        places = list_slices(column, words, len(self.vocabulary))
         if not np.all(counts):
             raise LibraryError("The descriptors name a word zero times; compute them again with `vplog run`.")
-        return [Words(words[place], counts[place]) for place in places]
+        return [WordCounts(words[place], counts[place]) for place in places]
 
 
 class WordIndex:
     """Inverted file: for each word, the places that have it with their weight. Rows are in the order given."""
 
-    def __init__(self, places: Sequence[Words], state: BovfState) -> None:
+    def __init__(self, places: Sequence[WordCounts], state: BovfState) -> None:
         self._count, self._state = len(places), state
-        owners = np.repeat(np.arange(len(places), dtype=np.int32), [len(place.words) for place in places])
-        words = np.concatenate([np.zeros(0, np.uint16), *(place.words for place in places)])
-        weights = np.concatenate([np.zeros(0, np.float32), *(_weights(place, state) for place in places)])
-        order = np.argsort(words, kind="stable")
-        self._list_start = np.searchsorted(words[order], np.arange(len(state.idf) + 1)).astype(np.int64)
-        self._list_place, self._list_weight = owners[order], weights[order]
+        self._list_start, self._list_place, order = postings([place.words for place in places], len(state.idf))
+        self._list_weight = np.concatenate([np.zeros(0, np.float32), *(_weights(place, state) for place in places)])[
+            order
+        ]
 
     def __len__(self) -> int:
         return self._count
 
-    def scores(self, descriptor: Words, stop: int | None = None) -> Float32s:
+    def scores(self, descriptor: WordCounts, stop: int | None = None) -> Float32s:
         """(stop,) cosine of the tf-idf vectors of the query and each place, 0 where they share no word."""
         stop = self._count if stop is None else min(stop, self._count)
-        weights = _weights(descriptor, self._state)
-        return _products(descriptor.words, weights, self._list_start, self._list_place, self._list_weight, stop)
+        lists = self._list_start, self._list_place, self._list_weight
+        return _products(descriptor.words, _weights(descriptor, self._state), *lists, stop)
 
-    def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that share a word; ties go to the earlier row."""
+    def query(self, descriptor: WordCounts, k: int, stop: int | None = None) -> Ranking:
         return best_rows(self.scores(descriptor, stop), k)
 
 
@@ -175,7 +170,7 @@ def _tf_idf(words: NDArray, counts: Bytes, state: BovfState) -> Float32s:
     return (np.sqrt(counted) if state.settings.damp_bursts else counted) * state.idf[words]
 
 
-def _weights(place: Words, state: BovfState) -> Float32s:
+def _weights(place: WordCounts, state: BovfState) -> Float32s:
     """(K,) tf-idf of unit length."""
     weights = _tf_idf(place.words, place.counts, state)
     return weights / max(np.sqrt(np.square(weights).sum()), np.float32(1e-9))

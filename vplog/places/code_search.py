@@ -8,7 +8,8 @@ places compares boxes only where an upper bound of the score reaches the best fo
 from __future__ import annotations
 
 import heapq
-from typing import TYPE_CHECKING, Literal, Protocol, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numba
 import numpy as np
@@ -17,7 +18,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from vplog.data import Ranking
-from vplog.places.code_lists import BLOCK, MOST_ROWS, STEPS, CodeLists, build_lists
+from vplog.errors import ResultError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
 
     Pairing = Literal["best", "same", "both"]
 
+BLOCK = 8192
+"""Rows of a block: their bounds take 32 kB, a core's first cache; 4096 to 32768 cost the same to 20 %."""
+MOST_ROWS = 65_536
+"""Rows that a block may have: an offset has 16 bits."""
+STEPS = 255
+"""A bound is a product of two unit vectors, each value a whole number of these steps, rounded up."""
 _PAIRINGS = {"best": (1, 0), "same": (0, 1), "both": (1, 1)}
 """Weights of a box's best overlap and of its overlap with the same window's box."""
 _ROUNDING = 1e-6
@@ -36,37 +43,78 @@ _ALL = np.zeros(1, np.int64), np.ones(1, np.bool_)
 """One run of rows, all of which count."""
 
 
-class CodedPlace(Protocol):
+@dataclass(frozen=True, eq=False)
+class Place:
+    """J references with a weight each and I boxes on it: 12 bytes a reference with nine boxes."""
+
+    references: Uint16s
+    """(J,) best first; one beyond the library where fewer share anything."""
+    weights: Bytes
+    """(J,) how much each explains, in 255ths of the most."""
+    boxes: Bytes
+    """(J, I) number of the box that each window is found in, 255 where it is not."""
+
+
+@dataclass(frozen=True, eq=False)
+class CodeLists:
+    """N places as E entries, one for each reference of a place, of a library of L references."""
+
+    start: Ints
+    """(L, B + 1) the entries of reference r in block b of rows are start[r, b]..start[r, b + 1]."""
+    offset: Uint16s
+    """(E,) row within the block, rising within a reference's part of it."""
+    weight: Bytes
+    """(E,) of the reference in its place, as described."""
+    share: Bytes
+    """(E,) the weight as part of the place's unit vector, in 255ths, rounded up."""
+    boxes: Bytes
+    """(E, I) numbers of the boxes."""
+    square: NDArray[np.uint32]
+    """(N,) sum of the squares of the place's weights, at least 1."""
+    block: int
+    """Rows of a block; the last one may have fewer."""
+
+    def __len__(self) -> int:
+        return len(self.square)
+
     @property
-    def references(self) -> Uint16s: ...
-    @property
-    def weights(self) -> Bytes: ...
-    @property
-    def boxes(self) -> Bytes: ...
+    def parts(self) -> tuple[Ints, Uint16s, Bytes, Bytes, Bytes, NDArray[np.uint32]]:
+        """The arrays, in the order in which kernels take them and files hold them."""
+        return self.start, self.offset, self.weight, self.share, self.boxes, self.square
+
+
+def build_lists(references: Uint16s, weights: Bytes, boxes: Bytes, library_size: int, block: int) -> CodeLists:
+    """Lists of `references` and `weights` (N, J), a reference beyond the library is none, and `boxes` (N, J, I)."""
+    count, _, windows = boxes.shape
+    start = _count_entries(references, library_size, block)
+    entries = int(start[-1, -1]) if start.size else 0
+    offset, weight = np.empty(entries, np.uint16), np.empty(entries, np.uint8)
+    share, coded = np.empty(entries, np.uint8), np.empty((entries, windows), np.uint8)
+    square = np.empty(count, np.uint32)
+    _fill(references, weights, boxes, block, start, offset, weight, share, coded, square)
+    return CodeLists(start, offset, weight, share, coded, square, block)
+
+
+def check_lists(lists: CodeLists) -> None:
+    """Raises ResultError where a search would read or write beyond the arrays. Only `start` is looked at: whatever the
+    other arrays of a stranger's file hold, they give wrong scores at worst."""
+    start = lists.start.reshape(-1)
+    blocks = -(-len(lists) // lists.block)
+    sound = 0 < lists.block <= MOST_ROWS and lists.start.shape[1] == blocks + 1
+    ends = len(start) == 0 or (start[0] == 0 and start[-1] == len(lists.offset))
+    if not (sound and ends) or np.any(start[1:] < start[:-1]):  # not differences, which wrap round
+        raise ResultError("Its lists do not fit together.")
 
 
 class CodeIndex:
     """Places of a map; rows are in the order given."""
 
-    def __init__(
-        self, references: Uint16s, weights: Bytes, boxes: Bytes, overlap: Bytes, library_size: int, pairing: Pairing
-    ) -> None:
-        """`references` and `weights` (N, J), a reference beyond the library is none; `boxes` (N, J, I) numbers of
-        boxes; `overlap` (256, 256) cells that two boxes share."""
-        self._set(build_lists(references, weights, boxes, library_size, BLOCK), overlap, pairing)
-
-    @classmethod
-    def of(cls, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> Self:
-        """Over lists that are there already, as in a file."""
-        index = cls.__new__(cls)
-        index._set(lists, overlap, pairing)
-        return index
-
-    def _set(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
+    def __init__(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
+        """`overlap` (256, 256) is the cells that two boxes share."""
         self._lists, self._overlap, self._pairing = lists, overlap, _PAIRINGS[pairing]
         self._windows = (0,) * lists.boxes.shape[1]
         self._whole = int(overlap.max(initial=1)) * sum(self._pairing) * len(self._windows)
-        self._longest = lists.longest
+        self._longest = int(np.diff(lists.start).max(initial=0))
         for part in lists.parts:
             part.flags.writeable = False  # a kernel is compiled once, for lists in memory and for those of a file
 
@@ -75,28 +123,28 @@ class CodeIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the map takes, in bytes."""
-        return self._lists.nbytes
+        """Bytes of the map: 13 a reference of a place with nine boxes, 4 a place, and 8 a reference of the library and
+        block of rows."""
+        return sum(part.nbytes for part in self._lists.parts)
 
     @property
     def blocks(self) -> int:
         """Blocks of rows, which a search may be split by."""
         return self._lists.start.shape[1] - 1
 
-    def scores(self, descriptor: CodedPlace, stop: int | None = None) -> Float32s:
+    def scores(self, descriptor: Place, stop: int | None = None) -> Float32s:
         """(stop,) 0..1: mean overlap of the boxes, weighted by the references' weights as unit vectors; 1 is equal."""
         result = np.zeros(self._end(stop), np.float32)
         query, lists = self._query(descriptor), self._lists
         _score_all(*query, self._windows, self._pairing, lists.block, *lists.parts, result)
         return result
 
-    def query(self, descriptor: CodedPlace, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that overlap at all; ties go to the earlier row."""
+    def query(self, descriptor: Place, k: int, stop: int | None = None) -> Ranking:
         return self.best(descriptor, k, stop=self._end(stop))
 
     def best(
         self,
-        descriptor: CodedPlace,
+        descriptor: Place,
         k: int,
         blocks: tuple[int, int] | None = None,
         least: float = 0.0,
@@ -118,15 +166,54 @@ class CodeIndex:
     def _end(self, stop: int | None) -> int:
         return len(self) if stop is None else max(min(stop, len(self)), 0)
 
-    def _query(self, descriptor: CodedPlace) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
+    def _query(self, descriptor: Place) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
         """The query's references in the library (Q,), their weights (Q,), the (Q, 256, words x 8) cells that a box of
         any number shares with the box of each of the query's windows, their words, and what sums are divided by beside
         the length of the place's own weights."""
         weights = descriptor.weights.astype(np.int64)
-        known = np.flatnonzero(descriptor.references < len(self._lists.start))
-        cells = _cells(self._overlap, descriptor.boxes[known], -(-len(self._windows) // _LANES) * _LANES)
+        used = np.flatnonzero(descriptor.references < len(self._lists.start))
+        cells = _cells(self._overlap, descriptor.boxes[used], -(-len(self._windows) // _LANES) * _LANES)
         scale = np.sqrt(max(int((weights**2).sum()), 1)) * self._whole
-        return descriptor.references[known].astype(np.int64), weights[known], cells, cells.view(np.uint64), scale
+        return descriptor.references[used].astype(np.int64), weights[used], cells, cells.view(np.uint64), scale
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_entries(references, library_size, block):
+    """(L, B + 1) int64, `CodeLists.start`."""
+    N, J = references.shape
+    start = np.zeros((library_size, (N + block - 1) // block + 1), np.int64)
+    for row in range(N):
+        for j in range(J):
+            if references[row, j] < library_size:
+                start[references[row, j], row // block + 1] += 1
+    total = 0
+    for r in range(start.shape[0]):
+        for b in range(start.shape[1]):
+            total += start[r, b]
+            start[r, b] = total
+    return start
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(references, weights, boxes, block, start, offset, weight, share, coded, square):
+    """Write the lists: by reference, then by row."""
+    N, J, windows = boxes.shape
+    at = start[:, 0].copy()
+    for row in range(N):
+        total = np.int64(0)
+        for j in range(J):
+            total += np.int64(weights[row, j]) * np.int64(weights[row, j])
+        square[row] = max(total, 1)
+        length = np.sqrt(np.float64(square[row]))
+        for j in range(J):
+            reference = references[row, j]
+            if reference < start.shape[0]:
+                e = at[reference]
+                at[reference] += 1
+                offset[e], weight[e] = row % block, weights[row, j]
+                share[e] = np.ceil(weights[row, j] * STEPS / length)
+                for i in range(windows):
+                    coded[e, i] = boxes[row, j, i]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -192,7 +279,7 @@ def _entries(start, offset, b, reference, rows):
 
 @numba.njit(cache=True, nogil=True)
 def _score_all(
-    known, weights, cells, words, scale, windows, pairing, block,
+    references, weights, cells, words, scale, windows, pairing, block,
     start, offset, weight, share, coded, square, result,
 ):  # fmt: skip
     """Write the scores of the first rows into `result`."""
@@ -201,8 +288,8 @@ def _score_all(
     for b in range((stop + block - 1) // block):
         rows = min(stop - b * block, block)
         total[:rows] = 0
-        for j in range(known.shape[0]):
-            first, last = _entries(start, offset, b, known[j], rows)
+        for j in range(references.shape[0]):
+            first, last = _entries(start, offset, b, references[j], rows)
             row, mass, boxes = offset[first:last], weight[first:last], coded[first:last]
             here, word = cells[j], words[j]
             for e in range(last - first):
@@ -228,34 +315,34 @@ def _reach(weights, cells, pairing, scale):
 
 @numba.njit(cache=True, nogil=True)
 def _find_best(
-    known, weights, cells, words, scale, windows, pairing, block,
+    references, weights, cells, words, scale, windows, pairing, block,
     start, offset, weight, share, coded, square, longest, begin, end, stop, k, floor, runs, counts,
 ):  # fmt: skip
     """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach `floor`, in no order."""
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
     reach = _reach(weights, cells, pairing, scale)
     bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores
-    touched, keep = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
+    touched, candidates = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
     worst = floor
     least = _reached(worst)
     for b in range(begin, end if k > 0 else begin):
         rows = min(stop - b * block, block)
         bound[:rows] = 0
-        for j in range(known.shape[0]):
-            first, last = _entries(start, offset, b, known[j], rows)
+        for j in range(references.shape[0]):
+            first, last = _entries(start, offset, b, references[j], rows)
             row, part, step = offset[first:last], share[first:last], reach[j]
             for e in range(last - first):
                 bound[row[e]] += step * np.int32(part[e])
         count = 0
-        for j in range(known.shape[0]):
-            first, last = _entries(start, offset, b, known[j], rows)
+        for j in range(references.shape[0]):
+            first, last = _entries(start, offset, b, references[j], rows)
             row, mass, boxes = offset[first:last], weight[first:last], coded[first:last]
             here, word = cells[j], words[j]
-            kept = 0
+            reaching = 0
             for e in range(last - first):  # without a branch, which could not be foreseen
-                keep[kept] = e
-                kept += bound[row[e]] >= least
-            for e in keep[:kept]:
+                candidates[reaching] = e
+                reaching += bound[row[e]] >= least
+            for e in candidates[:reaching]:
                 more = weights[j] * np.int64(mass[e]) * _compare(here, word, boxes, e, windows, pairing)
                 if more > 0 and total[row[e]] == 0:
                     touched[count] = row[e]

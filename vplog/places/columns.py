@@ -1,4 +1,4 @@
-"""Checks of the places in a table's column, which anyone may have written."""
+"""Columns of places: to Arrow, and back from a table that anyone may have written."""
 
 from __future__ import annotations
 
@@ -10,11 +10,34 @@ import pyarrow as pa
 from vplog.errors import LibraryError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from numpy.typing import NDArray
 
 
+def to_column(arrow_type: pa.DataType, arrays: Iterator[NDArray]) -> pa.Array:
+    """A column of fixed-size lists, or of structs of them, from the values (N, ...) of each list in turn."""
+    if isinstance(arrow_type, pa.StructType):
+        parts = [to_column(part.type, arrays) for part in arrow_type]
+        return pa.StructArray.from_arrays(parts, fields=list(arrow_type))
+    return pa.FixedSizeListArray.from_arrays(pa.array(next(arrays).reshape(-1), arrow_type.value_type), type=arrow_type)
+
+
+def from_column(column: pa.Array, arrow_type: pa.DataType) -> list[NDArray]:
+    """The values (N, length) of each fixed-size list of a `to_column`. Raises LibraryError where the column is of
+    another type, or lacks a finite value."""
+    check_type(column, arrow_type)
+    check_values(column)
+    if isinstance(arrow_type, pa.StructType):
+        return [values for part in arrow_type for values in from_column(column.field(part.name), part.type)]
+    values = column.flatten().to_numpy().reshape(-1, arrow_type.list_size)
+    if not np.all(np.isfinite(values)):
+        raise LibraryError("Some descriptors have values that are not finite; compute them again with `vplog run`.")
+    return [values]
+
+
 def check_type(column: pa.Array, arrow_type: pa.DataType) -> None:
-    """Raises LibraryError where the places of a column are of another kind than a recogniser's."""
+    """Raises LibraryError where a column is not of a recogniser's type."""
     if not column.type.equals(arrow_type):
         raise LibraryError(f"Descriptors of type {column.type} do not fit this recogniser's {arrow_type}.")
 
@@ -27,7 +50,13 @@ def check_values(*arrays: pa.Array) -> None:
             raise LibraryError("Some descriptors have no value; compute them again with `vplog run`.")
 
 
-def words_by_place(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: int) -> list[slice]:
+def to_lists(items: pa.Array, lengths: Sequence[int], arrow_type: pa.ListType) -> pa.Array:
+    """A column of lists of these lengths from all their items."""
+    start = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(start), items, type=arrow_type)
+
+
+def list_slices(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: int) -> list[slice]:
     """The slice of all words (K,) for each list of the column. Raises LibraryError where the words of a place do not
     rise or are beyond the `vocabulary`."""
     if len(words) and words.max() >= vocabulary:
@@ -41,13 +70,4 @@ def words_by_place(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: 
     rising[start[start < len(words)]] = True  # a place's first word follows none
     if not np.all(rising):
         raise LibraryError("The descriptors name a word twice or out of order; compute them again with `vplog run`.")
-    return [slice(a, b) for a, b in zip(start.tolist(), stop.tolist(), strict=True)]
-
-
-def struct_of_lists(arrow_type: pa.StructType, *arrays: NDArray) -> pa.Array:
-    """A column of structs of fixed-size lists from the values (N, ...) of each."""
-    columns = [
-        pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), part.type.list_size)
-        for values, part in zip(arrays, arrow_type, strict=True)
-    ]
-    return pa.StructArray.from_arrays(columns, fields=list(arrow_type))
+    return list(map(slice, start.tolist(), stop.tolist()))

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 STRONGEST = 200
 """Features of a frame that the choice looks at: a quarter of what describes a place tells who explains whom."""
 _CANDIDATES_A_REFERENCE = 4
-"""Candidates for each reference asked for: neighbours a quarter of the references' distance apart hardly differ."""
+"""Candidates a requested reference: neighbours a quarter of the references' distance apart hardly differ."""
 _LEAST_CANDIDATES = 256
-"""Candidates where fewer references than 64 are asked for, as far as there are frames."""
+"""Least candidates, of 64 references or fewer, as far as there are frames."""
 _FRAMES_A_CANDIDATE = 2
 """Frames to be explained for each candidate, so that half of them are no candidates themselves."""
 _NEIGHBOURS = 10
@@ -83,7 +83,7 @@ def choose_by_coverage(
 
     `descriptors_of` gives the (M, 128) descriptors of a row, strongest first. Rows of several drives are chosen from
     alike: one that no other drive explains gets references of its own. Long drives are looked at in even steps, so
-    that the cost depends on the size asked for alone.
+    that the cost depends on the requested size alone.
     """
     if count == 0:
         return np.zeros(0, np.int64)

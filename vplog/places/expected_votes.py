@@ -98,12 +98,13 @@ def best_boxes(here, there, weight, windows, along_y, along_x, none):
     return result
 
 
-def overlaps(boxes_x: int, boxes_y: int, width: int, height: int) -> Bytes:
-    """(256, 256) uint8 cells that two boxes share, by their numbers; nothing for numbers that are no box."""
-    x, y = np.arange(boxes_x), np.arange(boxes_y)
+def overlaps(positions: tuple[int, int], width: int, height: int) -> Bytes:
+    """(256, 256) uint8 cells that two boxes of width x height cells share, by their numbers; nothing for numbers that
+    are no box."""
+    x, y = map(np.arange, positions)
     along_x = np.maximum(width - np.abs(x[:, None] - x), 0)
     along_y = np.maximum(height - np.abs(y[:, None] - y), 0)
-    count = boxes_x * boxes_y
+    count = len(x) * len(y)
     table = np.zeros((256, 256), np.uint8)
     table[:count, :count] = np.einsum("ab,cd->acbd", along_y, along_x).reshape(count, count)
     return table

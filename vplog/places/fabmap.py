@@ -17,13 +17,19 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
 
-from vplog.data import Ranking
 from vplog.errors import LibraryError
-from vplog.places.chow_liu import learn_tree
-from vplog.places.columns import check_type, check_values, words_by_place
-from vplog.places.fabmap_calibration import calibrate
-from vplog.places.fabmap_model import Evidence, Model, average_place, log_likelihood_table, log_mean
-from vplog.places.relearn import ReferencesState, RelearnedSettings, keep_references
+from vplog.places.columns import check_type, check_values, list_slices, to_lists
+from vplog.places.dense import ranked
+from vplog.places.fabmap_model import (
+    Evidence,
+    Model,
+    average_place,
+    calibrate,
+    learn_tree,
+    log_likelihood_table,
+    log_mean,
+)
+from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
 
 if TYPE_CHECKING:
@@ -31,7 +37,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Bools, Features, Float32s, Floats, Reference
+    from vplog.data import Bools, Features, Float32s, Floats, Ranking, Reference
     from vplog.execution.execution import Execution
 
     Words = NDArray[np.uint16]
@@ -82,12 +88,12 @@ class FabmapSettings(RelearnedSettings):
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> FabmapState:
         """Words and their tree from the references. Raises LibraryError where too few or featureless."""
-        kept = keep_references(references, self.features)
-        if len(kept) < 2:
+        used = keep_references(references, self.features)
+        if len(used) < 2:
             raise LibraryError(
                 "fabmap learns which words occur together, so it needs at least two references; one was given."
             )
-        descriptors = [reference.features.descriptors for reference in kept]
+        descriptors = [reference.features.descriptors for reference in used]
         vocabulary = learn_vocabulary(np.concatenate(descriptors), self.words, self.seed, execution)
         images = list(execution.map(lambda rows: _words(vocabulary, rows), descriptors))
         tree = learn_tree(images, len(vocabulary), self.independence)
@@ -95,9 +101,9 @@ class FabmapSettings(RelearnedSettings):
         drawn = np.sort(np.random.default_rng(self.seed).permutation(len(images))[: self.samples])
         weight, new_place_nats = 1.0, 0.0
         if self.calibrate:
-            weight, new_place_nats = calibrate(kept, images, model, drawn if self.new_place == "sampled" else None)
+            weight, new_place_nats = calibrate(used, images, model, drawn if self.new_place == "sampled" else None)
         samples = Evidence([images[row] for row in drawn], model) if self.new_place == "sampled" else None
-        return FabmapState(self, kept, vocabulary, model, samples, weight, new_place_nats)
+        return FabmapState(self, used, vocabulary, model, samples, weight, new_place_nats)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,20 +146,20 @@ class FabmapState(ReferencesState):
         return FabmapPart(self, descriptors)
 
     def to_arrow(self, descriptors: Sequence[Words]) -> pa.Array:
-        start = np.concatenate([[0], np.cumsum([len(place) for place in descriptors])]).astype(np.int32)
         words = np.concatenate([np.zeros(0, np.uint16), *descriptors]).astype(np.uint16)
-        return pa.ListArray.from_arrays(pa.array(start), pa.array(words), type=_PLACE)
+        return to_lists(pa.array(words), [len(place) for place in descriptors], _PLACE)
 
     def from_arrow(self, column: pa.Array) -> list[Words]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
         check_type(column, _PLACE)
         check_values(column)
         words = column.flatten().to_numpy()
-        return [words[place] for place in words_by_place(column, words, len(self.vocabulary))]
+        return [words[place] for place in list_slices(column, words, len(self.vocabulary))]
 
 
-class FabmapIndex:
-    """Places of a map; rows are in the order given. A query's prior is the same for every place."""
+class FabmapPart:
+    """Some places of a map; rows are in the order given. A posterior is over all places there are, so here a place's
+    score is the natural log of how much more likely the image is there than at a new place: over the whole map the
+    order is that of the posterior."""
 
     def __init__(self, state: FabmapState, places: Sequence[Words]) -> None:
         self._state, self._evidence = state, Evidence(places, state.model)
@@ -161,24 +167,35 @@ class FabmapIndex:
     def __len__(self) -> int:
         return len(self._evidence)
 
-    def log_likelihood(self, descriptor: Words, stop: int | None = None) -> tuple[Floats, float]:
-        """(stop,) float64 ln p(Z | L) of the places and that of a new place, neither weighed nor smoothed."""
-        places, _ = self._evidence(descriptor, self._below(stop))
-        return places, self._new_place(descriptor)
-
-    def log_ratio(self, descriptor: Words, stop: int | None = None) -> tuple[Floats, Bools]:
-        """(stop,) float64 log of how much likelier the image is at each place than at a new one, weighed, and whether
-        they share a word."""
-        places, shared = self._evidence(descriptor, self._below(stop))
-        new = self._new_place(descriptor) + self._state.new_place_nats
-        return self._state.weight * (places - new), shared
-
     def scores(self, descriptor: Words, stop: int | None = None) -> Float32s:
-        """(stop,) natural log of each place's posterior, before smoothing.
+        """(stop,) natural log of each place's score."""
+        return self._scored(descriptor, stop)[0]
 
-        Smoothing keeps the order of a query's places, but would make all that are far from the best equal.
-        """
-        return self._log_posterior(descriptor, stop)[0].astype(np.float32)
+    def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
+        """The k most probable places below row `stop` that share a word; ties go to the earlier row."""
+        score, shared = self._scored(descriptor, stop)
+        return ranked(np.flatnonzero(shared), score, k)
+
+    def _scored(self, descriptor: Words, stop: int | None) -> tuple[Float32s, Bools]:
+        """(stop,) scores, and whether each place shares a word with the image."""
+        places, new, shared = self.log_likelihood(descriptor, stop)
+        return (self._state.weight * (places - new)).astype(np.float32), shared
+
+    def log_likelihood(self, descriptor: Words, stop: int | None = None) -> tuple[Floats, float, Bools]:
+        """(stop,) ln p(Z | L) of the places, that of a new place with its calibration, and whether a place shares a
+        word."""
+        state = self._state
+        places, shared = self._evidence(descriptor, len(self) if stop is None else min(stop, len(self)))
+        if state.samples is None:
+            new = average_place(descriptor, state.model)
+        else:
+            new = log_mean(state.samples(descriptor, len(state.samples))[0])
+        return places, new + state.new_place_nats, shared
+
+
+class FabmapIndex(FabmapPart):
+    """A whole map: scores are natural logs of the posterior before smoothing, which would make all places that are far
+    from the best equal. A query's prior is the same for every place."""
 
     def posterior(self, descriptor: Words, stop: int | None = None) -> tuple[Floats, float]:
         """(stop,) float64 probability of each place, smoothed, and that of a new place; they sum to 1.
@@ -199,59 +216,20 @@ class FabmapIndex:
         joint /= joint.sum()
         return joint[: len(places)], float(joint[-1]) if s.new_place_prior else 0.0
 
-    def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
-        """The k most probable places below row `stop` that share a word; ties go to the earlier row."""
+    def _scored(self, descriptor: Words, stop: int | None) -> tuple[Float32s, Bools]:
         places, _, shared = self._log_posterior(descriptor, stop)
-        return _best(places.astype(np.float32), shared, k)
+        return places.astype(np.float32), shared
 
     def _log_posterior(self, descriptor: Words, stop: int | None) -> tuple[Floats, float, Bools]:
         """ln p(L | Z) of the places and of a new place before smoothing, and whether a place shares a word."""
-        state = self._state
-        prior = state.settings.new_place_prior
-        places, shared = self._evidence(descriptor, self._below(stop))
+        prior, weight = self._state.settings.new_place_prior, self._state.weight
+        places, new, shared = self.log_likelihood(descriptor, stop)
         if len(places) == 0:
             return places, 0.0, shared
-        places = state.weight * places + np.log((1 - prior) / len(places))
-        new = -np.inf
-        if prior:
-            new = state.weight * (self._new_place(descriptor) + state.new_place_nats) + np.log(prior)
+        places = weight * places + np.log((1 - prior) / len(places))
+        new = weight * new + np.log(prior) if prior else -np.inf
         total = np.logaddexp(np.logaddexp.reduce(places), new)
         return places - total, float(new - total), shared
-
-    def _new_place(self, descriptor: Words) -> float:
-        samples = self._state.samples
-        if samples is None:
-            return average_place(descriptor, self._state.model)
-        return log_mean(samples(descriptor, len(samples))[0])
-
-    def _below(self, stop: int | None) -> int:
-        return len(self) if stop is None else min(stop, len(self))
-
-
-class FabmapPart:
-    """Some places of a map. A posterior is over all places there are, so here a place's score is the natural log of how
-    much more likely the image is there than at a new place: over the whole map the order is that of the posterior."""
-
-    def __init__(self, state: FabmapState, places: Sequence[Words]) -> None:
-        self._all = FabmapIndex(state, places)
-
-    def __len__(self) -> int:
-        return len(self._all)
-
-    def scores(self, descriptor: Words, stop: int | None = None) -> Float32s:
-        """(stop,) natural log of each place's likelihood over that of a new place."""
-        return self._all.log_ratio(descriptor, stop)[0].astype(np.float32)
-
-    def query(self, descriptor: Words, k: int, stop: int | None = None) -> Ranking:
-        """The k most probable places below row `stop` that share a word; ties go to the earlier row."""
-        ratio, shared = self._all.log_ratio(descriptor, stop)
-        return _best(ratio.astype(np.float32), shared, k)
-
-
-def _best(score: Float32s, shared: Bools, k: int) -> Ranking:
-    rows = np.flatnonzero(shared)
-    rows = rows[np.lexsort((rows, -score[rows]))][: max(k, 0)]
-    return Ranking(rows.astype(np.int32), score[rows])
 
 
 def _words(vocabulary: Vocabulary, descriptors: NDArray[np.uint8]) -> Words:

@@ -5,7 +5,6 @@ The energy of a bank of Gabor filters over the prefiltered image, averaged over 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numba
@@ -15,7 +14,7 @@ from pydantic import Field
 
 from vplog.data import THUMBNAIL_SIDE
 from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
-from vplog.places.relearn import RelearnedSettings, keep_references
+from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -52,29 +51,15 @@ class GistSettings(RelearnedSettings):
         return GistState(self, keep_references(references))
 
 
-@dataclass(frozen=True, eq=False)
 class GistState(VectorState):
     """The filters. Shared freely between threads."""
 
-    settings: GistSettings
-    references: list[Reference]
-
-    def __post_init__(self) -> None:
-        s = self.settings
-        object.__setattr__(self, "_low_pass", _low_pass(THUMBNAIL_SIDE + 2 * _PREFILTER_PAD))
-        object.__setattr__(self, "_filters", gabor_filters(THUMBNAIL_SIDE + 2 * _PAD, s.scales, s.orientations))
-
-    _low_pass: Float32s = None  # pyright: ignore[reportAssignmentType]
-    _filters: Float32s = None  # pyright: ignore[reportAssignmentType]
-
-    @property
-    def _length(self) -> int:
-        s = self.settings
-        return s.scales * s.orientations * s.blocks**2
-
-    @property
-    def arrow_type(self) -> pa.FixedSizeListType:
-        return pa.list_(pa.float16(), self._length)
+    def __init__(self, settings: GistSettings, references: list[Reference]) -> None:
+        s = self.settings = settings
+        self.references = references
+        self.arrow_type = pa.list_(pa.float16(), s.scales * s.orientations * s.blocks**2)
+        self._low_pass = _low_pass(THUMBNAIL_SIDE + 2 * _PREFILTER_PAD)
+        self._filters = gabor_filters(THUMBNAIL_SIDE + 2 * _PAD, s.scales, s.orientations)
 
     def describe(self, features: Features) -> NDArray[np.float16]:
         """(D,) mean energy by scale, orientation, then block, row by row. Needs the thumbnail."""
@@ -101,7 +86,7 @@ class GistState(VectorState):
         return np.fft.ifft2(np.fft.fft2(image) * self._low_pass).real.astype(np.float32)
 
     def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(np.array(descriptors, np.float32).reshape(-1, self._length), _nearness)
+        return VectorIndex(self.matrix(descriptors, np.float32), _nearness)
 
 
 def _low_pass(side: int) -> Float32s:

@@ -7,7 +7,7 @@ representation, ACM MM 2013) of keypoints and patches, with the position in the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numba
@@ -16,11 +16,12 @@ import pyarrow as pa
 from pydantic import Field
 
 from vplog.places.bobb import BobbSettings
-from vplog.places.columns import check_type, check_values
-from vplog.places.dense import best_rows, vectors_from_arrow, vectors_to_arrow
+from vplog.places.code_search import Place
+from vplog.places.columns import from_column, to_column
+from vplog.places.dense import best_rows
+from vplog.places.library_files import ReferencesState, RelearnedSettings
 from vplog.places.matches import keypoints_of, patches_of
-from vplog.places.relearn import ReferencesState, RelearnedSettings
-from vplog.places.vocabulary import ROOT_STEPS
+from vplog.places.vocabulary import ROOT_STEPS, spread_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -29,8 +30,9 @@ if TYPE_CHECKING:
 
     from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
     from vplog.execution.execution import Execution
-    from vplog.places.bobb import BobbState, Place
+    from vplog.places.bobb import BobbState
     from vplog.places.code_search import CodeIndex
+    from vplog.places.matches import Described
 
 _STEPS = 4096
 """Steps of 1: values are rounded to whole ones before they are summed over features, so that sums stay below 2^53 and
@@ -75,17 +77,17 @@ class HybridSettings(RelearnedSettings):
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> HybridState:
         """Index the references, learn words, and how scores vary. Raises LibraryError where there are no features."""
-        kept = list(references)
-        bobb = self.bobb.learn(kept, execution)
-        words = learn_words([_described(r.features, self) for r in kept], self)
-        state = HybridState(self, kept, bobb, words, self.share)
-        rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MOST_REFERENCES)).astype(np.int64)).tolist()
-        places = list(execution.map(lambda row: state.describe(kept[row].features), rows))
-        return HybridState(self, kept, bobb, words, _balance(state.index(places), places, self.share))
+        references = list(references)
+        bobb = self.bobb.learn(references, execution)
+        vlad = learn_vlad([_features_of(r.features, self) for r in references], self)
+        state = HybridState(self, references, bobb, vlad, self.share)
+        rows = spread_rows(len(references), _MOST_REFERENCES).tolist()
+        places = list(execution.map(lambda row: state.describe(references[row].features), rows))
+        return replace(state, share=_balance(state.index(places), places, self.share))
 
 
 @dataclass(frozen=True, eq=False)
-class Words:
+class BinaryVlad:
     """W words in a space of 64 principal directions of descriptors and 2 of positions."""
 
     mean: Float32s
@@ -95,35 +97,33 @@ class Words:
     place: float
     centres: Floats
     """(W, 66) whole steps of 1/4096."""
-    turn: Floats
-    """(66, B) whole steps: a rotation, so that each bit tells as much."""
+    rotation: Floats
+    """(66, B) whole steps, so that each bit tells as much."""
 
     def signs(self, values: Float32s, points: Float32s) -> Bytes:
         """(W * B / 8,) bits: the side on which the features of a word lie, summed. All 0 without features."""
-        placed = _place_values(values / ROOT_STEPS, points, self.mean, self.directions, self.place)
-        return np.packbits(_sum_residuals(placed, self.centres, _STEPS) @ self.turn > 0)
+        placed = _with_position(values / ROOT_STEPS, points, self.mean, self.directions, self.place)
+        return np.packbits(_sum_residuals(placed, self.centres, _STEPS) @ self.rotation > 0)
 
 
-def _described(features: Features, settings: HybridSettings) -> tuple[Float32s, Float32s]:
-    """(M, 128) RootSIFT in steps of 1/512 and (M, 2) places of an image's patches and keypoints."""
+def _features_of(features: Features, settings: HybridSettings) -> Described:
+    """Patches and keypoints of an image, RootSIFT in steps of 1/512."""
     wanted = settings.bobb.model_copy(update={"features": settings.features, "root_sift": True})
-    kinds = keypoints_of(features, wanted), patches_of(features, wanted)
-    return np.concatenate([values for values, _ in kinds]), np.concatenate([points for _, points in kinds])
+    values, points = map(np.concatenate, zip(keypoints_of(features, wanted), patches_of(features, wanted), strict=True))
+    return values, points
 
 
-def learn_words(features: Sequence[tuple[Float32s, Float32s]], settings: HybridSettings) -> Words:
+def learn_vlad(features: Sequence[Described], settings: HybridSettings) -> BinaryVlad:
     """From the library's features, of which there is one at least."""
-    steps = np.concatenate([values for values, _ in features]).astype(np.float64)
-    points = np.concatenate([points for _, points in features])
-    rows = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _MOST_FEATURES)).astype(np.int64))
-    mean, directions = _principal(steps[rows] / ROOT_STEPS, settings.whitening)
+    steps, points = map(np.concatenate, zip(*features, strict=True))
+    rows = spread_rows(len(steps), _MOST_FEATURES)
+    roots, points = steps[rows].astype(np.float64) / ROOT_STEPS, points[rows]
+    mean, directions = _principal(roots, settings.whitening)
     rng = np.random.default_rng(settings.seed)
-    values = _place_values(
-        (steps[rows] / ROOT_STEPS).astype(np.float32), points[rows], mean, directions, settings.place
-    )
+    values = _with_position(roots.astype(np.float32), points, mean, directions, settings.place)
     centres = _centres(values, settings.words, rng)
-    turn = np.linalg.qr(rng.normal(size=(values.shape[1], values.shape[1])))[0][:, : settings.bits]
-    return Words(mean, directions, settings.place, centres, np.rint(turn * _STEPS))
+    rotation = np.linalg.qr(rng.normal(size=(values.shape[1], values.shape[1])))[0][:, : settings.bits]
+    return BinaryVlad(mean, directions, settings.place, centres, np.rint(rotation * _STEPS))
 
 
 def _principal(values: Floats, whitening: float) -> tuple[Float32s, Float32s]:
@@ -131,11 +131,11 @@ def _principal(values: Floats, whitening: float) -> tuple[Float32s, Float32s]:
     mean = values.mean(axis=0)
     covariance = values.T @ values / len(values) - np.outer(mean, mean)
     variance, sides = np.linalg.eigh(covariance)
-    kept = np.argsort(-variance, kind="stable")[:_DIRECTIONS]
-    sides = sides[:, kept]
+    largest = np.argsort(-variance, kind="stable")[:_DIRECTIONS]
+    sides = sides[:, largest]
     # an eigenvector's sign is a matter of the machine: let its largest entry be positive
-    sides = sides * np.sign(sides[np.argmax(np.abs(sides), axis=0), np.arange(len(kept))])
-    variance = np.maximum(variance[kept], max(_LEAST_VARIANCE * variance.max(), 1e-12))
+    sides = sides * np.sign(sides[np.argmax(np.abs(sides), axis=0), np.arange(len(largest))])
+    variance = np.maximum(variance[largest], max(_LEAST_VARIANCE * variance.max(), 1e-12))
     length = np.sqrt((variance ** (1 - whitening)).sum())
     return mean.astype(np.float32), (sides / (variance ** (whitening / 2) * length)).astype(np.float32)
 
@@ -152,14 +152,13 @@ def _project(descriptors, mean, directions):
     return result
 
 
-def _place_values(
+def _with_position(
     descriptors: Float32s, points: Float32s, mean: Float32s, directions: Float32s, place: float
 ) -> Floats:
     """(M, 66) whole steps."""
-    described = _project(descriptors, mean, directions)
-    return np.rint(
-        np.column_stack([described, (points - np.float32(0.5)) * np.float32(place)]).astype(np.float64) * _STEPS
-    )
+    position = (points - np.float32(0.5)) * np.float32(place)
+    values = np.column_stack([_project(descriptors, mean, directions), position])
+    return np.rint(values.astype(np.float64) * _STEPS)
 
 
 def _centres(values: Floats, words: int, rng: np.random.Generator) -> Floats:
@@ -207,13 +206,13 @@ def _sum_residuals(values, centres, steps):
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class HybridPlace:
     """The descriptor."""
 
     boxes: Place
     """BoBB's."""
     signs: Bytes
-    """(W * B / 8,) of `Words.signs`."""
+    """(W * B / 8,) of `BinaryVlad.signs`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,13 +222,9 @@ class HybridState(ReferencesState):
     settings: HybridSettings
     references: list[Reference]
     bobb: BobbState
-    words: Words
+    vlad: BinaryVlad
     share: float
     """0..1: part of the words in a score."""
-
-    @property
-    def _signs_type(self) -> pa.FixedSizeListType:
-        return pa.list_(pa.uint8(), self.settings.words * self.settings.bits // 8)
 
     @property
     def bits(self) -> int:
@@ -238,74 +233,66 @@ class HybridState(ReferencesState):
 
     @property
     def arrow_type(self) -> pa.DataType:
-        return pa.struct([pa.field("boxes", self.bobb.arrow_type), pa.field("signs", self._signs_type)])
+        signs = pa.list_(pa.uint8(), self.settings.words * self.settings.bits // 8)
+        return pa.struct([pa.field("boxes", self.bobb.arrow_type), pa.field("signs", signs)])
 
-    def describe(self, features: Features) -> Described:
+    def describe(self, features: Features) -> HybridPlace:
         """Boxes and signs of the same features."""
-        return Described(self.bobb.describe(features), self.words.signs(*_described(features, self.settings)))
+        return HybridPlace(self.bobb.describe(features), self.vlad.signs(*_features_of(features, self.settings)))
 
-    def index(self, descriptors: Sequence[Described]) -> HybridIndex:
+    def _signs(self, places: Sequence[HybridPlace]) -> Bytes:
+        """(N, W * B / 8)."""
+        length = self.settings.words * self.settings.bits // 8
+        return np.array([place.signs for place in places], np.uint8).reshape(-1, length)
+
+    def index(self, descriptors: Sequence[HybridPlace]) -> HybridIndex:
         boxes = self.bobb.index([place.boxes for place in descriptors])
-        return HybridIndex(
-            boxes, np.array([p.signs for p in descriptors], np.uint8), self._signs_type.list_size, self.share
-        )
+        return HybridIndex(boxes, self._signs(descriptors), self.share)
 
     def windows(self, rank: int) -> Floats:
-        """(I, 4) windows of the boxes."""
         return self.bobb.windows(rank)
 
-    def boxes(self, place: Described) -> Boxes:
-        """The boxes of a place as shares of the reference's sides."""
+    def boxes(self, place: HybridPlace) -> Boxes:
         return self.bobb.boxes(place.boxes)
 
     def voting_map(self, features: Features, reference: int) -> Floats:
-        """(rows, columns) votes of the boxes' matches."""
         return self.bobb.voting_map(features, reference)
 
-    def shared(self, places: Sequence[Described], query: Int32s, match: Int32s) -> SharedReferences:
-        """The references that explain both places of pairs (C,) of rows, by the boxes."""
+    def shared(self, places: Sequence[HybridPlace], query: Int32s, match: Int32s) -> SharedReferences:
         return self.bobb.shared([place.boxes for place in places], query, match)
 
-    def to_arrow(self, descriptors: Sequence[Described]) -> pa.Array:
-        columns = [
-            self.bobb.to_arrow([place.boxes for place in descriptors]),
-            vectors_to_arrow([place.signs for place in descriptors], self._signs_type),
-        ]
-        return pa.StructArray.from_arrays(columns, fields=list(self.arrow_type))
+    def to_arrow(self, descriptors: Sequence[HybridPlace]) -> pa.Array:
+        boxes = self.bobb.arrays([place.boxes for place in descriptors])
+        return to_column(self.arrow_type, iter((*boxes, self._signs(descriptors))))
 
-    def from_arrow(self, column: pa.Array) -> list[Described]:
-        """The places of a table's column. Raises LibraryError where it is of another kind or library."""
-        check_type(column, self.arrow_type)
-        check_values(column)
-        boxes = self.bobb.from_arrow(column.field("boxes"))
-        signs = vectors_from_arrow(column.field("signs"), self._signs_type)
-        return [Described(b, s) for b, s in zip(boxes, signs, strict=True)]
+    def from_arrow(self, column: pa.Array) -> list[HybridPlace]:
+        *boxes, signs = from_column(column, self.arrow_type)
+        return list(map(HybridPlace, map(Place, *self.bobb.checked(boxes)), signs))
 
 
 class HybridIndex:
     """Places of a map; rows are in the order given."""
 
-    def __init__(self, boxes: CodeIndex, signs: Bytes, length: int, share: float) -> None:
+    def __init__(self, boxes: CodeIndex, signs: Bytes, share: float) -> None:
         """`signs` (N, length); `share` of the words in a score."""
-        self._boxes, self._share, self._bits = boxes, share, 8 * length
-        self._signs = _words_of_64(signs.reshape(-1, length))
+        self._boxes, self._share, self._bits = boxes, share, 8 * signs.shape[1]
+        self._signs = _words_of_64(signs)
 
     def __len__(self) -> int:
         return len(self._boxes)
 
-    def alike(self, descriptor: Described, stop: int | None = None) -> tuple[Float32s, Float32s]:
+    def alike(self, descriptor: HybridPlace, stop: int | None = None) -> tuple[Float32s, Float32s]:
         """(stop,) BoBB's score, and agreement of the signs 0..1: 0 where half of them or fewer are equal."""
         boxes = self._boxes.scores(descriptor.boxes, stop)
         query = _words_of_64(descriptor.signs[None])[0]
         return boxes, _agreement(self._signs[: len(boxes)], query, self._bits)
 
-    def scores(self, descriptor: Described, stop: int | None = None) -> Float32s:
+    def scores(self, descriptor: HybridPlace, stop: int | None = None) -> Float32s:
         """(stop,) 0..1: both similarities in their shares; 1 is equal."""
         boxes, words = self.alike(descriptor, stop)
         return ((1 - self._share) * boxes + self._share * words).astype(np.float32)
 
-    def query(self, descriptor: Described, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that are alike at all; ties go to the earlier row."""
+    def query(self, descriptor: HybridPlace, k: int, stop: int | None = None) -> Ranking:
         return best_rows(self.scores(descriptor, stop), k)
 
 
@@ -335,7 +322,7 @@ def _agreement(signs, query, bits):
     return result
 
 
-def _balance(index: HybridIndex, places: Sequence[Described], share: float) -> float:
+def _balance(index: HybridIndex, places: Sequence[HybridPlace], share: float) -> float:
     """Part of the words in a score, so that both similarities vary alike between different references at half.
 
     With fewer references than it takes to tell how they vary, `share` itself.

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.relearn import keep_references
+from vplog.places.library_files import keep_references
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Library:
 
     def translate(self, descriptors: Bytes) -> Words:
         """Words of (M, 128) descriptors. Exact whole-number distances: the same on any machine and thread."""
-        return _translate(self.index, self.descriptors, descriptors, self.settings, own=False)
+        return _translate(self.index, self.descriptors, descriptors, self.settings)
 
 
 def build_library(
@@ -85,17 +85,17 @@ def build_library(
 
     Raises LibraryError where there is no feature.
     """
-    kept = keep_references(references, settings.features)
-    start = np.concatenate([[0], np.cumsum([len(reference.features) for reference in kept])]).astype(np.int32)
+    used = keep_references(references, settings.features)
+    start = np.concatenate([[0], np.cumsum([len(reference.features) for reference in used])]).astype(np.int32)
     if start[-1] == 0:
-        raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")
-    descriptors = np.concatenate([reference.features.descriptors for reference in kept])
-    points = np.concatenate([reference.features.points for reference in kept])
+        raise LibraryError(f"None of the {len(used)} reference images has a single feature; choose other images.")
+    descriptors = np.concatenate([reference.features.descriptors for reference in used])
+    points = np.concatenate([reference.features.points for reference in used])
     breadth = max(settings.hnsw_ef_search, settings.neighbours)
     index = hnsw(descriptors.astype(np.float32), settings.hnsw_links, settings.hnsw_ef_construction, breadth)
     nothing = Words(np.zeros(1, np.int32), np.zeros(0, np.int32))
     words = _own_words(index, descriptors, settings, execution) if own else nothing
-    return Library(kept, start, descriptors, points, settings, words, index)
+    return Library(used, start, descriptors, points, settings, words, index)
 
 
 def hnsw(values: Float32s, links: int, ef_construction: int, ef_search: int) -> Any:
@@ -118,31 +118,30 @@ def hnsw(values: Float32s, links: int, ef_construction: int, ef_search: int) -> 
 
 
 def _own_words(index: Any, descriptors: Bytes, settings: WordSettings, execution: Execution) -> Words:
-    def part(rows: slice) -> Words:
-        return _translate(index, descriptors, descriptors[rows], settings, own=True, first=rows.start)
+    def part(first: int) -> Words:
+        return _translate(index, descriptors, descriptors[first : first + 1000], settings, first)
 
-    parts = [slice(at, at + 1000) for at in range(0, len(descriptors), 1000)]
-    done = list(execution.map(part, parts))
-    counts = np.concatenate([np.diff(words.start) for words in done])
+    parts = list(execution.map(part, range(0, len(descriptors), 1000)))
+    counts = np.concatenate([np.diff(words.start) for words in parts])
     start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    return Words(start, np.concatenate([words.values for words in done]))
+    return Words(start, np.concatenate([words.values for words in parts]))
 
 
 def _translate(
-    index: Any, library: Bytes, descriptors: Bytes, settings: WordSettings, own: bool, first: int = 0
+    index: Any, library: Bytes, descriptors: Bytes, settings: WordSettings, first: int | None = None
 ) -> Words:
-    """Near neighbours that pass the L1 check; with `own`, row r is library feature first + r and has its own word."""
+    """Near neighbours that pass the L1 check; with `first`, row r is library feature first + r and has its own word."""
     if len(descriptors) == 0:
         return Words(np.zeros(1, np.int32), np.zeros(0, np.int32))
+    none = np.iinfo(np.int64).max
     neighbours = index.search(descriptors.astype(np.float32), settings.neighbours)[1]
     close = l1_distance(descriptors, library, neighbours) < settings.max_l1
-    neighbours = np.where(close & (neighbours >= 0), neighbours, np.iinfo(np.int64).max)
-    if own:
-        mine = first + np.arange(len(descriptors))[:, None]
-        neighbours = np.where(neighbours == mine, np.iinfo(np.int64).max, neighbours)
-        neighbours = np.concatenate([mine, neighbours], axis=1)
+    neighbours = np.where(close & (neighbours >= 0), neighbours, none)
+    if first is not None:
+        own = first + np.arange(len(descriptors))[:, None]
+        neighbours = np.concatenate([own, np.where(neighbours == own, none, neighbours)], axis=1)
     neighbours.sort(axis=1)
-    valid = neighbours < np.iinfo(np.int64).max
+    valid = neighbours < none
     start = np.concatenate([[0], np.cumsum(valid.sum(axis=1))]).astype(np.int32)
     return Words(start, neighbours[valid].astype(np.int32))
 

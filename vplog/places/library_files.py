@@ -1,4 +1,4 @@
-"""A reference library on disk, for every recogniser: images, features and settings."""
+"""A reference library on disk, for every recogniser: images, features and settings. Loading it learns again."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -16,16 +17,15 @@ import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
+from vplog.settings import Settings
 from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
-
-    from vplog.settings import Settings
 
 _FORMAT = 1
 """Version of library.json. A reader refuses a newer one."""
@@ -33,9 +33,51 @@ _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
 
-def strongest(reference: Reference, count: int) -> Reference:
-    """The reference with at most its `count` strongest features."""
-    return replace(reference, features=reference.features.rows(slice(count)))
+class RelearnedSettings(Settings):
+    """Settings of a recogniser that is saved as its references."""
+
+    def load(self, folder: Path, execution: Execution) -> Any:
+        """A library saved by its state. Raises LibraryError where it is damaged or gives another hash."""
+        return relearn(type(self), folder, execution)
+
+
+class ReferencesState:
+    """A state that follows from settings and references: its hash, and how it is saved."""
+
+    settings: Any
+    references: list[Reference]
+
+    @property
+    def hash(self) -> str:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> str:
+        return references_hash(self.references, self.settings)
+
+    def save(self, folder: Path) -> None:
+        save_references(self.references, self.settings, folder)
+
+
+def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:
+    """The references with their `features` strongest features, None for all. Raises LibraryError for none."""
+    found = [replace(one, features=one.features.rows(slice(features))) for one in references]
+    if not found:
+        raise LibraryError("A library needs at least one reference image; none was given.")
+    return found
+
+
+def relearn(settings: Any, folder: Path, execution: Execution, learn: Callable[..., Any] | None = None) -> Any:
+    """State of a folder written by `save_references`, whose own settings count; `settings` is their class, and `learn`
+    its method that makes the state. Raises LibraryError where the folder is damaged or gives another hash."""
+    record = read_library_record(folder)
+    own = settings.read(record["settings"], f"{folder}/library.json")
+    state = (learn or settings.learn)(own, load_references(folder, execution), execution)
+    if state.hash != record["hash"]:
+        raise LibraryError(
+            f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
+        )
+    return state
 
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:
@@ -80,37 +122,14 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         features = [reference.features for reference in references]
         owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
         points = np.concatenate([f.points for f in features])
-        descriptors = np.concatenate([f.descriptors for f in features])
-        _write(
-            folder / "features.parquet",
-            pa.table(
-                {
-                    "reference": owners,
-                    "x": points[:, 0],
-                    "y": points[:, 1],
-                    "size": np.concatenate([f.sizes for f in features]),
-                    "descriptor": pa.FixedSizeBinaryArray.from_buffers(
-                        pa.binary(128), len(owners), [None, pa.py_buffer(np.ascontiguousarray(descriptors))]
-                    ),
-                },
-                schema=_FEATURES,
-            ),
-            compression="zstd",
-        )
-        _write(
-            folder / "references.parquet",
-            pa.table(
-                {
-                    "drive": [r.drive for r in references],
-                    "stamp_ns": [r.stamp_ns for r in references],
-                    "width": [f.width for f in features],
-                    "height": [f.height for f in features],
-                    "image": [cv2.imencode(".png", r.image)[1].tobytes() for r in references],
-                },
-                schema=_REFERENCES,
-            ),
-            compression="none",
-        )
+        sizes = np.concatenate([f.sizes for f in features])
+        descriptors = pa.py_buffer(np.ascontiguousarray(np.concatenate([f.descriptors for f in features])))
+        packed = pa.FixedSizeBinaryArray.from_buffers(pa.binary(128), len(owners), [None, descriptors])
+        _write(folder / "features.parquet", _FEATURES, [owners, *points.T, sizes, packed], compression="zstd")
+        images = [cv2.imencode(".png", r.image)[1].tobytes() for r in references]
+        entries = [(r.drive, r.stamp_ns, f.width, f.height) for r, f in zip(references, features, strict=True)]
+        columns = [*zip(*entries, strict=True), images]
+        _write(folder / "references.parquet", _REFERENCES, columns, compression="none")
         record = {
             "format": _FORMAT,
             "vplog": vplog.__version__,
@@ -129,7 +148,8 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         ) from None
 
 
-def _write(path: Path, table: pa.Table, compression: str) -> None:
+def _write(path: Path, schema: pa.Schema, columns: Sequence[Any], compression: str) -> None:
+    table = pa.table(dict(zip(schema.names, columns, strict=True)), schema=schema)
     with path.open("wb") as stream:
         write_table(stream, table, compression=compression)
 

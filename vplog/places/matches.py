@@ -6,8 +6,9 @@ one absolute distance, a match here weighs by how much nearer it is than the fea
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+import threading
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numba
 import numpy as np
@@ -15,18 +16,33 @@ from pydantic import Field
 
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
-from vplog.places.once import Once
+from vplog.places.library_files import keep_references
 from vplog.places.patches import describe_patches
-from vplog.places.relearn import keep_references
 from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable
 
     from vplog.data import Features, Float32s, Int32s, Reference
 
-    Both = tuple["Indexed | None", "Indexed | None"]
+    Described = tuple[Float32s, Float32s]
+    """Descriptors (M, 128), whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
+
+Value = TypeVar("Value")
+
+
+class Once(Generic[Value]):
+    """A value made by the first call, from whichever thread; the others wait for it."""
+
+    def __init__(self, make: Callable[[], Value]) -> None:
+        self._make, self._made, self._lock = make, list[Value](), threading.Lock()
+
+    def __call__(self) -> Value:
+        with self._lock:
+            if not self._made:
+                self._made.append(self._make())
+        return self._made[0]
 
 
 class WeighedMatchSettings(Settings):
@@ -83,16 +99,12 @@ class Indexed:
     """Weight of a match."""
 
 
-@dataclass(frozen=True, eq=False)
 class Matcher:
     """The features of L references, indexed on first use. Safe to share between threads."""
 
-    references: list[Reference]
-    settings: WeighedMatchSettings
-    _indexed: Once[Both] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_indexed", Once(lambda: _index_both(self.references, self.settings)))
+    def __init__(self, references: list[Reference], settings: WeighedMatchSettings) -> None:
+        self.references, self.settings = references, settings
+        self._indexed = Once(lambda: (self._index(keypoints_of, 1.0), self._index(patches_of, settings.patch_weight)))
 
     def __len__(self) -> int:
         return len(self.references)
@@ -107,31 +119,36 @@ class Matcher:
         """The patches; None where they are not used, or the references have none."""
         return self._indexed()[1]
 
+    def _index(self, described: Callable[[Features, WeighedMatchSettings], Described], weight: float) -> Indexed | None:
+        s = self.settings
+        values, points = zip(*(described(r.features, s) for r in self.references), strict=True)
+        owner = np.repeat(np.arange(len(values), dtype=np.int32), list(map(len, values)))
+        if not len(owner):
+            return None
+        graph = hnsw(np.concatenate(values), s.hnsw_links, s.hnsw_ef_construction, s.neighbours)
+        return Indexed(owner, np.concatenate(points), graph, weight)
+
     def match(self, features: Features) -> Matches:
         """Matches of an image."""
         s, L = self.settings, len(self.references)
         found = []
-        for kind, described in ((self.keypoints, keypoints_of), (self.patches, patches_of)):
+        for kind, described in zip(self._indexed(), (keypoints_of, patches_of), strict=True):
             if kind is not None:
                 values, points = described(features, s)
                 if len(values):
                     found.append((kind, points, *kind.graph.search(values, s.neighbours)))
         itself = max((_itself(distance, entry, kind.owner, L) for kind, _, distance, entry in found), default=-1)
-        rows = [np.zeros(0, np.int32)]
-        here, there, weight = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
+        none = np.zeros((0, 2), np.float32)
+        parts = [(np.zeros(0, np.int32), none, none, none[:, 0])]
         for kind, points, distance, entry in found:
-            feature, library, one = _weigh(distance, entry, kind.owner, L, itself, s.reach)
-            rows.append(kind.owner[library])
-            here.append(points[feature])
-            there.append(kind.points[library])
-            weight.append(one * np.float32(kind.weight))
-        owner = np.concatenate(rows)
+            feature, library, weight = _weigh(distance, entry, kind.owner, L, itself, s.reach)
+            weight *= np.float32(kind.weight)
+            parts.append((kind.owner[library], points[feature], kind.points[library], weight))
+        owner, here, there, weight = map(np.concatenate, zip(*parts, strict=True))
         order = np.argsort(owner, kind="stable")
         start = np.searchsorted(owner[order], np.arange(L + 1)).astype(np.int32)
-        return Matches(
-            start, np.concatenate(here)[order], np.concatenate(there)[order], np.concatenate(weight)[order],
-            itself, np.concatenate([here[0], *(points for _, points, _, _ in found)]),
-        )  # fmt: skip
+        points = np.concatenate([none, *(points for _, points, _, _ in found)])
+        return Matches(start, here[order], there[order], weight[order], itself, points)
 
 
 def large_enough(features: Features, settings: WeighedMatchSettings) -> Features:
@@ -140,20 +157,16 @@ def large_enough(features: Features, settings: WeighedMatchSettings) -> Features
     return features.rows(np.flatnonzero(features.sizes >= least)[: settings.features])
 
 
-def shares(features: Features) -> Float32s:
-    """(M, 2) points as shares of the image's sides."""
-    return ((features.points + 0.5) / np.array([features.width, features.height])).astype(np.float32)
-
-
-def keypoints_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
-    """Descriptors (M, 128) float32, whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
+def keypoints_of(features: Features, settings: WeighedMatchSettings) -> Described:
+    """The large enough keypoints of an image, strongest first."""
     used = large_enough(features, settings)
     values = root_sift_steps(used.descriptors) if settings.root_sift else used.descriptors.astype(np.float32)
-    return values, shares(used)
+    points = (used.points + 0.5) / np.array([features.width, features.height])
+    return values, points.astype(np.float32)
 
 
-def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Float32s, Float32s]:
-    """`keypoints_of` of patches; none where the features have no thumbnail."""
+def patches_of(features: Features, settings: WeighedMatchSettings) -> Described:
+    """The patches of an image; none where the features have no thumbnail."""
     if settings.patch_weight == 0 or features.thumbnail is None:
         return np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32)
     return describe_patches(features.thumbnail)
@@ -161,30 +174,11 @@ def patches_of(features: Features, settings: WeighedMatchSettings) -> tuple[Floa
 
 def index_references(references: Iterable[Reference], settings: WeighedMatchSettings) -> Matcher:
     """The references' features, not yet indexed. Raises LibraryError where they have none."""
-    kept = [replace(r, features=large_enough(r.features, settings)) for r in keep_references(references)]
-    matcher = Matcher(kept, settings)
-    if not any(len(r.features) for r in kept) and matcher.patches is None:
-        raise LibraryError(f"None of the {len(kept)} reference images has a single feature; choose other images.")
+    used = [replace(r, features=large_enough(r.features, settings)) for r in keep_references(references)]
+    matcher = Matcher(used, settings)
+    if not any(len(r.features) for r in used) and matcher.patches is None:
+        raise LibraryError(f"None of the {len(used)} reference images has a single feature; choose other images.")
     return matcher
-
-
-def _index_both(references: Sequence[Reference], settings: WeighedMatchSettings) -> Both:
-    """Keypoints and patches."""
-    return (
-        _index([keypoints_of(r.features, settings) for r in references], settings, 1.0),
-        _index([patches_of(r.features, settings) for r in references], settings, settings.patch_weight),
-    )
-
-
-def _index(
-    described: Sequence[tuple[Float32s, Float32s]], settings: WeighedMatchSettings, weight: float
-) -> Indexed | None:
-    values = np.concatenate([values for values, _ in described])
-    if not len(values):
-        return None
-    graph = hnsw(values, settings.hnsw_links, settings.hnsw_ef_construction, settings.neighbours)
-    owner = np.repeat(np.arange(len(described), dtype=np.int32), [len(values) for values, _ in described])
-    return Indexed(owner, np.concatenate([points for _, points in described]), graph, weight)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -204,12 +198,12 @@ def _itself(distance, entry, owner, L):
 def _weigh(distance, entry, owner, L, itself, reach):
     """(feature, library feature, weight) of every match; the weights of a feature share it between its references.
 
-    A feature seen on d references is divided by the root of d: it tells less, as a frequent word does.
+    A feature matched on d references is divided by the root of d: it tells less, as a frequent word does.
     """
     F, K = distance.shape
     feature, library = np.empty(F * K, np.int32), np.empty(F * K, np.int32)
     weight = np.empty(F * K, np.float32)
-    seen = np.full(L, -1, np.int32)
+    last_feature = np.full(L, -1, np.int32)
     count = 0
     for f in range(F):
         last = 0.0
@@ -221,12 +215,12 @@ def _weigh(distance, entry, owner, L, itself, reach):
             if entry[f, k] < 0:
                 continue
             reference = owner[entry[f, k]]
-            if reference == itself or seen[reference] == f:
+            if reference == itself or last_feature[reference] == f:
                 continue
             w = 1.0 - distance[f, k] / (reach * last) if last > 0.0 else 0.0
             if w <= 0.0:
                 break
-            seen[reference] = f
+            last_feature[reference] = f
             feature[count], library[count], weight[count] = f, entry[f, k], w
             count += 1
         share = 1.0 / np.sqrt(max(count - first, 1))

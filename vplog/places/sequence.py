@@ -106,8 +106,8 @@ def sequence_rows(
         for first in range(0, count, _BLOCK):  # row half of the buffers is query `first`
             if first:
                 x[: 2 * half], agrees[: 2 * half] = x[_BLOCK:].copy(), agrees[_BLOCK:].copy()
-            known = first + half if first else 0
-            list(mapped(fill, range(known, min(first + _BLOCK + half, count))))
+            filled = first + half if first else 0
+            list(mapped(fill, range(filled, min(first + _BLOCK + half, count))))
             yield from list(mapped(match, range(first, min(first + _BLOCK, count))))
 
 

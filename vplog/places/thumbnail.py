@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from vplog.data import THUMBNAIL_SIDE
 from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
-from vplog.places.relearn import RelearnedSettings, keep_references
+from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -47,10 +47,7 @@ class ThumbnailState(VectorState):
 
     settings: ThumbnailSettings
     references: list[Reference]
-
-    @property
-    def arrow_type(self) -> pa.FixedSizeListType:
-        return pa.list_(pa.uint8(), _WIDTH * _HEIGHT)
+    arrow_type = pa.list_(pa.uint8(), _WIDTH * _HEIGHT)
 
     def describe(self, features: Features) -> Bytes:
         """(2048,) uint8 row by row: deviations from the patch's mean in units of its own. Needs the thumbnail."""
@@ -62,7 +59,7 @@ class ThumbnailState(VectorState):
         return np.clip(np.rint(128 + _STEPS * normal), 0, 255).astype(np.uint8).reshape(-1)
 
     def index(self, descriptors: Sequence[Bytes]) -> VectorIndex:
-        return VectorIndex(np.array(descriptors, np.uint8).reshape(-1, _WIDTH * _HEIGHT), _likeness)
+        return VectorIndex(self.matrix(descriptors, np.uint8), _likeness)
 
 
 @numba.njit(cache=True, nogil=True)

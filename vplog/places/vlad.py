@@ -16,8 +16,8 @@ from pydantic import Field
 
 from vplog.errors import LibraryError
 from vplog.places.dense import VectorIndex, VectorState
-from vplog.places.relearn import RelearnedSettings, keep_references
-from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift
+from vplog.places.library_files import RelearnedSettings, keep_references
+from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift, spread_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -50,16 +50,16 @@ class VladSettings(RelearnedSettings):
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> VladState:
         """Centres and PCA from the references. Raises LibraryError where they are fewer than two or featureless."""
-        kept = keep_references(references, self.features)
-        if len(kept) < 2:
+        used = keep_references(references, self.features)
+        if len(used) < 2:
             raise LibraryError("vlad learns in what its references differ, so it needs at least two; one was given.")
-        descriptors = np.concatenate([reference.features.descriptors for reference in kept])
+        descriptors = np.concatenate([reference.features.descriptors for reference in used])
         vocabulary = learn_vocabulary(descriptors, self.centres, self.seed, execution)
         if self.dimensions is None:
-            return VladState(self, kept, vocabulary, None)
-        rows = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _MAX_PCA_REFERENCES)).astype(np.int64))
-        raw = list(execution.map(lambda row: aggregate(kept[row].features, self.features, vocabulary), rows))
-        return VladState(self, kept, vocabulary, Whitening.learn(np.array(raw), self.dimensions, self.shrinkage))
+            return VladState(self, used, vocabulary, None)
+        rows = spread_rows(len(used), _MAX_PCA_REFERENCES)
+        raw = list(execution.map(lambda row: aggregate(used[row].features, self.features, vocabulary), rows))
+        return VladState(self, used, vocabulary, Whitening.learn(np.array(raw), self.dimensions, self.shrinkage))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,22 +73,19 @@ class VladState(VectorState):
     """None for vectors without PCA."""
 
     @property
-    def _length(self) -> int:
-        return self.vocabulary.centres.size if self.whitening is None else len(self.whitening.projection)
-
-    @property
     def arrow_type(self) -> pa.FixedSizeListType:
-        return pa.list_(pa.float16(), self._length)
+        size = self.vocabulary.centres.size if self.whitening is None else len(self.whitening.projection)
+        return pa.list_(pa.float16(), size)
 
     def describe(self, features: Features) -> NDArray[np.float16]:
         """(D,) of unit length; all zero for an image without features."""
         raw = aggregate(features, self.settings.features, self.vocabulary)
         if self.whitening is None or not raw.any():
-            return raw[: self._length].astype(np.float16)
+            return raw[: self.arrow_type.list_size].astype(np.float16)
         return self.whitening.apply(raw).astype(np.float16)
 
     def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(np.array(descriptors, np.float32).reshape(-1, self._length), _products)
+        return VectorIndex(self.matrix(descriptors, np.float32), _products)
 
 
 def aggregate(features: Features, count: int, vocabulary: Vocabulary) -> Float32s:
@@ -122,13 +119,13 @@ class Whitening:
         centred = (raw - mean).astype(np.float64)
         variance, sides = np.linalg.eigh(centred @ centred.T / len(raw))
         variance = np.maximum(variance, 0)
-        kept = np.argsort(-variance, kind="stable")[: min(dimensions, len(raw) - 1)]
-        directions = sides[:, kept].T @ centred
+        order = np.argsort(-variance, kind="stable")[: min(dimensions, len(raw) - 1)]
+        directions = sides[:, order].T @ centred
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
         # an eigenvector's sign is a matter of the machine: let its largest entry be positive
         largest = np.argmax(np.abs(directions), axis=1)
-        directions *= np.sign(directions[np.arange(len(kept)), largest])[:, None]
-        weight = 1 / np.sqrt(np.maximum(variance[kept] + shrinkage * variance.mean(), 1e-12))
+        directions *= np.sign(directions[np.arange(len(order)), largest])[:, None]
+        weight = 1 / np.sqrt(np.maximum(variance[order] + shrinkage * variance.mean(), 1e-12))
         return cls(mean.astype(np.float32), (directions * weight[:, None]).astype(np.float32))
 
     def apply(self, raw: Float32s) -> Float32s:

@@ -6,7 +6,6 @@ centre is the same whatever the order of the sum, the number of threads or the m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import faiss
@@ -16,7 +15,11 @@ from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Int32s
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Bytes, Float32s, Int32s, Ints
     from vplog.execution.execution import Execution
 
 ROOT_STEPS = np.float32(512)
@@ -45,17 +48,13 @@ def root_sift(descriptors: Bytes) -> Float32s:
     return root_sift_steps(descriptors) / ROOT_STEPS
 
 
-@dataclass(frozen=True, eq=False)
 class Vocabulary:
     """V visual words. Shared freely between threads."""
 
-    centres: Float32s
-    """(V, 128) float32 RootSIFT, multiples of 1/512."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_index", _index(self.centres * ROOT_STEPS, _EF_SEARCH))
-
-    _index: Any = None
+    def __init__(self, centres: Float32s) -> None:
+        """`centres` (V, 128) are RootSIFT, multiples of 1/512."""
+        self.centres = centres
+        self._index = _index(centres * ROOT_STEPS, _EF_SEARCH)
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -118,3 +117,17 @@ def _nearest(index: Any, steps: Float32s) -> Int32s:
     if len(steps) == 0:
         return np.zeros(0, np.int32)
     return index.search(steps, 1)[1][:, 0].astype(np.int32)
+
+
+def postings(images: Sequence[NDArray[np.integer]], words: int) -> tuple[Ints, Int32s, Ints]:
+    """An inverted file of images, each the numbers of its words: those with word w are start[w]..start[w + 1] of the
+    images, in order; and the order that sorts all words of all images so."""
+    owner = np.repeat(np.arange(len(images), dtype=np.int32), [len(image) for image in images])
+    values = np.concatenate([np.zeros(0, np.int64), *images]).astype(np.int64)
+    order = np.argsort(values, kind="stable")
+    return np.searchsorted(values[order], np.arange(words + 1)).astype(np.int64), owner[order], order
+
+
+def spread_rows(count: int, most: int) -> Ints:
+    """At most `most` of `count` rows, evenly from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))

@@ -146,7 +146,7 @@ def _search_segment(
     segment: Segment, numbers: Int32s, shard: Shard, best: Answers, pool: ThreadPoolExecutor
 ) -> list[Answers]:
     """The best of a segment for each view: by view where they are many, else by view and stretch of blocks."""
-    index, threads = CodeIndex.of(segment.lists, shard.overlap, shard.pairing), shard.execution.threads
+    index, threads = CodeIndex(segment.lists, shard.overlap, shard.pairing), shard.execution.threads
     runs = segment.first[:-1], numbers >= 0
     pieces = 1 if len(shard.views) >= 2 * threads else threads
     cuts = np.linspace(0, index.blocks, pieces + 1).astype(int).tolist()

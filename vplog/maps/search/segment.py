@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from vplog.errors import ResultError
-from vplog.places.code_lists import MOST_ROWS, CodeLists, check_lists
+from vplog.places.code_search import MOST_ROWS, CodeLists, check_lists
 from vplog.results.run_record import canonical_json
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import replacing

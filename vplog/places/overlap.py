@@ -1,27 +1,39 @@
-"""Eq. (1) over a whole map, exactly, through inverted lists by reference: only boxes on a shared reference overlap."""
+"""Eq. (1): the overlap of boxes on shared references, over a whole map and by reference for the ledger of closures."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
+from vplog.data import SharedReferences
 from vplog.places.dense import best_rows
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Int32s, Ranking
+    from collections.abc import Callable
+
+    from vplog.data import Bytes, Float32s, Floats, Int32s, Ints, Ranking, Uint16s
+
+    Compare = Callable[[Ints, Ints, Ints, Ints], tuple[Floats, Floats]]
+
+_PAIRS = 4096
+"""Pairs of places that are compared at once: their references and boxes take some ten MB."""
 
 
-class BoxPlace(Protocol):
-    @property
-    def references(self) -> Int32s: ...
-    @property
-    def boxes(self) -> Bytes: ...
+@dataclass(frozen=True, eq=False)
+class BoxPlace:
+    """J references and I boxes on each."""
+
+    references: Int32s
+    """(J,) best first, -1 where fewer references share anything."""
+    boxes: Bytes
+    """(J, I, 4) x0 y0 x1 y1 in cells of the grid, all zero where nothing was found."""
 
 
 class BoxIndex:
-    """Places of a map; rows are in the order given."""
+    """Places of a map, through inverted lists by reference; rows are in the order given."""
 
     def __init__(self, references: Int32s, boxes: Bytes, library_size: int, grid: int) -> None:
         """`references` (N, J), -1 for none; `boxes` (N, J, I, 4) in cells of a grid x grid image."""
@@ -44,7 +56,6 @@ class BoxIndex:
         return (overlap / (boxes.shape[0] * boxes.shape[1] * self._area)).astype(np.float32)
 
     def query(self, descriptor: BoxPlace, k: int, stop: int | None = None) -> Ranking:
-        """The k best places below row `stop` that overlap at all; ties go to the earlier row."""
         return best_rows(self.scores(descriptor, stop), k)
 
 
@@ -71,3 +82,24 @@ def _overlap(references, boxes, list_start, list_place, list_boxes, stop):
                 total += best
             result[list_place[e]] += total
     return result
+
+
+def list_shared(references: Ints, query: Int32s, match: Int32s, compare: Compare) -> SharedReferences:
+    """The references (N, J) of places that two of them share, for C pairs of rows; a negative number is none.
+
+    `compare` gets rows (S,) of the query places, the ranks (S,) of their reference, and the same of the match places,
+    and gives the overlap (S,) of their boxes and what it is worth in the score (S,), up to a factor of the pair.
+    """
+    numbers: list[Uint16s] = []
+    shares: list[Float32s] = []
+    for start in range(0, len(query), _PAIRS):
+        rows, others = query[start : start + _PAIRS].astype(np.int64), match[start : start + _PAIRS].astype(np.int64)
+        mine, theirs = references[rows], references[others]
+        pair, rank, other_rank = np.nonzero((mine[:, :, None] == theirs[:, None, :]) & (mine >= 0)[:, :, None])
+        overlap, worth = compare(rows[pair], rank, others[pair], other_rank)
+        number = mine[pair, rank]
+        order = np.lexsort((number, -worth, pair))
+        ends = np.cumsum(np.bincount(pair, minlength=len(rows)))[:-1]
+        numbers += np.split(number[order].astype(np.uint16), ends)
+        shares += np.split(overlap[order].astype(np.float32), ends)
+    return SharedReferences(numbers, shares)

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
-from vplog.places.search import BoxIndex
+from vplog.places.overlap import BoxIndex, BoxPlace
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    references: np.ndarray
-    boxes: np.ndarray
-
-
-def _place(rng: np.random.Generator, library: int, J: int, I: int, grid: int) -> Place:  # noqa: E741
+def _place(rng: np.random.Generator, library: int, J: int, I: int, grid: int) -> BoxPlace:  # noqa: E741
     references = rng.permutation(library)[:J].astype(np.int32)
     corners = np.sort(rng.integers(0, grid + 1, (J, I, 2, 2)), axis=2)  # some boxes are empty
     boxes = np.concatenate([corners[:, :, 0], corners[:, :, 1]], axis=-1).astype(np.uint8)
     known = int(rng.integers(0, J + 1))
     references[known:], boxes[known:] = -1, 0
-    return Place(references, boxes)
+    return BoxPlace(references, boxes)
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> int:
@@ -30,7 +22,7 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> int:
     return max(wide, 0) * max(tall, 0)
 
 
-def _similarity(query: Place, other: Place, grid: int) -> float:
+def _similarity(query: BoxPlace, other: BoxPlace, grid: int) -> float:
     """Eq. (1), as a share of the image: for each box the best over all i', j' on the same reference."""
     J, boxes = query.boxes.shape[:2]
     total = 0
@@ -41,7 +33,7 @@ def _similarity(query: Place, other: Place, grid: int) -> float:
     return total / (J * boxes * grid * grid)
 
 
-def _map(seed: int, count: int = 40) -> tuple[list[Place], BoxIndex, int]:
+def _map(seed: int, count: int = 40) -> tuple[list[BoxPlace], BoxIndex, int]:
     rng = np.random.default_rng(seed)
     J, I, library = (int(n) for n in (rng.integers(1, 5), rng.integers(1, 5), rng.integers(5, 9)))  # noqa: E741
     grid = int(rng.choice([4, 16, 64, 255]))
@@ -85,7 +77,7 @@ def test_stop_is_a_map_of_the_first_rows() -> None:
 
 
 def test_ties_go_to_the_earlier_row() -> None:
-    place = Place(np.array([2], np.int32), np.array([[[0, 0, 2, 2]]], np.uint8))
+    place = BoxPlace(np.array([2], np.int32), np.array([[[0, 0, 2, 2]]], np.uint8))
     index = BoxIndex(np.full((50, 1), 2, np.int32), np.tile(place.boxes, (50, 1, 1, 1)), 3, 8)
     for k in (1, 7, 50):
         assert index.query(place, k).rows.tolist() == list(range(k))
@@ -93,7 +85,7 @@ def test_ties_go_to_the_earlier_row() -> None:
 
 def test_an_empty_map_has_no_answer() -> None:
     index = BoxIndex(np.zeros((0, 4), np.int32), np.zeros((0, 4, 4, 4), np.uint8), 10, 64)
-    query = Place(np.arange(4, dtype=np.int32), np.full((4, 4, 4), 1, np.uint8))
+    query = BoxPlace(np.arange(4, dtype=np.int32), np.full((4, 4, 4), 1, np.uint8))
     assert len(index) == 0
     assert len(index.query(query, 5).rows) == 0
     assert len(index.scores(query)) == 0
