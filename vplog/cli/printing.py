@@ -244,6 +244,8 @@ def print_optimised(found: dict[str, Any]) -> None:
     )
     print(f"  error {found['error_before']:.6g} before, {found['error_after']:.6g} after (half the chi-square)")
     print(f"  {found['reason']}")
+    if "certificate" in found:
+        print(f"  {found['certificate']['reason']}")
     warn(found["warnings"])
     print(f"  {sum(found['seconds'].values()):.2f} s")
 

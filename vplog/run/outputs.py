@@ -13,6 +13,7 @@ from vplog.data import EdgeKind, Verdict
 from vplog.figures.run_figures import ClosureInputs, earth_of, finished_picture, reference_use
 from vplog.geometry import tum
 from vplog.graph import consistency
+from vplog.graph.certificate import certify
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import about_gps
@@ -155,6 +156,7 @@ def _account(run: Run) -> dict[str, Any]:
             "converged": solution.converged,
             "reason": solution.reason if constrained else "No closure passed verification.",
         },
+        "certificate": certify(run.graph, solution.weight, solution.world_from_body).record(),
         "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
         "gps": about_gps(run.solved),
     }
