@@ -103,6 +103,14 @@ def test_turns_too_many_along_a_cycle_are_refused_and_left(dimension: int, n: in
     assert "no optimum of the edges kept" in solution.reason
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_smallest_graphs_are_certified(n: int, dimension: int) -> None:
+    graph = ring(n, dimension, 1)
+    solution = LmSettings()(graph)
+    assert certify(graph, solution.weight, solution.world_from_body).verdict == "certified"
+
+
 def test_the_staircase_alone_leaves_a_wound_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(certificate, "relaxed", lambda *_: None)
     for dimension, turns in ((2, 2), (2, 3), (3, 2)):

@@ -16,7 +16,7 @@ from vplog.graph import consistency
 from vplog.graph.certificate import certify
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
-from vplog.run.back_end import about_gps
+from vplog.run.back_end import about_gps, keyframe_covariances
 from vplog.run.report import write_report
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def write(
     )  # fmt: skip
     column = [run.state.to_arrow(run.places)]
     tables.write_descriptors(folder / "descriptors.parquet", keyframes, column, run.state.arrow_type, header)
-    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, keyframe_covariances(run.solved))
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)
     tables.write_edges(folder / "edges.parquet", run.graph, run.solution, residual, header)
