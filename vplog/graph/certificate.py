@@ -44,10 +44,13 @@ _ROUNDING = 1e-13
 """Eigenvalues up to this share of the largest entry of S are rounding."""
 _STEPS = 60
 """Newton steps after which a descent ends; from a solution it takes 3-12."""
-_CONVERGED = 1e-13
-"""A descent has converged when a step promises less than this share of the chi-square."""
-_DAMPING = 1e-4
-"""First damping, as a share of the diagonal, and the largest, where no step helps."""
+_CONVERGED = 1e-7
+"""A descent has converged when a step promises less than this share of the chi-square, a tenth of GAP; after a Newton
+step as short, rounding is what is left."""
+_DAMPING = 1e-10
+"""First damping, as a share of the diagonal, what it is changed by, and the largest, where no step helps. Long chains
+have directions of a billionth of the diagonal."""
+_DAMPING_CHANGE = 100.0
 _MOST_DAMPING = 1e6
 _ROUNDS = 4
 """Other starts that are tried."""
@@ -179,7 +182,7 @@ def _certify_part(graph: PoseGraph, weight: Floats, search: bool) -> _Part:
     point, chi2 = descend(problem, start)
     moved_m = float(np.linalg.norm((point - start)[:, :, d], axis=1).max())
     value, direction, tolerance = least_eigenvalue(problem, point)
-    certified = value >= -tolerance
+    certified = value >= -tolerance and is_stationary(problem, point)
     best, lowest = (point, chi2) if certified or not search else better_point(problem, graph, weight, point, direction)
     poses = np.array(graph.world_from_body)
     poses[:, :d, :d], poses[:, :d, 3] = best[:, :, :d], best[:, :, d]
@@ -267,29 +270,36 @@ def precisions(graph: PoseGraph) -> tuple[Floats, Floats]:
 def descend(problem: Problem, start: Floats, tolerance: float = _CONVERGED) -> tuple[Floats, float]:
     """The local minimum that a point (n, p, p + 1) leads to with pose 0 held, and its chi-square.
 
-    Newton's method on the manifold where the Hessian is positive definite and the step helps, else Gauss-Newton, damped
-    as Levenberg-Marquardt.
+    Newton's method on the manifold, Gauss-Newton where its Hessian is not positive definite, damped where a step does
+    not help.
     """
     point, cost, damping = start, problem.cost(start), 0.0
     for _ in range(_STEPS):
-        gradient, newton, gauss_newton = _derivatives(problem, point)
-        hessians = [newton] if damping == 0 else []
+        gradient, hessian, gauss_newton = _derivatives(problem, point)
         while damping <= _MOST_DAMPING:
-            hessian = hessians.pop() if hessians else _damped(gauss_newton, damping)
-            step, promised = _step(hessian, gradient, problem.order)
+            step, promised = _step(_damped(hessian, damping), gradient, problem.order)
+            if promised <= 0 and hessian is not gauss_newton:
+                hessian = gauss_newton
+                continue
             moved = _moved(point, step.reshape(len(point) - 1, -1), problem.d)
             gain = cost - problem.cost(moved)
             if promised > 0 and (gain >= 0 or promised <= tolerance * cost):
                 break
-            damping = max(_DAMPING, damping * 10.0) if hessian is not newton else 0.0
+            damping = max(_DAMPING, damping * _DAMPING_CHANGE)
         else:
             break
         if gain >= 0:
             point, cost = moved, cost - gain
         if promised <= tolerance * cost:
             break
-        damping = damping / 10.0 if damping > _DAMPING else 0.0
+        damping = damping / _DAMPING_CHANGE if damping > _DAMPING else 0.0
     return point, cost
+
+
+def is_stationary(problem: Problem, point: Floats) -> bool:
+    """Whether a descent has ended here and not at its limit: Gauss-Newton promises less than GAP of the chi-square."""
+    gradient, _, gauss_newton = _derivatives(problem, point)
+    return _step(gauss_newton, gradient, problem.order)[1] <= max(GAP * problem.cost(point), _ROUNDING)
 
 
 def _derivatives(problem: Problem, point: Floats) -> tuple[Floats, sparse.csr_array, sparse.csr_array]:
