@@ -62,6 +62,17 @@ def test_a_run_folder_holds_every_file_and_no_scratch_but_its_cache(finished: Pa
     assert {path.suffix for path in (finished / ".cache").iterdir()} == {".stage", ".json"}
 
 
+def test_a_run_says_how_sure_it_is(finished: Path) -> None:
+    """Whether its solution is the global optimum, and of every keyframe its covariance."""
+    certificate = record_of(finished)["certificate"]
+    assert certificate["verdict"] == "certified"
+    assert certificate["smallest_eigenvalue"] > 0
+    assert "does not say whether the closures kept are true" in certificate["reason"]
+    covariance = tables.read_keyframe_covariance(finished / "keyframes.parquet")
+    assert not covariance[0].any()
+    assert (np.linalg.eigvalsh(covariance[1:]) > 0).all()
+
+
 def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Drive) -> None:
     record = record_of(finished)
     assert record["finished"] is True

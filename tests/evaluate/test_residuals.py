@@ -10,7 +10,7 @@ import pytest
 from tests.graph.drive import ledger
 from vplog.data import Closures, Keyframes, Trajectory, Verdict
 from vplog.evaluate.body_truth import BodyTruth
-from vplog.evaluate.closures import score_residuals
+from vplog.evaluate.closures import PoseScore, score_poses, score_residuals
 from vplog.geometry import se3
 
 SIGMA = np.repeat([0.003, 0.05], 3)
@@ -56,3 +56,27 @@ def test_nothing_accepted_is_no_figure() -> None:
     keyframes, closures, truth = drive()
     found = score_residuals(keyframes, replace(closures, verdict=[Verdict.TOO_FAR] * LAP), truth)
     assert (found.closures, found.to_truth, found.pairs, found.to_neighbours) == (0, None, 0, None)
+
+
+@pytest.mark.parametrize("claimed", [0.5, 1.0, 4.0])
+def test_nees_is_one_where_poses_are_off_by_what_they_claim(claimed: float) -> None:
+    """In the frame of the truth, wherever the first keyframe is by either."""
+    keyframes, _, truth = drive()
+    poses = truth.trajectory.world_from_body
+    error = np.random.default_rng(1).normal(size=(2 * LAP, 6)) * SIGMA
+    error[0] = 0.0
+    elsewhere = se3.exp(np.array([[0.2, -0.1, 2.0, 30.0, -7.0, 4.0]]))
+    covariance = np.tile(np.diag((claimed * SIGMA) ** 2), (2 * LAP, 1, 1))
+    covariance[7] = np.nan
+    found = score_poses(keyframes, elsewhere @ poses @ se3.exp(error), covariance, truth)
+    assert found.keyframes == 2 * LAP - 2
+    assert found.nees == pytest.approx(claimed**-2, rel=0.1)
+    assert found.median_sigma_m == pytest.approx(claimed * 0.05 * np.sqrt(3))
+
+
+def test_poses_without_covariance_or_orientation_have_no_nees() -> None:
+    keyframes, _, truth = drive()
+    poses = truth.trajectory.world_from_body
+    unknown, none = np.full((2 * LAP, 6, 6), np.nan), PoseScore(0, None, None)
+    assert score_poses(keyframes, poses, unknown, truth) == none
+    assert score_poses(keyframes, poses, np.tile(np.eye(6), (2 * LAP, 1, 1)), replace(truth, oriented=False)) == none

@@ -58,6 +58,17 @@ def test_keyframes_come_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(world, RUN.solution.world_from_body, rtol=0, atol=1e-12)
 
 
+def test_the_covariance_of_keyframes_comes_back_and_tables_of_before_have_none(tmp_path: Path) -> None:
+    count = len(RUN.keyframes.stamp_ns)
+    covariance = np.random.default_rng(0).normal(size=(count, 6, 6))
+    covariance[1] = np.nan
+    for given, expected in ((covariance, covariance), (None, np.full((count, 6, 6), np.nan))):
+        tables.write_keyframes(tmp_path / "k", RUN.keyframes, RUN.solution.world_from_body, METADATA, given)
+        np.testing.assert_array_equal(tables.read_keyframe_covariance(tmp_path / "k"), expected)
+    pq.write_table(pq.read_table(tmp_path / "k").drop_columns(["covariance"]), tmp_path / "before")
+    assert np.isnan(tables.read_keyframe_covariance(tmp_path / "before")).all()
+
+
 def test_closures_come_back_with_what_is_unknown(tmp_path: Path) -> None:
     tables.write_closures(tmp_path / "c", RUN.closures, RUN.keyframes, METADATA)
     assert_same(tables.read_closures(tmp_path / "c"), RUN.closures, ("match_from_query",))

@@ -15,6 +15,7 @@ from tests.benchmarks.graphs import city, spoiled
 from vplog.cli import main, results
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
+from vplog.graph import lm
 from vplog.graph.consistency import is_loop, odometry_chain
 from vplog.graph.solve import OptimiserSettings
 from vplog.results.g2o import read_g2o, write_g2o
@@ -51,6 +52,31 @@ def test_every_method_solves_and_nothing_is_lost(path: Path, tmp_path: Path, kin
         false = np.flatnonzero(FALSE)
         expected = {(int(50 + 3 * CITY.a[edge]), int(50 + 3 * CITY.b[edge])) for edge in false}
         assert expected <= set(map(tuple, record["rejected_edges"]))
+
+
+def test_a_local_minimum_is_left_with_certify_and_the_record_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A circle of 12 poses, begun with two turns in place of one: plain least squares stays there."""
+    turn = 2 * np.pi / 12
+    text = "".join(f"VERTEX_SE2 {k} 0 0 {np.angle(np.exp(2j * turn * k))}\n" for k in range(12))
+    text += "".join(f"EDGE_SE2 {k} {(k + 1) % 12} {1 + 0.1 * (k == 5)} 0 {turn} 1 0 0 1 0 1\n" for k in range(12))
+    (tmp_path / "in.g2o").write_text(text)
+    monkeypatch.setattr(lm, "initial_poses", lambda factors, _: factors.graph.world_from_body)
+    plain = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o", "lm").record
+    assert "certificate" not in plain
+    done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o", "lm", certify=True).record
+    assert done["error_after"] < 0.01
+    assert plain["error_after"] > 1.0
+    assert "no optimum of the edges kept" in done["reason"]
+    found = json.loads(json.dumps(done))["certificate"]
+    assert found["verdict"] == "certified"
+    assert found["smallest_eigenvalue"] > 0
+    assert "isotropic" in found["noise"]
+    words = ["optimize", str(tmp_path / "in.g2o"), "-o", str(tmp_path / "out.g2o"), "--method", "lm", "--certify"]
+    with pytest.raises(SystemExit):
+        main.main(words)
+    assert "does not say whether the closures kept are true" in capsys.readouterr().out
 
 
 def test_the_methods_of_the_command_line_are_those_of_the_seam() -> None:

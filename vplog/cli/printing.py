@@ -188,6 +188,10 @@ def print_evaluation(found: dict[str, Any]) -> None:
             f"median {residuals['to_truth']:.2f} sigma to the truth{near} (consistent with their covariance: about 1)"
         )
         print_line("residuals", text)
+    poses = found.get("poses")
+    if poses and poses["nees"] is not None:
+        text = f"NEES {poses['nees']:.2f} per degree of freedom (consistent with their covariance: about 1), "
+        print_line("poses", f"{text}median sigma {poses['median_sigma_m']:.3g} m from the first keyframe")
     for when in ("before", "after"):
         ate, rpe, drift = found[f"ate_{when}"], found.get(f"rpe_{when}"), found.get(f"drift_{when}")
         scale = f", scale {ate['scale']:.4f}" if ate["alignment"] == "Sim(3)" else ""
@@ -238,6 +242,8 @@ def print_optimised(found: dict[str, Any]) -> None:
     )
     print(f"  error {found['error_before']:.6g} before, {found['error_after']:.6g} after (half the chi-square)")
     print(f"  {found['reason']}")
+    if "certificate" in found:
+        print(f"  {found['certificate']['reason']}")
     warn(found["warnings"])
     print(f"  {sum(found['seconds'].values()):.2f} s")
 

@@ -51,7 +51,7 @@ def optimize(arguments: argparse.Namespace) -> None:
     """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
     from vplog.verbs.optimize import optimize as optimize_graph
 
-    done = optimize_graph(arguments.graph, arguments.output, arguments.method)
+    done = optimize_graph(arguments.graph, arguments.output, arguments.method, arguments.certify)
     print_result(arguments, done.record, print_optimised)
 
 
@@ -133,6 +133,8 @@ def add_results(
     option(sub, "graph", local_file, "GRAPH.g2o")
     option(sub, "-o --output", place, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
+    text = "say whether the solution is the global optimum of the edges kept, and look for a better one if not"
+    sub.add_argument("--certify", action="store_true", help=text)
 
 
 def _add_explain(sub: argparse.ArgumentParser) -> None:

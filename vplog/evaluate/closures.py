@@ -321,6 +321,31 @@ def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) 
     return ResidualScore(len(rows), _median(to_truth), len(this), _median(to_neighbours))
 
 
+@dataclass(frozen=True)
+class PoseScore:
+    """Errors of the keyframes' poses, normalised by their covariances, both relative to the first keyframe."""
+
+    keyframes: int
+    """Those with a covariance and a truth."""
+    nees: float | None
+    """Mean of e' C^-1 e / 6: about 1 for honest covariances. Neighbours share their errors, so that one drive alone is
+    within a factor of 2 or 3 of it."""
+    median_sigma_m: float | None
+    """Median of the standard deviation of the position: the root of the covariance's trace."""
+
+
+def score_poses(keyframes: Keyframes, world_from_body: Floats, covariance: Floats, truth: BodyTruth) -> PoseScore:
+    """Score solved keyframes (N, 4, 4) by their covariances (N, 6, 6), NaN where unknown."""
+    at = truth.at(keyframes.stamp_ns)
+    rows = np.flatnonzero(at.known & truth.oriented & at.known[:1] & np.isfinite(covariance).all((1, 2)))
+    rows = rows[rows > 0]
+    if not len(rows):
+        return PoseScore(0, None, None)
+    expected, found = (se3.between(poses[:1], poses[rows]) for poses in (at.world_from_body, world_from_body))
+    nees = float((_normalised(expected, found, covariance[rows]) ** 2).mean())
+    return PoseScore(len(rows), nees, float(np.median(np.sqrt(np.trace(covariance[rows, 3:, 3:], axis1=1, axis2=2)))))
+
+
 def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:
     """Positions of closures, and of the next one in order of queries whose ends are near but not both the same."""
     order = np.lexsort((match, query))

@@ -182,6 +182,19 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
         )
 
 
+def subgraph(graph: PoseGraph, rows: Ints, edges: Ints) -> PoseGraph:
+    """Some poses, in order, and some of the edges between them."""
+    return replace(
+        graph,
+        world_from_body=graph.world_from_body[rows],
+        a=np.searchsorted(rows, graph.a[edges]).astype(np.int32),
+        b=np.searchsorted(rows, graph.b[edges]).astype(np.int32),
+        a_from_b=graph.a_from_b[edges],
+        information=graph.information[edges],
+        kind=[graph.kind[edge] for edge in edges.tolist()],
+    )
+
+
 def parts(n: int, a: Int32s | Ints, b: Int32s | Ints) -> Ints:
     """Number (N,) of the connected part that each of n poses belongs to by the edges a, b, in order of first poses."""
     return _parts(n, np.asarray(a, np.int64), np.asarray(b, np.int64))

@@ -1,4 +1,4 @@
-"""Covariances of the motion between two poses of a solved graph."""
+"""Covariances of the poses of a solved graph and of the motion between two."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.geometry import se3
-from vplog.graph.build import AXES
+from vplog.graph.build import AXES, parts
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
@@ -29,6 +29,26 @@ def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats
     Ad = se3.adjoint(se3.between(poses[graph.b[edges]], poses[graph.a[edges]]))[:, axes][:, :, axes]
     mixed = Ad @ ab
     return bb - mixed - np.swapaxes(mixed, 1, 2) + Ad @ aa @ np.swapaxes(Ad, 1, 2)
+
+
+def pose_covariances(objective: Objective, poses: Floats) -> Floats:
+    """Covariance (N, d, d) of world_from_body of every pose, in its own frame, after the least squares at `poses`.
+
+    Relative to the first pose, whose own is 0, or with positions to where these are measured; d = 6, or 3 in the plane.
+    To first order; NaN where edges of positive weight do not lead to pose 0. Raises GraphError where the poses are not
+    determined.
+    """
+    graph, on = objective.factors.graph, np.flatnonzero(objective.weight > 0)
+    a, b = graph.a[on], graph.b[on]
+    ends = np.concatenate([a, b])
+    aa, _, bb = objective.information(poses).inverse_blocks(a, b)
+    result = np.full((len(poses), *aa.shape[1:]), np.nan)
+    result[ends] = np.concatenate([aa, bb])
+    part = parts(len(poses), a, b)
+    result[part != part[0]] = np.nan
+    if objective.positions is None:
+        result[0] = 0.0
+    return result
 
 
 def joint_covariance(factors: Factors, information: Supernodes | BayesTree, poses: Floats, edges: Ints) -> Floats:

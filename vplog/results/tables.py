@@ -91,8 +91,13 @@ KEYFRAMES = pa.schema(
         column("stamp_ns", pa.int64(), "ns", "Stamp of the frame, in the log's clock."),
         *_pose_columns("odom_", "odom_from_body, as the odometry has it"),
         *_pose_columns("world_", "world_from_body, optimised"),
+        column(
+            "covariance", _MATRIX, "rad^2, rad m, m^2",
+            "6x6 of world_from_body in the body frame, by the solved graph: relative to the first keyframe, or to "
+            "earth with GPS; null where not known.", True,
+        ),
     ]
-)
+)  # fmt: skip
 CLOSURES = pa.schema(
     [
         column("query", pa.int32(), "row", "Keyframe, the later one."),
@@ -173,8 +178,14 @@ def descriptors_schema(descriptor: pa.DataType) -> pa.Schema:
     )
 
 
-def write_keyframes(path: Path, keyframes: Keyframes, world_from_body: Floats, metadata: TableMetadata) -> None:
-    """keyframes.parquet, with the optimised poses (N, 4, 4)."""
+def write_keyframes(
+    path: Path,
+    keyframes: Keyframes,
+    world_from_body: Floats,
+    metadata: TableMetadata,
+    covariance: Floats | None = None,
+) -> None:
+    """keyframes.parquet, with the optimised poses (N, 4, 4) and their covariance (N, 6, 6), NaN where unknown."""
     count = len(keyframes.stamp_ns)
     columns = {
         "keyframe": np.arange(count, dtype=np.int32),
@@ -182,8 +193,14 @@ def write_keyframes(path: Path, keyframes: Keyframes, world_from_body: Floats, m
         "stamp_ns": keyframes.stamp_ns,
         **_pose_values("odom_", keyframes.odom_from_body),
         **_pose_values("world_", world_from_body),
+        "covariance": np.full((count, 6, 6), np.nan) if covariance is None else covariance,
     }
     _write(path, "keyframes", _table(KEYFRAMES, columns), metadata)
+
+
+def read_keyframe_covariance(path: Path) -> Floats:
+    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known, as in tables of before."""
+    return _matrices(_read(path, "keyframes", KEYFRAMES), "covariance")
 
 
 def read_keyframes(path: Path) -> tuple[Keyframes, Floats]:

@@ -10,11 +10,15 @@ import numpy as np
 
 from vplog.cache.steps import step
 from vplog.data import EdgeKind, Verdict
+from vplog.errors import GraphError
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.cross_check import cross_checked
-from vplog.graph.gps_factors import fixes_on
+from vplog.graph.factors import Factors
+from vplog.graph.gps_factors import fixes_on, with_fixes
 from vplog.graph.gps_gate import keep_odometry_if_further
+from vplog.graph.least_squares import Objective
+from vplog.graph.marginals import pose_covariances
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.solve import gated
@@ -22,7 +26,7 @@ from vplog.graph.solve import gated
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.data import Closures, Floats, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
     from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.gps_factors import Fixes, GpsSettings
     from vplog.graph.noise import NoiseSettings
@@ -124,6 +128,21 @@ def about_gps(solved: Solved) -> dict[str, Any] | None:
         "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude},
         "world_from_enu": refined.world_from_enu.tolist(),
     }
+
+
+def keyframe_covariances(solved: Solved) -> Floats | None:
+    """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated and the GPS fixes kept;
+    None where edges and fixes do not determine them."""
+    refined, fixes = solved.refined, solved.fixes
+    factors, poses, weight = Factors.of(refined.graph), refined.solution.world_from_body, refined.solution.weight
+    objective = Objective(factors, weight)
+    if fixes is not None and refined.inlier.any():
+        objective = with_fixes(factors, weight, poses, fixes, refined.inlier)
+    try:
+        return pose_covariances(objective, poses)
+    except GraphError as error:
+        _log.warning("The covariance of the keyframes is not known: %s", error)
+        return None
 
 
 def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) -> Closures:

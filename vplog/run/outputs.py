@@ -13,9 +13,10 @@ from vplog.data import EdgeKind, Verdict
 from vplog.figures.run_figures import ClosureInputs, earth_of, finished_picture, reference_use
 from vplog.geometry import tum
 from vplog.graph import consistency
+from vplog.graph.certificate import certify
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
-from vplog.run.back_end import about_gps
+from vplog.run.back_end import about_gps, keyframe_covariances
 from vplog.run.report import write_report
 from vplog.storage.image_file import decode_image
 
@@ -91,7 +92,7 @@ def write(
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
     )  # fmt: skip
     tables.write_descriptors(folder / "descriptors.parquet", keyframes, run.state.to_arrow(run.places), header)
-    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, keyframe_covariances(run.solved))
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)
     tables.write_edges(folder / "edges.parquet", run.graph, run.solution, residual, header)
@@ -149,6 +150,7 @@ def _account(run: Run) -> dict[str, Any]:
             "converged": solution.converged,
             "reason": solution.reason if constrained else "No closure passed verification.",
         },
+        "certificate": certify(run.graph, solution.weight, solution.world_from_body).record(),
         "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
         "gps": about_gps(run.solved),
     }

@@ -109,7 +109,7 @@ def head(
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on."""
-    packages = ("numpy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
+    packages = ("numpy", "scipy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
     return {"python": platform.python_version(), **{name: _version(name) for name in packages}}
 
 

@@ -73,7 +73,8 @@ def evaluate_poses(
     known = _read_truth(truth, options) if known is None else known
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
-    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = run_record.recorded(record, folder / "run.json", dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
@@ -87,6 +88,8 @@ def evaluate_poses(
         "closures": asdict(score),
         "residuals": asdict(closures.score_residuals(keyframes, ledger, of_body)),
     }
+    if record.get("gps") is None:  # with GPS they are relative to earth, where the truth need not be
+        found["poses"] = asdict(closures.score_poses(keyframes, world_from_body, covariance, of_body))
     return Evaluation(found, keyframes, of_body, judged)
 
 

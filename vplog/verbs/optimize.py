@@ -12,7 +12,8 @@ from vplog.data import EdgeKind, PoseGraph, Solution
 from vplog.errors import GraphError
 from vplog.execution.timing import Watch
 from vplog.geometry.se3 import inverse
-from vplog.graph.build import checked, parts
+from vplog.graph.build import checked, parts, subgraph
+from vplog.graph.certificate import solve_certified
 from vplog.graph.solve import OptimiserSettings, gated
 from vplog.results.g2o import read_g2o, write_g2o
 
@@ -34,11 +35,14 @@ class Optimised:
     """What `--json` prints."""
 
 
-def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
+def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) -> Optimised:
     """Solve the graph of a g2o file and write it with its new poses to `out`, all its edges too.
 
     Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
-    where it is. Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
+    where it is. With `certify` the record has a `certificate`: whether the solution is the global optimum of the edges
+    kept. Where it is not and a better one is found, that is taken.
+
+    Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
     """
     optimiser = TypeAdapter(OptimiserSettings).validate_python({"kind": method})
     watch = Watch()
@@ -48,11 +52,18 @@ def optimize(path: Path, out: Path, method: str = "gnc") -> Optimised:
     part = parts(len(ids), graph.a, graph.b)
     warnings = file.warnings + _about_parts(part, ids)
     with watch.stage("solve"):
-        solution, repairs = solve_parts(graph, part, optimiser, ids)
-        solution = _holding(solution, graph, part == part[file.held], file.held)
+        solution, graph, repairs = solve_parts(graph, part, optimiser, ids)
+    certificate = None
+    if certify:
+        with watch.stage("certify"):
+            solution, certificate = solve_certified(graph, solution)
     with watch.stage("write"):
-        write_g2o(out, graph, solution.world_from_body, ids, file.held)
-    return Optimised(file, solution, _record(path, out, method, file, solution, warnings + repairs, watch))
+        solution = _holding(solution, graph, part == part[file.held], file.held)
+        write_g2o(out, file.graph, solution.world_from_body, ids, file.held)
+    record = _record(path, out, method, file, solution, warnings + repairs, watch)
+    if certificate is not None:
+        record["certificate"] = certificate.record()
+    return Optimised(file, solution, record)
 
 
 def _about_parts(part: Ints, ids: Ints) -> list[str]:
@@ -69,42 +80,39 @@ def _about_parts(part: Ints, ids: Ints) -> list[str]:
     return warnings
 
 
-def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints) -> tuple[Solution, list[str]]:
-    """The solution of each part (N,) of a graph by itself, put together, and warnings of what was repaired."""
-    poses, weight = np.array(graph.world_from_body), np.ones(len(graph.a))
+def solve_parts(
+    graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints
+) -> tuple[Solution, PoseGraph, list[str]]:
+    """The solution of each part (N,) of a graph by itself, put together, the graph as repaired, and warnings of it."""
+    poses, weight, information = np.array(graph.world_from_body), np.ones(len(graph.a)), np.array(graph.information)
     solutions, warnings = [], []
     size = np.bincount(part)
     rows_of, edges_of = _by_part(part, len(size)), _by_part(part[graph.a], len(size))
     for number in np.flatnonzero(size > 1).tolist():
         rows, edges = rows_of(number), edges_of(number)
-        alone = PoseGraph(
-            graph.world_from_body[rows],
-            np.searchsorted(rows, graph.a[edges]).astype(np.int32),
-            np.searchsorted(rows, graph.b[edges]).astype(np.int32),
-            graph.a_from_b[edges],
-            graph.information[edges],
-            [graph.kind[edge] for edge in edges],
-            graph.dimension,
-        )
-        alone, repairs = checked(alone)
+        alone, repairs = checked(subgraph(graph, rows, edges))
         solution = gated(alone, optimiser)
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
         warnings += [where + text for text in repairs]
-        poses[rows], weight[edges] = solution.world_from_body, solution.weight
+        poses[rows], weight[edges], information[edges] = solution.world_from_body, solution.weight, alone.information
         solutions.append(replace(solution, reason=where + solution.reason))
     if not solutions:
         raise GraphError(
             "No edge joins two poses, so there is nothing to solve. Give a graph with edges between two poses."
         )
-    return Solution(
-        poses,
-        weight,
-        sum(one.error_before for one in solutions),
-        sum(one.error_after for one in solutions),
-        max(one.iterations for one in solutions),
-        all(one.converged for one in solutions),
-        " ".join(one.reason for one in solutions),
-    ), warnings
+    return (
+        Solution(
+            poses,
+            weight,
+            sum(one.error_before for one in solutions),
+            sum(one.error_after for one in solutions),
+            max(one.iterations for one in solutions),
+            all(one.converged for one in solutions),
+            " ".join(one.reason for one in solutions),
+        ),
+        replace(graph, information=information),
+        warnings,
+    )
 
 
 def _by_part(part: Ints, parts: int) -> Callable[[int], Ints]:

@@ -49,7 +49,7 @@ class Elimination:
         pairs = np.unique(low * n + high)
         low, high = pairs // n, pairs % n
         low, high = low[low != high], high[low != high]
-        place = _dissected(n, low, high)
+        place = dissected(n, low, high)
         first, neighbours = _adjacent(n, place[low], place[high])
         parent = _tree(n, first, neighbours)
         after = _postordered(parent)
@@ -74,7 +74,7 @@ class Elimination:
         return Subtrees.of(self.form)
 
 
-def _dissected(n: int, a: Ints, b: Ints) -> Ints:
+def dissected(n: int, a: Ints, b: Ints) -> Ints:
     """When each node (n,) is eliminated."""
     graph = gtsam.SymbolicFactorGraph()
     for one, other in zip(a.tolist(), b.tolist(), strict=True):

@@ -151,7 +151,8 @@ def name_keyframes(path: Path, drive: str) -> None:
     header = tables.read_metadata(path)
     keyframes, world_from_body = tables.read_keyframes(path)
     about = tables.TableMetadata(json.loads(header["vplog.settings"]), header["vplog.library"])
-    tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about)
+    covariance = tables.read_keyframe_covariance(path)
+    tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about, covariance)
 
 
 @cache
