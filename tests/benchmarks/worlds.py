@@ -16,6 +16,7 @@ import numpy as np
 from vplog.data import Closures, EdgeKind, Gps, Keyframes, Odometry, PoseGraph, Verdict
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic, local_enu
+from vplog.graph.noise import NoiseSettings, edge_covariance
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints
@@ -151,11 +152,13 @@ class World:
     closures: Closures
     is_true: Bools
     """(L,)."""
-    gps: Gps | None
     odometry_covariance: Floats
     """(N-1, 6, 6) of each edge, true: white noise of the same growth as its wandering bias and its scale error."""
+    odometry_claimed: Floats | None
+    """(N-1, 6, 6) as the log has it, None where it has none."""
     closure_covariance: Floats
     """(L, 6, 6) true: of a run of n together as much as what they share and an n-th of what they do not."""
+    gps: Gps | None
     fix_row: Ints
     """(F,) keyframe of each fix; empty without GPS."""
     fix_enu: Floats
@@ -167,16 +170,17 @@ class World:
     fix_sound: Bools
     """(F,) False for those of a jump."""
 
-    def graph(self, closures: Bools | None = None) -> PoseGraph:
-        """The odometry and the closures (some of them), with the noise that the log claims; the drift model of vplog
-        where it claims none."""
-        rows = np.arange(len(self.closures)) if closures is None else np.flatnonzero(closures)
-        return self._graph(np.linalg.inv(self._claimed()), self.closures.information, rows)
+    def graph(self) -> PoseGraph:
+        """The odometry and all closures with the noise that the log claims, or vplog's drift model without a claim."""
+        claimed = self.odometry_claimed
+        if claimed is None:
+            claimed, _, _ = edge_covariance(self.odometry, self.keyframes.stamp_ns, NoiseSettings())
+        return self._graph(claimed, self.closures.information, np.arange(len(self.closures)))
 
     def true_graph(self) -> PoseGraph:
         """The odometry and the true closures alone, with the true noise."""
-        information = np.linalg.inv(self.closure_covariance)
-        return self._graph(np.linalg.inv(self.odometry_covariance), information, np.flatnonzero(self.is_true))
+        information = _inverse(self.closure_covariance)
+        return self._graph(self.odometry_covariance, information, np.flatnonzero(self.is_true))
 
     def _graph(self, odometry: Floats, closures: Floats, rows: Ints) -> PoseGraph:
         poses, n = self.keyframes.odom_from_body, len(self.truth)
@@ -185,26 +189,23 @@ class World:
             np.concatenate([np.arange(n - 1), self.closures.match[rows]]).astype(np.int32),
             np.concatenate([np.arange(1, n), self.closures.query[rows]]).astype(np.int32),
             np.concatenate([se3.between(poses[:-1], poses[1:]), self.closures.match_from_query[rows]]),
-            np.concatenate([odometry, closures[rows]]),
+            np.concatenate([_inverse(odometry), closures[rows]]),
             [EdgeKind.ODOMETRY] * (n - 1) + [EdgeKind.LOOP] * len(rows),
         )
-
-    def _claimed(self) -> Floats:
-        if self.odometry.covariance is None or self.parameters.accumulated:
-            from vplog.graph.noise import NoiseSettings, edge_covariance  # the generator needs numpy alone
-
-            return edge_covariance(self.odometry, self.keyframes.stamp_ns, NoiseSettings())[0]
-        return self.odometry.covariance[1:]
 
     def world_from_enu(self) -> Floats:
         """(4, 4) from the plane of the log's first fix, which is vplog's frame, to the world's."""
         assert self.gps is not None
         there = local_enu(self.gps)
         axes = np.concatenate([np.zeros((1, 3)), 100.0 * np.eye(3)])
-        places = np.concatenate([[ORIGIN], geodetic(axes, there.origin)])
-        none = np.full((len(places), 3, 3), np.nan)
-        here = local_enu(Gps(np.arange(len(places)), *places.T, none)).enu_m[1:]
+        latitude, longitude, altitude = np.concatenate([[ORIGIN], geodetic(axes, there.origin)]).T
+        unknown = np.full((len(latitude), 3, 3), np.nan)
+        here = local_enu(Gps(np.arange(len(latitude)), latitude, longitude, altitude, unknown)).enu_m[1:]
         return se3.umeyama(axes, here)[0]
+
+
+def _inverse(matrices: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(matrices), np.float64)
 
 
 @dataclass(frozen=True)
@@ -325,30 +326,21 @@ def make(parameters: Parameters) -> World:
     metres = _way(truth)
     stamps = 1_700_000_000_000_000_000 + (metres / SPEED[parameters.kind] * 1e9).astype(np.int64)
     stamps = stamps + 1_000_000 * np.arange(len(stamps))  # no two alike, whatever stands still
-    match, query, is_true, family = _pairs(parameters, truth, next_aisle, random("pairs"))
-    measured, closure_covariance, scale = _measured(parameters, truth, match, query, family, random("closures"))
-    order = np.lexsort((match, query))
-    match, query, is_true, measured, closure_covariance = (
-        one[order] for one in (match, query, is_true, measured, closure_covariance)
-    )
-    marginal = _marginal(parameters, len(match), random("closures"))[order]
-    closures = _ledger(match, query, measured, marginal * parameters.closure_factor**2, [scale[row] for row in order])
-    gps, row, enu, fix_covariance, fix_claimed, sound = _fixes(parameters, truth, stamps, random("gps"))
+    pairs = _pairs(parameters, truth, next_aisle, random("pairs"))
+    measured, marginal, closure_covariance, scale = _measured(parameters, truth, pairs, random("closures"))
+    information = _inverse(marginal * parameters.closure_factor**2)
+    claimed = _claimed(parameters, covariance, random("claim"))
     return World(
         parameters,
         truth,
-        Odometry(stamps, odom, _logged(parameters, odom, covariance, random("claim"))),
+        Odometry(stamps, odom, _logged(parameters, odom, claimed)),
         Keyframes(f"world {parameters.seed}", stamps, odom),
-        closures,
-        is_true,
-        gps,
+        _ledger(pairs, measured, information, scale),
+        pairs.is_true,
         covariance + _scale_covariance(parameters, truth),
+        claimed,
         closure_covariance,
-        row,
-        enu,
-        fix_covariance,
-        fix_claimed,
-        sound,
+        *_fixes(parameters, truth, stamps, random("gps")),
     )
 
 
@@ -572,17 +564,21 @@ def _scale_covariance(parameters: Parameters, truth: Floats) -> Floats:
     return result
 
 
-def _logged(parameters: Parameters, odom: Floats, covariance: Floats, random: np.random.Generator) -> Floats | None:
-    """(N, 6, 6) as the log has it, None where it has none."""
+def _claimed(parameters: Parameters, covariance: Floats, random: np.random.Generator) -> Floats | None:
+    """(N-1, 6, 6) of each edge as the log has it, None where it has none."""
     if parameters.claim == "missing":
         return None
     if parameters.claim == "constant":
         turn, shift = np.exp(random.uniform(np.log([1e-4, 1e-3]), np.log([0.05, 0.5])))
-        return np.tile(np.diag([turn**2] * 3 + [shift**2] * 3), (len(odom), 1, 1))
+        return np.tile(np.diag([turn**2] * 3 + [shift**2] * 3), (len(covariance), 1, 1))
     factor = np.array([parameters.claim_turn_factor] * 3 + [parameters.claim_factor] * 3)
-    claimed = covariance * np.outer(factor, factor)
-    if not parameters.accumulated:
-        return np.concatenate([claimed[:1], claimed])
+    return np.asarray(covariance * np.outer(factor, factor), np.float64)
+
+
+def _logged(parameters: Parameters, odom: Floats, claimed: Floats | None) -> Floats | None:
+    """(N, 6, 6) of the samples, which are the keyframes: of each increment, or of the pose since the start."""
+    if claimed is None or not parameters.accumulated:
+        return None if claimed is None else np.concatenate([claimed[:1], claimed])
     total = [np.diag([1e-12] * 6)]
     for moved, added in zip(se3.adjoint(se3.between(odom[1:], odom[:-1])), claimed, strict=True):
         total.append(moved @ total[-1] @ moved.T + added)
@@ -592,13 +588,23 @@ def _logged(parameters: Parameters, odom: Floats, covariance: Floats, random: np
 # --- closures -------------------------------------------------------------------------------------------------------
 
 
-def _pairs(
-    parameters: Parameters, truth: Floats, shift: Floats | None, random: np.random.Generator
-) -> tuple[Ints, Ints, Bools, list[tuple[int, Floats | None]]]:
-    """Match, query (L,), whether true, and by closure its run's number and what a false one claims instead.
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Closures before they are measured."""
 
-    A false closure claims that the world is displaced by D (4, 4) between its two visits.
-    """
+    match: Ints
+    """(L,) keyframe, and below the later one that sees the same place, or claims to."""
+    query: Ints
+    run: Ints
+    """(L,) number of the run of neighbouring keyframes that each is of."""
+    displaced: Floats
+    """(L, 4, 4) D by which a closure claims that the world moved between its two visits; identity for true ones."""
+    is_true: Bools
+    """(L,)."""
+
+
+def _pairs(parameters: Parameters, truth: Floats, shift: Floats | None, random: np.random.Generator) -> Pairs:
+    """The closures in order of query, then match."""
     share, runs = parameters.false_share, _runs(_revisits(parameters, truth, np.eye(4)), parameters.run, random)
     true = _some(runs, round(parameters.closures * (1.0 - share)))
     # as many as their share of all is, where the drive comes back less often than was wanted, too
@@ -606,17 +612,22 @@ def _pairs(
     false = _false_runs(parameters, truth, shift, min(count, MOST_FALSE), random)
     if parameters.false_kind == "family" and not parameters.no_true:
         true = _some(true, max(int(_count([run for run, _ in false]) / random.uniform(1.05, 1.5)), 3))
-    match, query, is_true, claims = [], [], [], []
-    taken: set[tuple[int, int]] = set()
-    for number, (run, D) in enumerate([*((run, None) for run in true), *false]):
+    claims: dict[tuple[int, int], tuple[int, Floats, bool]] = {}
+    runs = [*((run, np.eye(4), True) for run in true), *((run, D, False) for run, D in false)]
+    for number, (run, D, is_true) in enumerate(runs):
         for a, b in run.tolist():
-            if (a, b) not in taken:
-                taken.add((a, b))
-                match.append(a)
-                query.append(b)
-                is_true.append(D is None)
-                claims.append((number, D))
-    return np.array(match, np.int64), np.array(query, np.int64), np.array(is_true, bool), claims
+            claims.setdefault((b, a), (number, D, is_true))
+    query, match = np.array(sorted(claims), np.int64).reshape(-1, 2).T
+    number, displaced, is_true = (
+        zip(*(claims[pair] for pair in sorted(claims)), strict=True) if claims else ((), (), ())
+    )
+    return Pairs(
+        match,
+        query,
+        np.array(number, np.int64),
+        np.array(displaced, np.float64).reshape(-1, 4, 4),
+        np.array(is_true, bool),
+    )
 
 
 def _revisits(parameters: Parameters, truth: Floats, D: Floats, wider: float = 1.0) -> Ints:
@@ -750,25 +761,18 @@ def _marginal(parameters: Parameters, count: int, random: np.random.Generator) -
 
 
 def _measured(
-    parameters: Parameters,
-    truth: Floats,
-    match: Ints,
-    query: Ints,
-    claims: list[tuple[int, Floats | None]],
-    random: np.random.Generator,
-) -> tuple[Floats, Floats, list[str]]:
-    """match_from_query (L, 4, 4), its covariance (L, 6, 6) as in World, and where its metres come from."""
-    marginal = _marginal(parameters, len(match), random)
-    run = np.array([number for number, _ in claims], np.int64)
-    moved = np.array([np.eye(4) if D is None else D for _, D in claims]).reshape(-1, 4, 4)
-    measured = se3.between(truth[match], moved @ truth[query])
+    parameters: Parameters, truth: Floats, pairs: Pairs, random: np.random.Generator
+) -> tuple[Floats, Floats, Floats, list[str]]:
+    """match_from_query (L, 4, 4), its covariance (L, 6, 6) by itself and as in World, and where its metres are from."""
+    count, run = len(pairs.run), pairs.run
+    marginal = _marginal(parameters, count, random)
+    measured = se3.between(truth[pairs.match], pairs.displaced @ truth[pairs.query])
     share, runs = parameters.common_share, int(run.max(initial=-1)) + 1
-    common, own = random.normal(size=(runs, 6))[run], random.normal(size=(len(match), 6))
+    common, own = random.normal(size=(runs, 6))[run], random.normal(size=(count, 6))
     source = random.integers(0, len(parameters.scales), runs)[run]
-    stretch = np.where(source == 0, 1.0 + parameters.depth_error, 1.0)
     scale = [parameters.scales[one] for one in source.tolist()]
-    by_odometry = np.array([one == "odometry" for one in scale], bool)
-    stretch = stretch * np.where(by_odometry, 1.0 + parameters.scale_error, 1.0)
+    stretch = np.where(source == 0, 1.0 + parameters.depth_error, 1.0)
+    stretch[[one == "odometry" for one in scale]] *= 1.0 + parameters.scale_error
     off = (stretch - 1.0)[:, None] * measured[:, :3, 3]
     measured[:, :3, 3] *= stretch[:, None]
     sigma = np.sqrt(np.diagonal(marginal, axis1=1, axis2=2))
@@ -776,16 +780,17 @@ def _measured(
     size = np.bincount(run, minlength=runs)[run].astype(float)
     covariance = marginal * (size * share + 1.0 - share)[:, None, None]
     covariance[:, 3:, 3:] += (size * (off**2).sum(1))[:, None, None] * np.eye(3) / 3.0
-    return measured, covariance, scale
+    return measured, marginal, covariance, scale
 
 
-def _ledger(match: Ints, query: Ints, measured: Floats, covariance: Floats, scale: list[str]) -> Closures:
-    count = len(match)
+def _ledger(pairs: Pairs, measured: Floats, information: Floats, scale: list[str]) -> Closures:
+    """The closures, all of them verified."""
+    count, query = len(pairs.query), pairs.query
     many, unknown = np.full(count, 50, np.int32), np.full(count, np.nan)
     rank = np.arange(count) - np.searchsorted(query, query)
     return Closures(
         query=query.astype(np.int32),
-        match=match.astype(np.int32),
+        match=pairs.match.astype(np.int32),
         rank=rank.astype(np.int32),
         score=np.ones(count, np.float32),
         support=np.zeros(count, np.int32),
@@ -798,7 +803,7 @@ def _ledger(match: Ints, query: Ints, measured: Floats, covariance: Floats, scal
         reverse_inliers=many,
         scale=scale,
         match_from_query=measured,
-        information=np.linalg.inv(covariance).reshape(-1, 6, 6),
+        information=information,
         verdict=[Verdict.ACCEPTED] * count,
         residual_before=unknown,
         residual_after=unknown,
