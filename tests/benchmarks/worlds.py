@@ -42,6 +42,9 @@ REACH_M = 100.0
 """Drift is stated over this length, or over the way where that is shorter (the KITTI benchmark's shortest)."""
 FALSE_BEYOND = 5.0
 """Sigmas of a closure's translation by which a false one is off at least; and half of the radius."""
+ELSEWHERE = 6.0
+"""Tolerances between two places that look alike, where no next aisle says: three radii. The shift that most of a drive
+agrees with would be the least one allowed otherwise."""
 LEAST_SHARE = 0.02
 """Least error of an oracle as a share of the odometry's."""
 FEWEST = 20
@@ -635,7 +638,8 @@ def _revisits(parameters: Parameters, truth: Floats, D: Floats, wider: float = 1
     moved, metres = D @ truth, _way(truth)
     radius = _radius(parameters, truth) * wider
     gap = np.linalg.norm(truth[:, None, :3, 3] - moved[None, :, :3, 3], axis=2)
-    cosine = (np.einsum("aij,bij->ab", truth[:, :3, :3], moved[:, :3, :3]) - 1.0) / 2.0
+    # of the angle between two rotations, by the trace of one's transpose times the other
+    cosine = (truth[:, :3, :3].reshape(-1, 9) @ moved[:, :3, :3].reshape(-1, 9).T - 1.0) / 2.0
     between = metres[None, :] - metres[:, None]
     apart = (between > 8.0 * radius) & (np.arange(len(truth))[None, :] - np.arange(len(truth))[:, None] > 10)
     gap = np.where(apart & (cosine > np.cos(np.radians(40.0))), gap, np.inf)
@@ -729,17 +733,17 @@ def _displaced(
     best, chosen = np.zeros((0, 2), np.int64), np.eye(4)
     for D in sides:
         pairs = _revisits(parameters, truth, D, 2.0)
-        pairs = pairs[_is_false(parameters, truth, pairs, D)]
+        pairs = pairs[_is_false(parameters, truth, pairs, D, 1.0 if shift is not None else ELSEWHERE)]
         if len(pairs) > len(best):
             best, chosen = pairs, D
     return [(run, chosen) for run in _some(_runs(best, parameters.run, random), count)]
 
 
-def _is_false(parameters: Parameters, truth: Floats, pairs: Ints, D: Floats) -> Bools:
-    """(K,) whether a claim is further from the truth than its tolerance, in m."""
+def _is_false(parameters: Parameters, truth: Floats, pairs: Ints, D: Floats, times: float = 1.0) -> Bools:
+    """(K,) whether a claim is further from the truth than its tolerance, or some times that."""
     claimed = se3.between(truth[pairs[:, 0]], D @ truth[pairs[:, 1]])
     error = claimed[:, :3, 3] - se3.between(truth[pairs[:, 0]], truth[pairs[:, 1]])[:, :3, 3]
-    return np.asarray(np.linalg.norm(error, axis=1) > tolerance_m(parameters, truth))
+    return np.asarray(np.linalg.norm(error, axis=1) > times * tolerance_m(parameters, truth))
 
 
 def tolerance_m(parameters: Parameters, truth: Floats) -> float:
