@@ -139,13 +139,18 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     for title, labels in _GROUPS.items():
         names = sorted({label for row in rows for label in labels(row)})
         groups[title] = {name: figures([row for row in rows if name in labels(row)]) for name in names}
-    ranked = sorted(rows, key=lambda row: -max(row["methods"][OURS][key] for key in ("over_odometry", "over_oracle")))
+    ranked = sorted(rows, key=lambda row: _harm(row["methods"][OURS]), reverse=True)
     return {
         "all": figures(rows),
         "oracle_beats_odometry": float(np.mean([row["methods"]["oracle"]["over_odometry"] <= 1.0 for row in rows])),
         "by": groups,
         "worst": [row["seed"] for row in ranked[:WORST]],
     }
+
+
+def _harm(one: dict[str, Any]) -> tuple[float, float]:
+    """Worse than odometry first, then far from what was possible."""
+    return max(one["over_odometry"], WORSE), one["over_oracle"]
 
 
 _GROUPS: dict[str, Callable[[dict[str, Any]], list[str]]] = {

@@ -42,6 +42,8 @@ REACH_M = 100.0
 """Drift is stated over this length, or over the way where that is shorter (the KITTI benchmark's shortest)."""
 FALSE_BEYOND = 5.0
 """Sigmas of a closure's translation by which a false one is off at least; and half of the radius."""
+PLACES = 20
+"""Pairs of places tried, of which the one that most of a drive agrees with is the one that looks alike."""
 ELSEWHERE = 6.0
 """Tolerances between two places that look alike, where no next aisle says: three radii. The shift that most of a drive
 agrees with would be the least one allowed otherwise."""
@@ -636,15 +638,15 @@ def _pairs(parameters: Parameters, truth: Floats, shift: Floats | None, random: 
 def _revisits(parameters: Parameters, truth: Floats, D: Floats, wider: float = 1.0) -> Ints:
     """(K, 2) of each query its nearest earlier keyframe that sees the same place, or would were the world displaced."""
     moved, metres = D @ truth, _way(truth)
-    radius = _radius(parameters, truth) * wider
-    gap = np.linalg.norm(truth[:, None, :3, 3] - moved[None, :, :3, 3], axis=2)
+    radius, rows = _radius(parameters, truth) * wider, np.arange(len(truth))
+    here, there = truth[:, :3, 3] - truth[0, :3, 3], moved[:, :3, 3] - truth[0, :3, 3]
+    gap = (here**2).sum(1)[:, None] + (there**2).sum(1) - 2.0 * here @ there.T
     # of the angle between two rotations, by the trace of one's transpose times the other
     cosine = (truth[:, :3, :3].reshape(-1, 9) @ moved[:, :3, :3].reshape(-1, 9).T - 1.0) / 2.0
-    between = metres[None, :] - metres[:, None]
-    apart = (between > 8.0 * radius) & (np.arange(len(truth))[None, :] - np.arange(len(truth))[:, None] > 10)
-    gap = np.where(apart & (cosine > np.cos(np.radians(40.0))), gap, np.inf)
+    apart = (metres - metres[:, None] > 8.0 * radius) & (rows - rows[:, None] > 10)
+    gap[~apart | (cosine < np.cos(np.radians(40.0)))] = np.inf
     best = gap.argmin(0)
-    query = np.flatnonzero(gap[best, np.arange(len(truth))] < radius)
+    query = np.flatnonzero(gap[best, rows] < radius**2)
     return np.stack([best[query], query], axis=1)
 
 
@@ -726,7 +728,7 @@ def _displaced(
         sides = [se3.pose(np.eye(3), side * shift) for side in (1.0, -1.0)]
     else:
         sides = []
-        for _ in range(40):
+        for _ in range(PLACES):
             a, b = np.sort(random.integers(0, len(truth), 2)).tolist()
             if b - a > 10:
                 sides.append(_claimed_displacement(parameters, truth, a, b, random))
