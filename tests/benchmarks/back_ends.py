@@ -126,29 +126,50 @@ def gnc(world: World) -> Answer:
     return Answer(poses, np.asarray(weight[is_loop(graph)] > 0.5, bool))
 
 
+def true_closures(world: World) -> Answer:
+    """Levenberg-Marquardt from the truth on the true closures and sound fixes with the noise as claimed: what is lost
+    by not knowing the noise."""
+    graph = world.graph()
+    edges = np.concatenate([np.ones(len(world.truth) - 1, bool), world.is_true])
+    graph = replace(
+        graph,
+        a=graph.a[edges],
+        b=graph.b[edges],
+        a_from_b=graph.a_from_b[edges],
+        information=graph.information[edges],
+        kind=[kind for kind, chosen in zip(graph.kind, edges, strict=True) if chosen],
+    )
+    factors, values = _factors(world, graph, world.truth, covariance=world.fix_claimed)
+    return Answer(_poses(_least_squares(factors, values)), world.is_true)
+
+
 def oracle(world: World) -> Answer:
     """Levenberg-Marquardt from the truth on the true closures and sound fixes, all with their true noise."""
-    factors, values = _factors(world, world.true_graph(), world.truth, oracle=True)
+    factors, values = _factors(world, world.true_graph(), world.truth, covariance=world.fix_covariance)
     return Answer(_poses(_least_squares(factors, values)), world.is_true)
 
 
 def _factors(
-    world: World, graph: PoseGraph, start: Floats, kernel: Any = None, oracle: bool = False
+    world: World, graph: PoseGraph, start: Floats, kernel: Any = None, covariance: Floats | None = None
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """A prior, the edges and the fixes of a world, and where to start; the oracle has the fixes' true noise."""
-    start = start if world.gps is None or oracle else _onto_fixes(world, start)
+    """A prior, the edges and the fixes of a world, and where to start.
+
+    With a `covariance` (F, 3, 3) of the fixes only the sound ones, and `start` is in the world's frame.
+    """
+    sound = np.ones(len(world.fix_row), bool) if covariance is None else world.fix_sound
+    if covariance is None:
+        covariance = world.fix_claimed
+        start = start if world.gps is None else _onto_fixes(world, start)
     loose = LOOSE if world.gps is not None else np.full(6, 1e-6)
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start[0]), gtsam.noiseModel.Diagonal.Sigmas(loose)))
     for a, b, measured, information in zip(graph.a, graph.b, graph.a_from_b, graph.information, strict=True):
         noise = gtsam.noiseModel.Gaussian.Information(information)
         factors.add(gtsam.BetweenFactorPose3(int(a), int(b), gtsam.Pose3(measured), noise))
-    covariance = world.fix_covariance if oracle else world.fix_claimed
-    for row, enu, spread, sound in zip(world.fix_row, world.fix_enu, covariance, world.fix_sound, strict=True):
-        if sound or not oracle:
-            noise = gtsam.noiseModel.Gaussian.Covariance(spread)
-            noise = noise if kernel is None else gtsam.noiseModel.Robust.Create(kernel, noise)
-            factors.add(gtsam.GPSFactor(int(row), enu, noise))
+    for row, enu, spread in zip(world.fix_row[sound], world.fix_enu[sound], covariance[sound], strict=True):
+        noise = gtsam.noiseModel.Gaussian.Covariance(spread)
+        noise = noise if kernel is None else gtsam.noiseModel.Robust.Create(kernel, noise)
+        factors.add(gtsam.GPSFactor(int(row), enu, noise))
     for row, pose in enumerate(start):
         values.insert(row, gtsam.Pose3(pose))
     return factors, values
@@ -198,5 +219,6 @@ METHODS: dict[str, Callable[[World], Answer]] = {
     "Cauchy (vplog)": vplog_method("cauchy"),
     "DCS (vplog)": vplog_method("dcs"),
     "PCM (vplog)": vplog_method("pcm"),
+    "true closures": true_closures,
     "oracle": oracle,
 }
