@@ -11,7 +11,8 @@ import pytest
 
 from tests.benchmarks import backend
 from tests.benchmarks.back_ends import gnc, odometry, oracle, plain, vplog_optimize
-from tests.benchmarks.worlds import Parameters, draw, make, position_error, score, tolerance_m, world
+from tests.benchmarks.world_closures import tolerance_m
+from tests.benchmarks.worlds import Parameters, draw, make, position_error, score, world
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.graph.build import checked
