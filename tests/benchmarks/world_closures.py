@@ -181,8 +181,9 @@ def _marginal(parameters: Parameters, count: int, random: np.random.Generator) -
 
 def measure(
     parameters: Parameters, truth: Floats, pairs: Pairs, random: np.random.Generator
-) -> tuple[Floats, Floats, Floats, list[str]]:
-    """match_from_query (L, 4, 4), its covariance (L, 6, 6) by itself and as in World, and where its metres are from."""
+) -> tuple[Floats, Floats, Floats, list[str], Bools]:
+    """match_from_query (L, 4, 4), its covariance (L, 6, 6) by itself and as in World, where its metres are from, and
+    whether the depth error is in them."""
     count, run = len(pairs.run), pairs.run
     marginal = _marginal(parameters, count, random)
     measured = se3.between(truth[pairs.match], pairs.displaced @ truth[pairs.query])
@@ -192,14 +193,12 @@ def measure(
     scale = [parameters.scales[one] for one in source.tolist()]
     stretch = np.where(source == 0, 1.0 + parameters.depth_error, 1.0)
     stretch[[one == "odometry" for one in scale]] *= 1.0 + parameters.scale_error
-    off = (stretch - 1.0)[:, None] * measured[:, :3, 3]
     measured[:, :3, 3] *= stretch[:, None]
     sigma = np.sqrt(np.diagonal(marginal, axis1=1, axis2=2))
     measured = measured @ se3.exp(sigma * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own))
     size = np.bincount(run, minlength=runs)[run].astype(float)
     covariance = marginal * (size * share + 1.0 - share)[:, None, None]
-    covariance[:, 3:, 3:] += (size * (off**2).sum(1))[:, None, None] * np.eye(3) / 3.0
-    return measured, marginal, covariance, scale
+    return measured, marginal, covariance, scale, np.asarray(source == 0, bool)
 
 
 def ledger(pairs: Pairs, measured: Floats, information: Floats, scale: list[str]) -> Closures:

@@ -49,11 +49,13 @@ class World:
     is_true: Bools
     """(L,)."""
     odometry_covariance: Floats
-    """(N-1, 6, 6) of each edge, true: white noise of the same growth as its wandering bias and its scale error."""
+    """(N-1, 6, 6) of each edge, true: white noise of the same growth as its wandering bias. The scale is beside."""
     odometry_claimed: Floats | None
     """(N-1, 6, 6) as the log has it, None where it has none."""
     closure_covariance: Floats
     """(L, 6, 6) true: of a run of n together as much as what they share and an n-th of what they do not."""
+    by_depth: Bools
+    """(L,) those whose metres are too long by `depth_error`."""
     gps: Gps | None
     fix_row: Ints
     """(F,) keyframe of each fix; empty without GPS."""
@@ -73,10 +75,18 @@ class World:
             claimed, _, _ = edge_covariance(self.odometry, self.keyframes.stamp_ns, NoiseSettings())
         return self._graph(claimed, self.closures.information, np.arange(len(self.closures)))
 
-    def true_graph(self) -> PoseGraph:
-        """The odometry and the true closures alone, with the true noise."""
-        information = _inverse(self.closure_covariance)
-        return self._graph(self.odometry_covariance, information, np.flatnonzero(self.is_true))
+    def true_graph(self, odometry_long: float = 0.0, depth_long: float = 0.0) -> PoseGraph:
+        """The odometry and the true closures alone, with the true noise, and metres that are too long by these shares
+        made right, noise and all."""
+        graph = self._graph(self.odometry_covariance, _inverse(self.closure_covariance), np.flatnonzero(self.is_true))
+        by_odometry = np.array([scale == "odometry" for scale in self.closures.scale], bool)[self.is_true]
+        length = np.full(len(graph.a), 1.0 + odometry_long)
+        length[len(self.truth) - 1 :] = np.where(by_odometry, 1.0 + odometry_long, 1.0)
+        length[len(self.truth) - 1 :] *= np.where(self.by_depth[self.is_true], 1.0 + depth_long, 1.0)
+        graph.a_from_b[:, :3, 3] /= length[:, None]
+        graph.information[:, 3:] *= length[:, None, None]
+        graph.information[:, :, 3:] *= length[:, None, None]
+        return graph
 
     def _graph(self, odometry: Floats, closures: Floats, rows: Ints) -> PoseGraph:
         poses, n = self.keyframes.odom_from_body, len(self.truth)
@@ -150,7 +160,7 @@ def make(parameters: Parameters) -> World:
     stamps = 1_700_000_000_000_000_000 + (metres / SPEED[parameters.kind] * 1e9).astype(np.int64)
     stamps = stamps + 1_000_000 * np.arange(len(stamps))  # no two alike, whatever stands still
     pairs = draw_pairs(parameters, truth, next_aisle, random("pairs"))
-    measured, marginal, closure_covariance, scale = measure(parameters, truth, pairs, random("closures"))
+    measured, marginal, closure_covariance, scale, by_depth = measure(parameters, truth, pairs, random("closures"))
     information = _inverse(marginal * parameters.closure_factor**2)
     claimed = _claimed(parameters, covariance, random("claim"))
     return World(
@@ -160,9 +170,10 @@ def make(parameters: Parameters) -> World:
         Keyframes(f"world {parameters.seed}", stamps, odom),
         ledger(pairs, measured, information, scale),
         pairs.is_true,
-        covariance + _scale_covariance(parameters, truth),
+        covariance,
         claimed,
         closure_covariance,
+        by_depth,
         *_fixes(parameters, truth, stamps, random("gps")),
     )
 
@@ -204,16 +215,6 @@ def _wandering(random: np.random.Generator, metres: Floats, length: float, size:
         value = keeps * value + np.sqrt(1.0 - keeps**2) * random.normal(size=size)
         values[k] = value
     return values
-
-
-def _scale_covariance(parameters: Parameters, truth: Floats) -> Floats:
-    """(N-1, 6, 6) white noise along the way that grows to as much as the scale error makes of the whole way."""
-    step = se3.between(truth[:-1], truth[1:])[:, :3, 3]
-    metres = np.linalg.norm(step, axis=1)
-    result = np.zeros((len(step), 6, 6))
-    along = step[:, :, None] * step[:, None, :] / np.maximum(metres, 1e-6)[:, None, None]
-    result[:, 3:, 3:] = parameters.scale_error**2 * metres.sum() * along
-    return result
 
 
 def _claimed(parameters: Parameters, covariance: Floats, random: np.random.Generator) -> Floats | None:
