@@ -6,11 +6,11 @@ and PCM, least squares on the true closures with the noise as claimed, and an or
 factor, too. The error is the root
 mean square distance of positions, after rigid alignment; in worlds with GPS without any, all methods using the fixes
 but `optimize`, which has none and is left out there. Told of every method: the share of worlds in which it is more
-than 5 % worse than the odometry, with its 95 % interval (Wilson 1927); the median and the 95th percentile of its error
-over the oracle's, which is taken to be 2 % of the odometry's at least; true closures lost, of all and in how many
-worlds more than a fifth; false closures kept; seconds of the processor, the median and the 95th percentile. Then the
-same by kind of world and by what the log claims wrongly, and vplog's ten worst worlds. `--seed N` prints one world
-with its parameters, `--show` draws it.
+than 5 % worse than the odometry, with its 95 % interval (Wilson 1927), and of those in which the oracle is not (now and
+then odometry is right by luck); the median and the 95th percentile of its error over the oracle's, which is taken to be
+2 % of the odometry's at least; true closures lost, of all and in how many worlds more than a fifth; false closures
+kept; seconds of the processor, the median and the 95th percentile. Then the same by kind of world and by what the log
+claims wrongly, and vplog's ten worst worlds. `--seed N` prints one world with its parameters, `--show` draws it.
 """
 
 from __future__ import annotations
