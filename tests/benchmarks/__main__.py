@@ -1,6 +1,7 @@
 """`python -m tests.benchmarks [WHAT...] [--json]`, from the top; `--help` lists what there is.
 
 Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
+Pose graph back ends on random worlds have arguments of their own: `python -m tests.benchmarks backend --help`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tests.benchmarks import backend
 from tests.benchmarks.batch import PARTS, batch
 from tests.benchmarks.discovery import discovery
 from tests.benchmarks.graphs import graphs
@@ -51,6 +53,8 @@ LARGEST_NEEDS_GB = 12.0
 
 
 def main() -> int:
+    if sys.argv[1:2] == ["backend"]:
+        return backend.main(sys.argv[2:])
     arguments = _arguments()
     figures = []
     for figure in _measure(arguments):
@@ -69,7 +73,7 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     kinds = ("mining", "describe", "discovery", "search", "growth", "scale", "graphs", "reading", "large", "batch")
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
-    named = f"of {', '.join(kinds)}; all but large and batch where none is named"
+    named = f"of {', '.join(kinds)}; all but large and batch where none is named. Or backend, which has its own --help"
     parser.add_argument("what", nargs="*", metavar="WHAT", help=named)
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")

@@ -1,0 +1,206 @@
+"""Where random worlds go: roads, aisles, rooms and the air, coming back to places they were at."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.geometry import se3
+
+if TYPE_CHECKING:
+    from tests.benchmarks.world_parameters import Parameters
+    from vplog.data import Floats, Ints
+
+RADIUS_M = {"road": 4.0, "aisles": 1.2, "room": 0.6, "drone": 6.0}
+"""How far apart two views of one place may be."""
+FEWEST = 20
+"""Keyframes that come back to a place; a drive with fewer is drawn again, some times."""
+
+
+def drive(parameters: Parameters, random: np.random.Generator) -> tuple[Floats, Floats | None]:
+    """True poses (N, 4, 4) that come back somewhere, and the shift (3,) that takes an aisle to the next one."""
+    tries = [_tried(parameters, random)]
+    while len(tries) < 10 and len(revisits(parameters, tries[-1][0], np.eye(4))) < FEWEST:
+        tries.append(_tried(parameters, random))
+    return tries[-1]
+
+
+def _tried(parameters: Parameters, random: np.random.Generator) -> tuple[Floats, Floats | None]:
+    if parameters.kind == "room":
+        return _hand_held(parameters, random), None
+    shift = None
+    if parameters.kind == "aisles":
+        line, shift = _aisles(random)
+    elif parameters.kind == "drone":
+        line = _circuit(random) if parameters.layout == "circuit" else _sweep(random)
+    else:
+        line = _loop(random) if parameters.layout == "loop" else _blocks(random)
+    points = _resampled(line, parameters, random)
+    if parameters.kind != "drone":
+        points[:, 2] = _ground(points, parameters.spatial, random)
+    return _headed(points, parameters, random), shift
+
+
+def _loop(random: np.random.Generator) -> Floats:
+    """(K, 3) laps of a closed road of 200-1500 m, each a little beside the other."""
+    laps, length = random.uniform(1.15, 3.0), random.uniform(200.0, 1500.0)
+    t = np.linspace(0.0, laps, 4000)
+    angle, radius = 2 * np.pi * t, np.ones(len(t))
+    for k in range(2, 5):
+        radius += random.uniform(0.0, 0.5 / k) * np.cos(k * angle + random.uniform(0, 2 * np.pi))
+    circle = np.stack([radius * np.cos(angle), radius * np.sin(angle) * random.uniform(0.4, 1.0)], axis=1)
+    lap = np.linalg.norm(np.diff(circle[t <= 1.0], axis=0), axis=1).sum()
+    beside = 0.5 * _smooth(random, t, 6)
+    circle = circle * length / lap * (1.0 + beside / length)[:, None]
+    return np.concatenate([circle, np.zeros((len(t), 1))], axis=1)
+
+
+def _blocks(random: np.random.Generator) -> Floats:
+    """(K, 3) a drive of 600-3000 m over the crossings of a town, corners rounded."""
+    side, across, length = random.uniform(40.0, 150.0), int(random.integers(3, 6)), random.uniform(600.0, 3000.0)
+    steps, at, heading = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]), np.array([0, 0]), 0
+    corners = [at]
+    while len(corners) * side < length:
+        # straight on twice as often as either turn; never back
+        turns = [turn for turn in (0, 0, 1, -1) if _within(at + steps[(heading + turn) % 4], across)]
+        heading = (heading + turns[int(random.integers(len(turns)))]) % 4
+        at = at + steps[heading]
+        corners.append(at)
+    line = _dense(np.array(corners, float) * side, 1.0)
+    return np.concatenate([_rounded(line, 8), np.zeros((len(line), 1))], axis=1)
+
+
+def _within(at: Any, across: int) -> bool:
+    return bool((at >= 0).all() and (at < across).all())
+
+
+def _aisles(random: np.random.Generator) -> tuple[Floats, Floats]:
+    """(K, 3) up and down parallel aisles 3-8 m apart, first all of them, then some again; and the shift to the next."""
+    count, apart, length = int(random.integers(4, 11)), random.uniform(3.0, 8.0), random.uniform(15.0, 50.0)
+    again = random.integers(0, count, int(random.uniform(0.5, 2.0) * count))
+    order, corners, end = [*range(count), *again.tolist()], [], 0.0
+    for aisle in order:
+        corners += [[end, aisle * apart], [length - end, aisle * apart]]
+        end = length - end
+    line = _rounded(_dense(np.array(corners), 0.1), 6)
+    return np.concatenate([line, np.zeros((len(line), 1))], axis=1), np.array([0.0, apart, 0.0])
+
+
+def _circuit(random: np.random.Generator) -> Floats:
+    """(K, 3) rounds of a closed curve in the air, each 1-2 m beside the other."""
+    laps = random.uniform(1.2, 3.0)
+    t = np.linspace(0.0, laps, 4000)
+    size = np.array([random.uniform(20.0, 150.0), random.uniform(20.0, 150.0), random.uniform(3.0, 20.0)])
+    line = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), np.zeros(len(t))], axis=1)
+    for k in range(2, 4):
+        line += random.uniform(-0.4, 0.4, 3) * np.cos(2 * np.pi * k * t[:, None] + random.uniform(0, 2 * np.pi, 3))
+    beside = np.stack([_smooth(random, t, 5) for _ in range(3)], axis=1)
+    return line * size + beside + [0.0, 0.0, 30.0]
+
+
+def _sweep(random: np.random.Generator) -> Floats:
+    """(K, 3) strips of a field flown one way, then across."""
+    width, apart, climb = random.uniform(50.0, 200.0), random.uniform(10.0, 30.0), random.uniform(0.0, 5.0)
+    across, corners, end = np.arange(0.0, width, apart), [], 0.0
+    for at in across.tolist():
+        corners += [[end, at, 30.0], [width - end, at, 30.0]]
+        end = width - end
+    for at in across[::-1].tolist():
+        corners += [[at, end, 30.0 + climb], [at, width - end, 30.0 + climb]]
+        end = width - end
+    return _rounded(_dense(np.array(corners), 1.0), 6)
+
+
+def _hand_held(parameters: Parameters, random: np.random.Generator) -> Floats:
+    """(N, 4, 4) wandering about a room, looking around."""
+    n = parameters.keyframes
+    t = np.linspace(0.0, n / 80.0, n) + random.uniform(-0.2, 0.2, n) / 80.0
+    size = np.array([random.uniform(0.8, 2.5), random.uniform(0.8, 2.5), random.uniform(0.1, 0.3)])
+    points = np.stack([_smooth(random, t, 3, 0.4) for _ in range(3)], axis=1) * size
+    yaw, pitch, roll = (_smooth(random, t, 3, 0.3) * spread for spread in (1.2, 0.25, 0.15))
+    return se3.pose(_turned(yaw, pitch, roll), points)
+
+
+def _dense(corners: Floats, step: float) -> Floats:
+    """(K, d) a broken line at even steps."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along = np.arange(0.0, at[-1], step)
+    return np.stack([np.interp(along, at, axis) for axis in corners.T], axis=1)
+
+
+def _rounded(line: Floats, half: int) -> Floats:
+    """A running mean over as many points either side."""
+    padded = np.pad(line, ((half, half), (0, 0)), mode="edge")
+    total = np.cumsum(np.concatenate([np.zeros((1, line.shape[1])), padded]), axis=0)
+    width = 2 * half + 1
+    return (total[width:] - total[:-width]) / width
+
+
+def _resampled(line: Floats, parameters: Parameters, random: np.random.Generator) -> Floats:
+    """(N, 3) points along a line at uneven steps, no further apart than two views of one place may be, twice."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    n = int(np.clip(at[-1] / (2.0 * RADIUS_M[parameters.kind]), parameters.keyframes, 600))
+    step = at[-1] / (n - 1)
+    along = np.linspace(0.0, at[-1], n) + random.uniform(-0.2, 0.2, n) * step
+    return np.stack([np.interp(along, at, axis) for axis in line.T], axis=1)
+
+
+def _ground(points: Floats, spatial: bool, random: np.random.Generator) -> Floats:
+    """(N,) heights of the ground: hills of some metres, or of some centimetres in a plane."""
+    height, wave = (random.uniform(2.0, 15.0), 300.0) if spatial else (random.uniform(0.01, 0.1), 60.0)
+    turn = random.uniform(0, 2 * np.pi, 4)
+    x, y = points[:, 0] / wave, points[:, 1] / wave
+    return height * (np.sin(2 * np.pi * x + turn[0]) * np.cos(2 * np.pi * y + turn[1]) + 0.3 * np.sin(4 * x + turn[2]))
+
+
+def _headed(points: Floats, parameters: Parameters, random: np.random.Generator) -> Floats:
+    """(N, 4, 4) looking along the way, give or take."""
+    ahead = np.gradient(points, axis=0)
+    yaw = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) + random.normal(0.0, np.radians(1.0), len(points))
+    if parameters.layout == "sweep":
+        yaw = np.full(len(points), random.uniform(-np.pi, np.pi)) + random.normal(0.0, 0.05, len(points))
+    pitch = -np.arctan2(ahead[:, 2], np.linalg.norm(ahead[:, :2], axis=1))
+    t = np.linspace(0.0, 10.0, len(points))
+    shake = np.radians(5.0 if parameters.kind == "drone" else 0.5)
+    return se3.pose(_turned(yaw, pitch + shake * _smooth(random, t, 5), shake * _smooth(random, t, 5)), points)
+
+
+def _turned(yaw: Floats, pitch: Floats, roll: Floats) -> Floats:
+    """(N, 3, 3)."""
+    x, y, z = np.eye(3)
+    R = se3.so3_exp(yaw[:, None] * z) @ se3.so3_exp(pitch[:, None] * y) @ se3.so3_exp(roll[:, None] * x)
+    return np.asarray(R, np.float64)
+
+
+def way(truth: Floats) -> Floats:
+    """(N,) metres travelled at each pose."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+
+
+def revisits(parameters: Parameters, truth: Floats, D: Floats, wider: float = 1.0) -> Ints:
+    """(K, 2) of each query its nearest earlier keyframe that sees the same place, or would were the world displaced."""
+    moved, metres = D @ truth, way(truth)
+    radius, rows = place_radius(parameters, truth) * wider, np.arange(len(truth))
+    here, there = truth[:, :3, 3] - truth[0, :3, 3], moved[:, :3, 3] - truth[0, :3, 3]
+    gap = (here**2).sum(1)[:, None] + (there**2).sum(1) - 2.0 * here @ there.T
+    # of the angle between two rotations, by the trace of one's transpose times the other
+    cosine = (truth[:, :3, :3].reshape(-1, 9) @ moved[:, :3, :3].reshape(-1, 9).T - 1.0) / 2.0
+    apart = (metres - metres[:, None] > 8.0 * radius) & (rows - rows[:, None] > 10)
+    gap[~apart | (cosine < np.cos(np.radians(40.0)))] = np.inf
+    best = gap.argmin(0)
+    query = np.flatnonzero(gap[best, rows] < radius**2)
+    return np.stack([best[query], query], axis=1)
+
+
+def place_radius(parameters: Parameters, truth: Floats) -> float:
+    """m; at least so much that a drive along the same line sees its keyframes again."""
+    return max(RADIUS_M[parameters.kind], 0.75 * way(truth)[-1] / len(truth))
+
+
+def _smooth(random: np.random.Generator, t: Floats, harmonics: int, first: float = 1.0) -> Floats:
+    """A random smooth function of t (K,) of root mean square 1 or so: harmonics of frequency `first` on."""
+    phase, size = random.uniform(0, 2 * np.pi, harmonics), random.uniform(0.3, 1.0, harmonics)
+    frequency = first * (np.arange(harmonics) + 1.0) * random.uniform(0.8, 1.2, harmonics)
+    waves = np.sin(2 * np.pi * frequency * t[:, None] + phase) * size
+    return waves.sum(1) / np.sqrt((size**2).sum() / 2.0)
