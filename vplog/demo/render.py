@@ -96,7 +96,7 @@ def _boxes(camera: Camera, corners: Floats) -> Int32s:
     return np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)], axis=1).astype(np.int32)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _find_nearest(quad_from_image, boxes, rows, columns):
     """The nearest quad of every pixel (H, W), -1 where there is none, and 1 / its depth (H, W)."""
     owner = np.full((rows, columns), -1, np.int32)
@@ -116,7 +116,7 @@ def _find_nearest(quad_from_image, boxes, rows, columns):
     return owner, nearness
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _shade(quad_from_image, texture, lit, pixels, levels, owner, nearness, up):
     """(H, W) grey 0..255: textures filtered over each pixel's footprint, times the light on them, before the sky."""
     rows, columns = owner.shape
@@ -146,7 +146,7 @@ def _shade(quad_from_image, texture, lit, pixels, levels, owner, nearness, up):
     return image
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _bilinear(pixels, level, u, v):
     """The value of one level of a picture at u, v (0..1)."""
     start, w, h = level
