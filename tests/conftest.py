@@ -139,6 +139,11 @@ def finished(drive: Drive, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
+def compiled(finished: Path) -> None:
+    """The kernels of a run are compiled and on disk, before workers and their processes would each compile them."""
+
+
+@pytest.fixture(scope="session")
 def joint(drive: Drive, made_once: Callable[..., Path]) -> Path:
     """The folder of a joint run of three drives, beside their logs. Tests read it and leave it as it is."""
     from tests.joined import run_together
