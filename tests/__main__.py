@@ -69,8 +69,10 @@ def in_background(name: str, command: list[str]) -> Iterator[list[str]]:
 
 
 def environment() -> dict[str, str]:
-    """One thread a library: the tests start workers of their own, and a BLAS pool inside each gets in their way."""
-    return {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1", **os.environ}
+    """One thread a library: the tests start workers of their own, and a BLAS pool inside each gets in their way. And
+    all that is compiled is kept: a hundred processes of the tests load the package."""
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1", **inherited}
 
 
 if __name__ == "__main__":

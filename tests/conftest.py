@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import settings
 
+from tests import durations
 from vplog.cli import main
 from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
@@ -30,54 +33,26 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 # servers of the tests are on this machine, whatever proxy there is
 os.environ["NO_PROXY"] = os.environ["no_proxy"] = "127.0.0.1,localhost"
 
-DURATIONS = Path(__file__).parent / "durations.json"
-"""Seconds by test function, of those that `--record-durations` found to take more than `_NOTED_S`."""
-_NOTED_S = 0.1
-_SLOW_S = 0.25
-"""From here on a test is `slow`: the others together take a minute on two cores."""
-
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--record-durations", action="store_true", help=f"write {DURATIONS.name}, for the mark `slow`")
+    about = f"write {durations.FILE.name}, for the mark `slow`"
+    parser.addoption("--record-durations", action="store_true", help=about)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--record-durations"):
-        config.pluginmanager.register(_Recorder())
+        config.pluginmanager.register(durations.Recorder())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark slow tests by their measured time. Files that take longest come first: each stays with one worker, and the
     others would wait for the last."""
-    known: dict[str, float] = json.loads(DURATIONS.read_text(encoding="utf-8"))
-    of_file: dict[str, float] = {}
-    for name, seconds in known.items():
-        file = name.partition("::")[0]
-        of_file[file] = of_file.get(file, 0.0) + seconds
+    functions = durations.known()
+    files = durations.by_file(functions)
     for item in items:
-        if known.get(item.nodeid.partition("[")[0], 0.0) > _SLOW_S:
+        if functions.get(item.nodeid.partition("[")[0], 0.0) > durations.SLOW_S:
             item.add_marker("slow")
-    items.sort(key=lambda item: -of_file.get(item.nodeid.partition("::")[0], 0.0))
-
-
-class _Recorder:
-    """The longest case of every test function, with what its fixtures take."""
-
-    def __init__(self) -> None:
-        self.cases: dict[str, float] = {}
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.cases[report.nodeid] = self.cases.get(report.nodeid, 0.0) + report.duration
-
-    def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        if hasattr(session.config, "workerinput"):
-            return
-        longest: dict[str, float] = {}
-        for name, seconds in self.cases.items():
-            function = name.partition("[")[0]
-            longest[function] = max(longest.get(function, 0.0), round(seconds, 1))
-        noted = {name: seconds for name, seconds in sorted(longest.items()) if seconds > _NOTED_S}
-        DURATIONS.write_text(json.dumps(noted, indent=0) + "\n", encoding="utf-8")
+    items.sort(key=lambda item: -files[item.nodeid.partition("::")[0]])
 
 
 @dataclass(frozen=True)
@@ -124,25 +99,56 @@ def verb(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
 
 
 @pytest.fixture(scope="session")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A folder by its name, filled by the first process of the tests that asks for it; the others wait for that."""
+    base = tmp_path_factory.getbasetemp()
+    top = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base  # each worker has a folder of its own there
+
+    def made(name: str, fill: Callable[[Path], object]) -> Path:
+        folder, filled = top / f"once-{name}", top / f"once-{name}.filled"
+        with (top / f"once-{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not filled.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                filled.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def drive(made_once: Callable[..., Path]) -> Drive:
     """The small demo drive: about 45 frames, of which the last dozen pass known places."""
-    return make_drive(tmp_path_factory.mktemp("drive"), SMALL)
+    from vplog.demo import route
+    from vplog.demo.record import Drive
+    from vplog.demo.scene import make_camera
+
+    folder = made_once("drive", lambda folder: make_drive(folder, SMALL))
+    stamp_ns = route.frame_stamps(SMALL)
+    poses = route.world_from_body(SMALL, stamp_ns)
+    return Drive(folder / "drive.mcap", folder / "truth.tum", make_camera(SMALL), stamp_ns, poses)
 
 
 @pytest.fixture(scope="session")
-def finished(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(drive: Drive, made_once: Callable[..., Path]) -> Path:
     """The folder of a default run on the small drive, with two threads. Tests read it and leave it as it is."""
-    out = tmp_path_factory.mktemp("finished") / "run"
-    run(drive.log, out, load_pipeline("default"), execution=Execution(2))
-    return out
+    pipeline, execution = load_pipeline("default"), Execution(2)
+    return made_once("finished", lambda folder: run(drive.log, folder / "run", pipeline, execution=execution)) / "run"
 
 
 @pytest.fixture(scope="session")
-def joint(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compiled(finished: Path) -> None:
+    """The kernels of a run are compiled and on disk, before workers and their processes would each compile them."""
+
+
+@pytest.fixture(scope="session")
+def joint(drive: Drive, made_once: Callable[..., Path]) -> Path:
     """The folder of a joint run of three drives, beside their logs. Tests read it and leave it as it is."""
     from tests.joined import run_together
 
-    return run_together(drive, tmp_path_factory.mktemp("joint"))
+    return made_once("joint", lambda folder: run_together(drive, folder)) / "out"
 
 
 @pytest.fixture(scope="session")

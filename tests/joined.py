@@ -1,4 +1,4 @@
-"""Three drives run together: the small drive cut in two, and one from elsewhere."""
+"""Parts of logs, and three drives run together: the small drive cut in two, and one from elsewhere."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from vplog.pipeline import load_pipeline
 from vplog.sessions.joint_run import run_joint
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from vplog.demo.record import Drive
@@ -22,26 +23,32 @@ LOGS = {"before": "before.mcap", "after": "after.mcap", "drive": "elsewhere/driv
 """File of each drive, beside the folder of the joint run."""
 
 
+def copied(log: Path, to: Path, wanted: Callable[[str, int], bool]) -> Path:
+    """The messages of an MCAP log that are wanted by topic and log time (ns), in a file of their own."""
+    with log.open("rb") as stream, to.open("wb") as file:
+        writer, channels = Writer(file), dict[int, int]()
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if not wanted(channel.topic, message.log_time):
+                continue
+            if channel.id not in channels:
+                known = 0 if schema is None else writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return to
+
+
 def cut(log: Path, at_ns: int, folder: Path, mounted: bool = True) -> list[Path]:
     """The messages of a log before and from a time on, in a file each; one knows how the camera sits, or both."""
-    files = [folder / "before.mcap", folder / "after.mcap"]
-    with log.open("rb") as stream, files[0].open("wb") as one, files[1].open("wb") as other:
-        writers = [Writer(one), Writer(other)]
-        channels: list[dict[int, int]] = [{}, {}]
-        for writer in writers:
-            writer.start(profile="ros2")
-        for schema, channel, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            for part, writer in enumerate(writers):
-                if not (mounted and channel.topic == "/tf_static") and (message.log_time >= at_ns) != bool(part):
-                    continue
-                if channel.id not in channels[part]:
-                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[part][channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
-                writer.add_message(channels[part][channel.id], message.log_time, message.data, message.publish_time)
-        for writer in writers:
-            writer.finish()
-    return files
+
+    def told(topic: str) -> bool:
+        return mounted and topic == "/tf_static"
+
+    return [
+        copied(log, folder / "before.mcap", lambda topic, ns: told(topic) or ns < at_ns),
+        copied(log, folder / "after.mcap", lambda topic, ns: told(topic) or ns >= at_ns),
+    ]
 
 
 def run_together(drive: Drive, folder: Path) -> Path:

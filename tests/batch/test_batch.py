@@ -77,7 +77,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def whole(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(compiled: None, logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of both at once, one after the other."""
     root = tmp_path_factory.mktemp("whole") / "map"
     told = run_batch(logs, root, load_pipeline("default", QUICK))

@@ -54,7 +54,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def alone(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def alone(compiled: None, logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map that four jobs on this machine make."""
     root = tmp_path_factory.mktemp("alone") / "map"
     told = run_batch(logs, root, load_pipeline("default", SETTINGS), None, None, Execution(4), BatchOptions(4))
@@ -221,7 +221,7 @@ def workers_of(place: str) -> list[str]:
 
 
 def test_an_address_without_a_cluster_is_said_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_cluster, "_ANSWER_S", 3.0)
+    monkeypatch.setattr(ray_cluster, "_ANSWER_S", 1.0)
     pipeline = load_pipeline("default", SETTINGS)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]

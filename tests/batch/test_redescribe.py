@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from vplog.demo.record import Drive
 
 QUICK = (
-    "features.max_features=200", "library.size=6", "pictures.closures=0", "pictures.megapixels=0",
-    "propose.per_query=1", "keyframes.distance_m=3",
+    "features.max_features=200", "features.max_megapixels=0.05", "library.size=6", "pictures.closures=0",
+    "pictures.megapixels=0", "propose.per_query=1", "keyframes.distance_m=3",
 )  # fmt: skip
 
 

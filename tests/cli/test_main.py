@@ -33,7 +33,10 @@ if TYPE_CHECKING:
     Verb = Callable[..., Said]
     Change = Callable[[str, int, bytes], bytes | None]
 
-QUICK = ("--set", "features.max_features=400", "--set", "propose.per_query=2", "--set", "library.size=4")
+QUICK = (
+    "--set", "features.max_features=400", "--set", "features.max_megapixels=0.05", "--set", "propose.per_query=2",
+    "--set", "library.size=4",
+)  # fmt: skip
 """For runs of which only the course matters."""
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 

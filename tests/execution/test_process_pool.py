@@ -24,4 +24,5 @@ def test_processes_that_are_ended_while_they_load_say_nothing() -> None:
     finally:
         for other in others:
             other.kill()
+            other.wait()
     assert (ended.returncode, ended.stderr) == (0, "")

@@ -25,7 +25,15 @@ if TYPE_CHECKING:
 
     from vplog.demo.record import Drive
 
-QUICK = [f"--set={one}" for one in ("features.max_features=400", "keyframes.distance_m=15", "library.size=5")]
+QUICK = [
+    f"--set={one}"
+    for one in (
+        "features.max_features=400",
+        "features.max_megapixels=0.05",
+        "keyframes.distance_m=15",
+        "library.size=5",
+    )
+]
 """A dozen keyframes."""
 
 

@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
     from vplog.demo.record import Drive
 
-QUICK = [f"--set={one}" for one in ("features.max_features=400", "propose.per_query=2", "library.size=5")]
+QUICK = [
+    f"--set={one}"
+    for one in ("features.max_features=400", "features.max_megapixels=0.05", "propose.per_query=2", "library.size=5")
+]
 
 
 class RangeHandler(SimpleHTTPRequestHandler):

@@ -62,8 +62,8 @@ SMALL = DemoSettings(
     block_width_m=20.0,
     corner_radius_m=6.0,
     frame_rate_hz=2.5,
-    width=480,
-    height=270,
+    width=384,
+    height=216,
     odometry_yaw_bias_rad_s=0.03,
 )
 """About 45 frames, of which about 13 pass known places again: quick enough for unit tests."""
