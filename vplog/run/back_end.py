@@ -12,18 +12,16 @@ from vplog.cache.steps import step
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
-from vplog.graph.cross_check import cross_checked
 from vplog.graph.gps_factors import fixes_on
 from vplog.graph.gps_gate import keep_odometry_if_further
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
-from vplog.graph.solve import gated
+from vplog.graph.solve import decided
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
-    from vplog.graph.cross_check import CrossCheckSettings
     from vplog.graph.gps_factors import Fixes, GpsSettings
     from vplog.graph.noise import NoiseSettings
     from vplog.graph.refine import Refined, RefineSettings
@@ -31,11 +29,6 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
-
-_CONTRADICTED = (
-    "The odometry's covariance is too small and was replaced by the drift model: with it the solver keeps no "
-    "closure, with the model {kept} of {count}."
-)
 
 
 class BackEnd(Protocol):
@@ -45,8 +38,6 @@ class BackEnd(Protocol):
     def noise(self) -> NoiseSettings: ...
     @property
     def solve(self) -> OptimiserSettings: ...
-    @property
-    def cross_check(self) -> CrossCheckSettings: ...
     @property
     def refine(self) -> RefineSettings: ...
     @property
@@ -80,20 +71,12 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
 def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
-    solution = solve_gated(graph, settings)
-    if source != "model" and len(rows) and not (solution.weight[is_loop(graph)] > 0.5).any():
-        # a covariance is the least reliable thing in a log; closures that agree with a usual drift speak against it
-        usual = settings.noise.model_copy(update={"source": "model"})
-        modelled, _, _ = edge_covariance(odometry, keyframes.stamp_ns, usual)
-        other, _, _ = build.build_graph(keyframes, modelled, closures)
-        again = solve_gated(other, settings)
-        if kept := int((again.weight[is_loop(other)] > 0.5).sum()):
-            graph, solution, source = other, again, "model"
-            doubts = [*doubts, _CONTRADICTED.format(count=len(rows), kept=kept)]
+    decision = decided(graph, settings.solve)
+    solution = decision.solution
     fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
     if fixes is not None:
         solution = keep_odometry_if_further(graph, solution, fixes)
-    refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
+    refined = refine(decision.graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
     return Solved(
         judge(closures, graph, refined, rows),
         refined,
@@ -102,11 +85,6 @@ def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gp
         source,
         doubts + repairs + (fixes.warnings if fixes else []),
     )
-
-
-def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
-    """The robust solution, or the odometry where that cannot be believed."""
-    return cross_checked(graph, gated(graph, settings.solve), settings.cross_check)
 
 
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:

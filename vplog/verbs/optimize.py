@@ -13,7 +13,7 @@ from vplog.errors import GraphError
 from vplog.execution.timing import Watch
 from vplog.geometry.se3 import inverse
 from vplog.graph.build import checked, parts
-from vplog.graph.solve import OptimiserSettings, gated
+from vplog.graph.solve import OptimiserSettings, decided
 from vplog.results.g2o import read_g2o, write_g2o
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def solve_parts(graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids:
             graph.dimension,
         )
         alone, repairs = checked(alone)
-        solution = gated(alone, optimiser)
+        solution = decided(alone, optimiser).solution
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
         warnings += [where + text for text in repairs]
         poses[rows], weight[edges] = solution.world_from_body, solution.weight
