@@ -42,7 +42,7 @@ class Decision(NamedTuple):
     """Which closures are true."""
 
     graph: PoseGraph
-    """With the sigmas that it turned out to have."""
+    """With the sigmas that are claimed, no closure's far below those of the others."""
     solution: Solution
     sigmas: Sigmas
     """By what the claimed sigmas were multiplied."""
@@ -58,11 +58,11 @@ def decided(graph: PoseGraph, optimiser: Optimiser) -> Decision:
     if not loops.any():
         return Decision(graph, optimiser(graph), Sigmas())
     best = best_hypothesis(graph, optimiser)
-    graph = claimed_times(bounded(graph), best.sigmas)
+    graph = bounded(graph)
     count, kept = int(loops.sum()), int(best.weight[loops].sum())
     if kept == 0:
         why = f"Odometry was kept: its noise explains the {count} closures better as false ones than any set of them."
         return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), best.sigmas)
     found = f"{kept} of {count} closures were kept. "
-    solution = solve_weighted(Factors.of(graph), best.weight, best.poses, 100, 1e-6, found)
+    solution = solve_weighted(Factors.of(claimed_times(graph, best.sigmas)), best.weight, best.poses, 100, 1e-6, found)
     return Decision(graph, solution, best.sigmas)

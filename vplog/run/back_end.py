@@ -76,7 +76,8 @@ def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gp
     fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
     if fixes is not None:
         solution = keep_odometry_if_further(graph, solution, fixes)
-    refined = refine(decision.graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
+    of_odometry = by_odometry(graph, closures, rows)
+    refined = refine(decision.graph, solution, of_odometry, settings.refine, fixes, settings.gps, decision.sigmas)
     return Solved(
         judge(closures, graph, refined, rows),
         refined,
