@@ -23,6 +23,8 @@ from vplog.graph.odometry_mixture import modes
 from vplog.graph.variance_components import Sigmas, estimate
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from vplog.data import Bools, Floats, PoseGraph
     from vplog.stages import Optimiser
 
@@ -49,9 +51,12 @@ class Hypothesis:
     log_evidence: float
 
 
-def best_hypothesis(graph: PoseGraph, optimiser: Optimiser) -> Hypothesis:
+def best_hypothesis(
+    graph: PoseGraph, optimiser: Optimiser, cost: Callable[[Factors, Floats, Floats], float] | None = None
+) -> Hypothesis:
     """The hypothesis of greatest evidence: the optimiser's, with `gnc` from several starts, or that none is true.
 
+    `cost` is what other measurements cost more with factors, weights and poses: by how much their log likelihood falls.
     Raises GraphError where the graph cannot be solved.
     """
     graph, loops = bounded(graph), np.flatnonzero(is_loop(graph))
@@ -74,7 +79,15 @@ def best_hypothesis(graph: PoseGraph, optimiser: Optimiser) -> Hypothesis:
         found.append(_judged(graph, kept, *_estimated(graph, kept, solution.world_from_body, Sigmas())))
     for sigmas in dict.fromkeys([Sigmas(), *(one.sigmas for one in found)]):
         found.append(_judged(graph, none, chain.poses, sigmas))
-    return max(found, key=lambda one: one.log_evidence)
+    if cost is None:
+        return max(found, key=lambda one: one.log_evidence)
+    best, most = found[-1], -np.inf
+    for one in sorted(found, key=lambda one: -one.log_evidence):
+        if one.log_evidence <= most:  # its measurements can only lower it
+            break
+        left = one.log_evidence - cost(Factors.of(claimed_times(graph, one.sigmas)), one.weight, one.poses)
+        best, most = (one, left) if left > most else (best, most)
+    return best
 
 
 def bounded(graph: PoseGraph) -> PoseGraph:

@@ -18,7 +18,9 @@ from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClure
 from vplog.graph.variance_components import Sigmas
 
 if TYPE_CHECKING:
-    from vplog.data import PoseGraph
+    from collections.abc import Callable
+
+    from vplog.data import Floats, PoseGraph
     from vplog.stages import Optimiser
 
 __all__ = [
@@ -48,8 +50,10 @@ class Decision(NamedTuple):
     """By what the claimed sigmas were multiplied."""
 
 
-def decided(graph: PoseGraph, optimiser: Optimiser) -> Decision:
-    """The hypothesis of greatest evidence, solved.
+def decided(
+    graph: PoseGraph, optimiser: Optimiser, cost: Callable[[Factors, Floats, Floats], float] | None = None
+) -> Decision:
+    """The hypothesis of greatest evidence, less what it costs other measurements, solved.
 
     Raises GraphError where the graph cannot be solved.
     """
@@ -57,7 +61,7 @@ def decided(graph: PoseGraph, optimiser: Optimiser) -> Decision:
     loops = is_loop(graph)
     if not loops.any():
         return Decision(graph, optimiser(graph), Sigmas())
-    best = best_hypothesis(graph, optimiser)
+    best = best_hypothesis(graph, optimiser, cost)
     graph = bounded(graph)
     count, kept = int(loops.sum()), int(best.weight[loops].sum())
     if kept == 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -12,8 +13,9 @@ from vplog.cache.steps import step
 from vplog.data import EdgeKind, Verdict
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
-from vplog.graph.gps_factors import fixes_on
-from vplog.graph.gps_gate import keep_odometry_if_further
+from vplog.graph.factors import Factors
+from vplog.graph.gps_factors import cost_of_fixes, fixes_on, with_noise_of
+from vplog.graph.hypotheses import claimed_times
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
 from vplog.graph.solve import decided
@@ -71,11 +73,17 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
 def _solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
-    decision = decided(graph, settings.solve)
-    solution = decision.solution
     fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
+    if fixes is None:
+        decision = decided(graph, settings.solve)
+    else:
+        alone = np.where(is_loop(graph), 0.0, 1.0)
+        fixes = with_noise_of(Factors.of(graph), alone, graph.world_from_body, fixes, settings.gps)
+        decision = decided(graph, settings.solve, partial(cost_of_fixes, fixes=fixes, settings=settings.gps))
+    solution = decision.solution
     if fixes is not None:
-        solution = keep_odometry_if_further(graph, solution, fixes)
+        present = Factors.of(claimed_times(decision.graph, decision.sigmas))
+        fixes = with_noise_of(present, solution.weight, solution.world_from_body, fixes, settings.gps)
     of_odometry = by_odometry(graph, closures, rows)
     refined = refine(decision.graph, solution, of_odometry, settings.refine, fixes, settings.gps, decision.sigmas)
     return Solved(
