@@ -67,7 +67,6 @@ class Pipeline(Settings):
     """Odometry noise."""
     solve: OptimiserSettings = GncSettings()
     """Robust solve of the pose graph."""
-    """Other methods compared where the solve rejects much."""
     refine: RefineSettings = RefineSettings()
     """Noise and scale of the odometry by the constraints kept."""
     gps: GpsSettings = GpsSettings()

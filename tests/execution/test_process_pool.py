@@ -16,11 +16,11 @@ for number in range(10):
 """
 
 
-
 def test_processes_that_are_ended_while_they_load_say_nothing() -> None:
     others = [subprocess.Popen(["sh", "-c", "while :; do :; done"]) for _ in range(os.cpu_count() or 1)]
     try:  # a busy machine, on which loading takes its time
-        ended = subprocess.run([sys.executable, "-c", ENDED_WHILE_THEY_LOAD], capture_output=True, text=True, check=False)
+        command = [sys.executable, "-c", ENDED_WHILE_THEY_LOAD]
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
     finally:
         for other in others:
             other.kill()

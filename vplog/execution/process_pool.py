@@ -52,7 +52,7 @@ class _Process(SpawnProcess):
 
 
 class _Spawn(SpawnContext):
-    """Its locks keep their names as long as the pool: pebble lets them go before it ends processes that look for them."""
+    """Its locks keep their names as long as the pool: pebble drops them before it ends processes that look for them."""
 
     Process = _Process
 

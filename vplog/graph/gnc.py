@@ -22,11 +22,11 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
+from vplog.graph.evidence import log_room
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import descend
 from vplog.graph.lm import solve_weighted
-from vplog.graph.evidence import log_room
 from vplog.graph.odometry_mixture import agreement
 from vplog.graph.outlier_test import OutlierTest
 from vplog.graph.pcm import PcmSettings

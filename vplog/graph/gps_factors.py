@@ -190,8 +190,9 @@ def inlier_fixes(
 def with_noise_of(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings) -> Fixes:
     """The fixes with the covariance that their residuals to the weighted edges (E,) say they have.
 
-    Not less than they claim, since poses follow them. Errors of satellites wander: fixes whose errors are alike count for so much less, by the sum of the autocorrelation
-    of their residuals as far as it is positive (Geyer, Practical Markov Chain Monte Carlo, 1992).
+    Not less than they claim, since poses follow them. Errors of satellites wander: fixes whose errors are alike count
+    for so much less, by the sum of the autocorrelation of their residuals as far as it is positive (Geyer, Practical
+    Markov Chain Monte Carlo, 1992).
     """
     for _ in range(_NOISE_ROUNDS):
         poses, inlier = inlier_fixes(factors, weight, start, fixes, settings)

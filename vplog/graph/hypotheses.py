@@ -36,6 +36,9 @@ _STEADY = 0.2
 """Change of a sigma below which closures need not be tested again."""
 _ALIKE = 0.01
 """Share of the closures by which a start must differ from what was found to be tried."""
+_VERY_STRONG = 5.0
+"""Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
+a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong."""
 _STEPS, _TOLERANCE = 100, 1e-6
 
 
@@ -78,7 +81,8 @@ def best_hypothesis(
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
         found.append(_judged(graph, kept, *_estimated(graph, kept, solution.world_from_body, Sigmas())))
     for sigmas in dict.fromkeys([Sigmas(), *(one.sigmas for one in found)]):
-        found.append(_judged(graph, none, chain.poses, sigmas))
+        alone = _judged(graph, none, chain.poses, sigmas)
+        found.append(replace(alone, log_evidence=alone.log_evidence + _VERY_STRONG))
     if cost is None:
         return max(found, key=lambda one: one.log_evidence)
     best, most = found[-1], -np.inf

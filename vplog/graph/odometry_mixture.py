@@ -37,7 +37,9 @@ def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> 
     if not known.any():
         return [(Sigmas(), np.ones(len(loops), bool))]
     mixture = _Mixture(graph, loops[known], chain)
-    best = [max((mixture.fit(Sigmas(float(s), float(t))) for t in _CLOSURES), key=lambda fit: fit[0]) for s in _ODOMETRY]
+    best = [
+        max((mixture.fit(Sigmas(float(s), float(t))) for t in _CLOSURES), key=lambda fit: fit[0]) for s in _ODOMETRY
+    ]
     likelihood = np.array([-np.inf, *(fit[0] for fit in best), -np.inf])
     peak = (likelihood[1:-1] >= likelihood[:-2]) & (likelihood[1:-1] >= likelihood[2:])
     found = []

@@ -140,8 +140,9 @@ class OutlierTest:
     def limit(self, log_spread: Floats) -> Floats:
         """(K,) how much chi-square each closure may cost the rest: what makes it as likely true as false.
 
-        False ones are uniform in the room, unless the test is `strict`. `log_spread` is half the log determinant of the covariance of the rest's
-        prediction and the closure's noise together. A true one as the noise has it passes by `probability` at least.
+        False ones are uniform in the room, unless the test is `strict`. `log_spread` is half the log determinant of the
+        covariance of the rest's prediction and the closure's noise together. A true one as the noise has it passes by
+        `probability` at least.
         """
         d = degrees_of_freedom(self.factors.graph)
         if self.strict:

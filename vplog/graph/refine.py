@@ -28,6 +28,9 @@ _LONGEST = 0.05
 """Largest change of the scale in one round."""
 
 
+_LONG = 10.0
+"""Length of closures in sigma from which their scale is estimated: noise makes lengths too long by the inverse square
+of this, a hundredth."""
 _STEADY = 0.025
 """Change of a sigma in a round, as a share, below which it is settled."""
 _AS_CLAIMED = Sigmas()
@@ -46,8 +49,9 @@ class RefineSettings(Settings):
     closure_scale_sigma: float = Field(default=0.05, gt=0)
     """How far the scale of closures with metres of their own is expected from 1: 5 % are a millimetre of a stereo
     pair's baseline, or a depth camera's error at 4 m."""
-    significance: float = Field(default=3.0, ge=0)
-    """A scale is applied where it is so many sigmas from 1."""
+    significance: float = Field(default=5.0, ge=0)
+    """A scale is applied where it is so many sigmas from 1: more than the usual three, as the noise is estimated too,
+    and what errors of neighbouring closures share makes a scale look surer than it is."""
     max_rounds: int = Field(default=12, ge=1)
     """Rounds after which it gives up; drives take 3-6."""
 
@@ -100,7 +104,8 @@ def refine(
     weight, poses, inlier = solution.weight, solution.world_from_body, np.zeros(0)
     loops = is_loop(graph)
     scales = [Scale("odometry", of_odometry, settings.scale_sigma)] if fixes is not None else []
-    if (weight[loops & ~of_odometry] > 0).any():
+    metric = loops & ~of_odometry & (weight > 0)
+    if metric.any() and np.median(_lengths(graph, metric)) >= _LONG:
         scales.append(Scale("closures", loops & ~of_odometry, settings.closure_scale_sigma))
     checked = bool((weight[loops] > 0).any())
     if fixes is not None and gps is not None:
@@ -134,12 +139,20 @@ def refine(
     return _refined(present, solution, poses, sigmas, scales, fixes, inlier)
 
 
+def _lengths(graph: PoseGraph, edges: Bools) -> Floats:
+    """Lengths (K,) of the edges in their own sigma."""
+    shift = graph.a_from_b[edges, :3, 3]
+    return np.sqrt(np.einsum("ki,kij,kj->k", shift, graph.information[edges, 3:, 3:], shift))
+
+
 def rescaled(graph: PoseGraph, scales: list[Scale], sigmas: Sigmas) -> PoseGraph:
     """The graph with metres of some edges multiplied, and its sigmas.
 
     What is multiplied has its noise multiplied too. With the noise left alone every constraint would be met best by a
     world of no size, and the estimate would be too small.
     """
+    if sigmas == _AS_CLAIMED and not scales:
+        return graph
     graph = claimed_times(graph, sigmas)
     a_from_b, information = graph.a_from_b.copy(), graph.information.copy()
     for scale in scales:

@@ -11,7 +11,7 @@ from vplog.graph.build import checked
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
-from vplog.graph.hypotheses import best_hypothesis, bounded, claimed_times
+from vplog.graph.hypotheses import best_hypothesis, bounded
 from vplog.graph.lm import LmSettings, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
@@ -65,8 +65,12 @@ def decided(
     graph = bounded(graph)
     count, kept = int(loops.sum()), int(best.weight[loops].sum())
     if kept == 0:
-        why = f"Odometry was kept: its noise explains the {count} closures better as false ones than any set of them."
+        why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
         return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), best.sigmas)
+    if not isinstance(optimiser, GncSettings):
+        return Decision(graph, optimiser(graph), best.sigmas)
     found = f"{kept} of {count} closures were kept. "
-    solution = solve_weighted(Factors.of(claimed_times(graph, best.sigmas)), best.weight, best.poses, 100, 1e-6, found)
+    solution = solve_weighted(
+        Factors.of(graph), best.weight, best.poses, optimiser.max_iterations, optimiser.tolerance, found
+    )
     return Decision(graph, solution, best.sigmas)

@@ -23,7 +23,7 @@ from vplog.graph.solve import decided
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
+    from vplog.data import Closures, Gps, Ints, Keyframes, Odometry, PoseGraph, Trajectory
     from vplog.graph.gps_factors import Fixes, GpsSettings
     from vplog.graph.noise import NoiseSettings
     from vplog.graph.refine import Refined, RefineSettings
