@@ -15,7 +15,6 @@ from vplog.errors import SettingsError, nearest
 from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings
 from vplog.features.stereo_depth import StereoSettings
-from vplog.graph.cross_check import CrossCheckSettings
 from vplog.graph.gps_factors import GpsSettings
 from vplog.graph.joint import JoinSettings
 from vplog.graph.noise import NoiseSettings
@@ -68,8 +67,6 @@ class Pipeline(Settings):
     """Odometry noise."""
     solve: OptimiserSettings = GncSettings()
     """Robust solve of the pose graph."""
-    cross_check: CrossCheckSettings = CrossCheckSettings()
-    """Other methods compared where the solve rejects much."""
     refine: RefineSettings = RefineSettings()
     """Noise and scale of the odometry by the constraints kept."""
     gps: GpsSettings = GpsSettings()

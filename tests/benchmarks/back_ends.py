@@ -18,7 +18,7 @@ from vplog.errors import VplogError
 from vplog.geometry import se3
 from vplog.graph.consistency import chi2_quantile, is_loop
 from vplog.graph.gps_factors import GpsSettings
-from vplog.graph.solve import GncSettings, OptimiserSettings, gated
+from vplog.graph.solve import GncSettings, OptimiserSettings, decided
 from vplog.pipeline import Pipeline
 from vplog.run import back_end
 
@@ -80,7 +80,7 @@ def vplog_run(world: World) -> Answer:
 def vplog_optimize(world: World) -> Answer:
     """`vplog optimize` by default, of the graph with the noise as claimed."""
     graph = world.graph()
-    solution = gated(graph, GncSettings())
+    solution = decided(graph, GncSettings()).solution
     return Answer(solution.world_from_body, np.asarray(solution.weight[is_loop(graph)] > 0.5, bool))
 
 

@@ -159,7 +159,7 @@ def _boxes(camera: Camera, corners: Floats) -> Int32s:
     return np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)], axis=1).astype(np.int32)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _draw(quad_from_image, boxes, texture, lit, pixels, levels, image, nearness):
     """Lay quads, near ones first, over an image (H, W) of grey 0..255 in full light and its 1 / depth (H, W)."""
     for q in range(len(boxes)):
@@ -176,7 +176,7 @@ def _draw(quad_from_image, boxes, texture, lit, pixels, levels, image, nearness)
                     image[y, x] = lit[q] * _filtered(pixels, levels[texture[q]], h, u / w, v / w, 1 / w)
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _filtered(pixels, levels, h, u, v, z):
     """The mean of a picture over the footprint of a pixel at u, v (0..1), a parallelogram."""
     # How far u and v move per pixel in x and in y.
@@ -196,7 +196,7 @@ def _filtered(pixels, levels, h, u, v, z):
     return total / samples
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _bilinear(pixels, level, u, v):
     """The value of one level of a picture at u, v (0..1)."""
     start, w, h = level

@@ -22,6 +22,7 @@ from vplog.graph.consistency import (
     is_loop,
     residual_sigma,
 )
+from vplog.graph.evidence import log_room
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import descend
@@ -75,21 +76,29 @@ class GncSettings(Settings):
             start = initial_poses(factors, weight)
             return solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
         chain = OdometryChain.of(graph)
-        agreed = agreement(graph, loops, chain)
-        gated = far_from_odometry(graph, self.gate_probability, chain)[loops]
-        weight[loops] = (agreed.probability > 0.5) & ~gated & self._join(graph, loops, chain)
+        likely = agreement(graph, loops, chain) & ~far_from_odometry(graph, self.gate_probability, chain)[loops]
+        weight, poses = self.tested(factors, *self.annealed(factors, likely))
+        accepted = int(weight[loops].sum())
+        found = f"{accepted} of {len(loops)} closures were kept. "
+        return solve_weighted(factors, weight, poses, self.max_iterations, self.tolerance, found)
+
+    def annealed(self, factors: Factors, likely: Bools) -> tuple[Floats, Floats]:
+        """Weights (E,), 0 or 1, and poses from the `likely` closures (K,), by the noise that the graph has."""
+        graph = factors.graph
+        loops = np.flatnonzero(is_loop(graph))
+        weight = np.ones(len(graph.a))
+        weight[loops] = likely & self._join(graph, loops, OdometryChain.of(graph))
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
-        weight, poses = self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
-        outlier_test = OutlierTest(
-            factors, loops[~gated], self.inlier_probability, agreed.log_room, self.max_iterations, chain
-        )
-        state = outlier_test(weight, poses)
-        accepted, far = int(state.weight[loops].sum()), int(gated.sum())
-        found = (
-            f"{accepted} of {len(loops)} closures were kept; {far} were too far from the odometry, "
-            f"{len(loops) - accepted - far} inconsistent with the others. "
-        )
-        return solve_weighted(factors, state.weight, state.poses, self.max_iterations, self.tolerance, found)
+        return self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
+
+    def tested(self, factors: Factors, weight: Floats, poses: Floats, strict: bool = False) -> tuple[Floats, Floats]:
+        """Weights (E,) and poses once no closure costs the others too much, and none is left out that they predict."""
+        graph, chain = factors.graph, OdometryChain.of(factors.graph)
+        room = log_room(chain.poses[:, :3, 3], graph.dimension)
+        loops = np.flatnonzero(is_loop(graph))
+        test = OutlierTest(factors, loops, self.inlier_probability, room, self.max_iterations, chain, strict)
+        state = test(weight, poses)
+        return state.weight, state.poses
 
     def _join(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest set that agrees."""

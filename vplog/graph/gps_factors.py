@@ -24,6 +24,14 @@ _LEAST = 3
 """Fixes that fix where a graph is and how it is turned."""
 
 
+_NOISE_ROUNDS = 5
+"""Most rounds of estimating the noise of the fixes: poses follow them less as it grows."""
+_UNLIKE = 0.1
+"""Autocorrelation below which errors are not alike."""
+_STEADY = 1.2
+"""Factor of the noise at which it is settled."""
+
+
 class GpsSettings(Settings):
     """GPS as constraints. Off, a log's GPS changes nothing."""
 
@@ -157,13 +165,15 @@ def inlier_fixes(
     """Poses (N, 4, 4), pose 0 as given, and the inliers (F,) among the fixes, 0 or 1.
 
     Graduated non-convexity with the truncated least squares loss (Yang et al., RA-L 2020) over the fixes, the edges
-    keeping their weights. The first solve uses all of them, so their frame is found whatever the odometry drifted.
+    keeping their weights. The first solve uses all of them, so their frame is found whatever the odometry drifted. A
+    fix is judged by the noise that most have where that is more than they claim.
     """
     bound, inlier, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
     mu = 0.0
     for _ in range(settings.max_stages):
         poses = minimised(with_fixes(factors, weight, poses, fixes, inlier), poses, 20, 1e-4).world_from_body
         chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)))
+        chi2 = chi2 / max(float(np.median(chi2)) / chi2_quantile(0.5, 3), 1.0)
         mu = bound / max(2.0 * chi2.max() - bound, bound) if mu == 0.0 else mu * settings.growth  # remark 5
         inlier = truncated_weights(chi2, bound, mu)
         if ((inlier == 0) | (inlier == 1)).all():
@@ -175,6 +185,50 @@ def inlier_fixes(
             "Run without --gps, or set gps.unknown_sigma_m to what the receiver does."
         )
     return poses, inlier
+
+
+def with_noise_of(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings) -> Fixes:
+    """The fixes with the covariance that their residuals to the weighted edges (E,) say they have.
+
+    Not less than they claim, since poses follow them. Errors of satellites wander: fixes whose errors are alike count
+    for so much less, by the sum of the autocorrelation of their residuals as far as it is positive (Geyer, Practical
+    Markov Chain Monte Carlo, 1992).
+    """
+    for _ in range(_NOISE_ROUNDS):
+        poses, inlier = inlier_fixes(factors, weight, start, fixes, settings)
+        world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
+        sound = np.flatnonzero(inlier)
+        error = ((antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m)[sound]
+        root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
+        white = (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
+        power = max(float((white**2).mean()), 1e-12)
+        alike = 1.0
+        for lag in range(1, len(white) // 4):
+            share = float((white[lag:] * white[:-lag]).mean()) / power
+            if share < _UNLIKE:
+                break
+            alike += 2.0 * share
+        factor = power * alike
+        fixes = replace(fixes, covariance=fixes.covariance * max(factor, 1.0))
+        if factor < _STEADY:
+            break
+    return fixes
+
+
+def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes, settings: GpsSettings) -> float:
+    """By how much the log density is less with the fixes than that of the weighted edges (E,), least at `poses`.
+
+    But for a constant; outliers count as at the bound of inliers.
+    """
+    most = 0.5 * chi2_quantile(settings.inlier_probability, 3)
+    try:
+        moved, inlier = inlier_fixes(factors, weight, poses, fixes, settings)
+    except GraphError:
+        return most * len(fixes)
+    fit = minimised(with_fixes(factors, weight, moved, fixes, inlier), moved, 20, 1e-4).world_from_body
+    alone, together = Objective(factors, weight), with_fixes(factors, weight, fit, fixes, inlier)
+    cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
+    return cost + 0.5 * (together.information(fit).log_determinant() - alone.information(poses).log_determinant())
 
 
 def only(fixes: Fixes, rows: Bools) -> Fixes:

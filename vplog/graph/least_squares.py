@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vplog.graph.sparse.frontal import Blocks
     from vplog.graph.sparse.linear import BayesTree, Supernodes
 
-_GAUGE_SIGMA = 1e-6
+GAUGE_SIGMA = 1e-6
 """rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""
 _FREE_SIGMA = 1e2
 """rad and m; holds pose 0 so weakly that positions alone say where the graph is."""
@@ -123,7 +123,7 @@ class Objective:
         diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
         held = np.concatenate([[0], self.factors.loose(self.weight)]).astype(np.int64)
         diagonal[:, axes, axes] += damping
-        sigma = _GAUGE_SIGMA if self.positions is None else _FREE_SIGMA
+        sigma = GAUGE_SIGMA if self.positions is None else _FREE_SIGMA
         diagonal[held[:, None], axes, axes] += 1.0 / sigma**2
         return factorised(matrix._replace(diagonal=diagonal), lambda: self.factors.elimination(self.weight > 0))
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import GraphError
+from vplog.graph.build import informed
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, residual_sigma
 from vplog.graph.least_squares import Objective, descend
 from vplog.graph.leave_one_out import cost_together, distance, group_costs, groups, tension
@@ -27,6 +28,9 @@ _MOST_JOINT = 100
 """Largest group whose joint cost is predicted: that is cubic, a tenth of a second for 100."""
 _MOST_ROUNDS = 100
 """Most rounds of rejecting and readmitting; each rejects one for good, and public graphs take up to 10."""
+_FURTHEST = 100.0
+"""Residuals beyond so many limits are not looked at again: the noise of a prediction by the graph is seldom larger than
+ten times that of a closure."""
 _TOLERANCE = 1e-6
 """Least squares ends when a step gains less than this share of the error."""
 
@@ -56,6 +60,8 @@ class OutlierTest:
     """Log of the volume in which false closures are uniform, in m and rad."""
     max_iterations: int
     chain: OdometryChain
+    strict: bool = False
+    """Whether a closure may cost no more than `probability` says, however unlikely it is to fit so well by chance."""
 
     def __call__(self, weight: Floats, poses: Floats) -> State:
         """Reject what costs the rest too much and readmit what the rest predicts, until nothing changes."""
@@ -71,7 +77,7 @@ class OutlierTest:
             except GraphError:  # nearly singular: no prediction
                 return state
             cost = np.minimum(single.cost, state.chi2)  # first order may say more than there is
-            limit = self.limit(state, cost, single.log_spread)
+            limit = self.limit(single.log_spread)
             if (cost > limit).any():
                 out = accepted[(cost > limit) & (cost >= _WORST_SHARE * cost[cost > limit].max())]
                 state = self.solve(_with_weight(state.weight, out, 0.0), state.poses)
@@ -81,7 +87,7 @@ class OutlierTest:
                 state = smaller
                 continue
             rejected = self.loops[(state.weight[self.loops] == 0) & ~returned[self.loops]]
-            back = self.predicted(state, rejected, single.freedom)
+            back = self.predicted(state, rejected)
             if len(back) == 0:
                 return state
             returned[back] = True  # readmitted once
@@ -99,77 +105,56 @@ class OutlierTest:
             group_costs(factors.graph, state.poses, accepted, single, places, self.chain), state.chi2
         )
         size = np.array([len(place) for place in places])
-        limit = np.full(len(places), np.inf)  # groups of one were tested already
-        for members in np.unique(size[size > 1]).tolist():
-            limit[size == members] = self.limit_of_group(state, suspicion[size == members], members)
-        ratio = suspicion / np.maximum(limit, 1e-300)
-        suspects = [accepted[places[at]] for at in np.argsort(-ratio, kind="stable").tolist() if ratio[at] > 1.0]
-        suspects = [members for members in suspects[:_MOST_SUSPECTS] if members.tobytes() not in cleared]
+        spread = np.array([single.log_spread[place].max() for place in places])
+        limit = np.array([self.limit_of_group(*one) for one in zip(size.tolist(), spread.tolist(), strict=True)])
+        ratio = np.where(size > 1, suspicion / limit, 0.0)  # groups of one were tested already
+        worst = [at for at in np.argsort(-ratio, kind="stable").tolist() if ratio[at] > 1.0][:_MOST_SUSPECTS]
+        suspects = [(accepted[places[at]], float(limit[at])) for at in worst]
+        suspects = [(members, most) for members, most in suspects if members.tobytes() not in cleared]
         if not suspects:
             return None
         information = Objective(factors, state.weight).information(state.poses)
-        for members in suspects:
+        for members, most in suspects:
             cost = state.chi2  # of many, solving without them is faster than predicting it
             if len(members) <= _MOST_JOINT:
                 cost = min(cost_together(factors, state.weight, state.poses, information, members), cost)
-            if cost > self.limit_of_group(state, np.array([cost]), len(members))[0]:
+            if cost > most:
                 smaller = self.solve(_with_weight(state.weight, members, 0.0), state.poses)
-                cost = state.chi2 - smaller.chi2
-                if cost > self.limit_of_group(state, np.array([cost]), len(members))[0]:
+                if state.chi2 - smaller.chi2 > most:
                     return smaller
             cleared.add(members.tobytes())
         return None
 
-    def predicted(self, state: State, rejected: Ints, freedom: Floats) -> Ints:
+    def predicted(self, state: State, rejected: Ints) -> Ints:
         """Rejected closures that the solved graph predicts."""
         graph = self.factors.graph
-        most = self.limit(state, np.zeros(1))[0]
-        # necessary where the rest predicts it no worse than any inlier
-        rejected = rejected[residual_sigma(graph, state.poses, rejected) ** 2 <= most * (1.0 + freedom.max())]
+        own = -0.5 * np.linalg.slogdet(informed(graph)[rejected])[1]
+        # an upper bound of the residual of what is within the limit, whatever the prediction's noise adds to its own
+        near = residual_sigma(graph, state.poses, rejected) ** 2 <= _FURTHEST * self.limit(own)
+        rejected = rejected[near]
         if len(rejected) == 0:
             return rejected
         apart, log_spread = distance(self.factors, state.weight, state.poses, rejected)
-        return rejected[apart <= self.limit(state, np.zeros(len(rejected)), log_spread)]
+        return rejected[apart <= self.limit(log_spread)]
 
-    def limit(self, state: State, cost: Floats, log_spread: Floats | None = None) -> Floats:
-        """(K,) how much chi-square each closure may cost the rest; the least of three bounds.
+    def limit(self, log_spread: Floats) -> Floats:
+        """(K,) how much chi-square each closure may cost the rest: what makes it as likely true as false.
 
-        1. By the claimed noise: the chi-square quantile.
-        2. By the estimated noise: its scale is the chi-square of the graph without it per degree of freedom (at the
-           quantile that it exceeds with the same probability). Residuals have long tails, so the bound is that of the
-           generalised Gauss inequality for unimodal distributions: P(r^2 > k d) <= (2 / (d + 2))^(2 / d) / k
-           (Van Parys, Goulart, Kuhn 2016).
-        3. By chance: fewer than 1 - probability of all rejected closures, if uniform, are expected as near; the bound
-           falls as the prediction's `log_spread` rises, but not below the mean of true ones.
+        False ones are uniform in the room, unless the test is `strict`. `log_spread` is half the log determinant of the
+        covariance of the rest's prediction and the closure's noise together. A true one as the noise has it passes by
+        `probability` at least.
         """
         d = degrees_of_freedom(self.factors.graph)
-        claimed = chi2_quantile(self.probability, d)
-        scale = self._scale(state, cost, 1)
-        tail = d * (2.0 / (d + 2.0)) ** (2.0 / d) / (1.0 - self.probability)
-        bound = np.minimum(claimed, scale * tail)
-        false = len(state.weight) - int(state.weight.sum())
-        if log_spread is None or false == 0:
-            return bound
-        ball = d / 2.0 * math.log(math.pi) - math.lgamma(d / 2.0 + 1.0)  # log volume of the unit ball
-        share = math.log1p(-self.probability) - math.log(false) + self.log_room
-        by_chance = np.exp(2.0 / d * (share - ball - log_spread))
-        return np.minimum(bound, np.maximum(by_chance, d * np.minimum(scale, 1.0)))
+        if self.strict:
+            return np.full(len(log_spread), chi2_quantile(self.probability, d))
+        by_chance = 2.0 * (self.log_room - log_spread) - d * math.log(2.0 * math.pi)
+        return np.maximum(by_chance, chi2_quantile(self.probability, d))
 
-    def limit_of_group(self, state: State, cost: Floats, members: int) -> Floats:
-        """(G,) the first two bounds for a group: a long tail for the group, none within it."""
+    def limit_of_group(self, members: int, log_spread: float) -> float:
+        """The limit of a group: it may be off as one as a closure may, and its members as their noise has it."""
         d = degrees_of_freedom(self.factors.graph)
-        tail = d * (2.0 / (d + 2.0)) ** (2.0 / d) / (1.0 - self.probability)
-        among = chi2_quantile(self.probability, (members - 1) * d)
-        claimed = chi2_quantile(self.probability, members * d)
-        return np.minimum(claimed, self._scale(state, cost, members) * (tail + among))
-
-    def _scale(self, state: State, cost: Floats, members: int) -> Floats:
-        """Factor (K,) of the noise's variance estimated without so many closures; inf without redundancy."""
-        d = degrees_of_freedom(self.factors.graph)
-        dof = d * (int(state.weight.sum()) - len(state.poses) + 1 - members)
-        if dof <= 0:
-            return np.full(len(cost), np.inf)
-        return np.maximum(state.chi2 - cost, 0.0) / chi2_quantile(1.0 - self.probability, dof)
+        among = chi2_quantile(self.probability, (members - 1) * d) if members > 1 else 0.0
+        return among + float(self.limit(np.array([log_spread]))[0])
 
     def solve(self, weight: Floats, poses: Floats) -> State:
         """Least squares with these weights (E,) from these poses."""

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog.errors import GraphError
-from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, redundancy, residual_sigma
+from vplog.graph.consistency import is_loop, residual_sigma
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import Fixes, chi2_of_fixes, inlier_fixes, with_fixes, world_from_enu
+from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, world_from_enu
+from vplog.graph.hypotheses import claimed_times
 from vplog.graph.least_squares import Objective, minimised
+from vplog.graph.variance_components import Sigmas, estimate
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -27,22 +28,45 @@ _LONGEST = 0.05
 """Largest change of the scale in one round."""
 
 
+_LONG = 10.0
+"""Length of closures in sigma from which their scale is estimated: noise makes lengths too long by the inverse square
+of this, a hundredth."""
+_STEADY = 0.025
+"""Change of a sigma in a round, as a share, below which it is settled."""
+_AS_CLAIMED = Sigmas()
+
+
 class RefineSettings(Settings):
     """What is learned of the odometry from the constraints that were kept."""
 
     noise: bool = True
     """Estimate by what factor the odometry's covariance is too large or too small."""
     scale: bool = True
-    """Estimate by what factor the odometry's metres are too short."""
+    """Estimate by what factor metres are too short: the odometry's by GPS, the closures' by the odometry. Closures tell
+    nothing of the odometry's metres: where the two differ, a shared error of depth is likelier, and does less harm."""
     scale_sigma: float = Field(default=0.02, gt=0)
-    """How far the scale is expected from 1: wheel and visual odometry lose 1-2 % of the way."""
-    least_redundancy: float = Field(default=30.0, gt=0)
-    """Degrees of freedom with which the constraints must check the odometry before its noise is judged by them: an
-    estimate from 30 is good to a quarter."""
-    most_change: float = Field(default=1e6, ge=1)
-    """The covariance is changed by no more than this factor: a thousandfold sigma."""
+    """How far the odometry's scale is expected from 1: wheel and visual odometry lose 1-2 % of the way."""
+    closure_scale_sigma: float = Field(default=0.05, gt=0)
+    """How far the scale of closures with metres of their own is expected from 1: 5 % are a millimetre of a stereo
+    pair's baseline, or a depth camera's error at 4 m."""
+    significance: float = Field(default=5.0, ge=0)
+    """A scale is applied where it is so many sigmas from 1: more than the usual three, as the noise is estimated too,
+    and what errors of neighbouring closures share makes a scale look surer than it is."""
     max_rounds: int = Field(default=12, ge=1)
     """Rounds after which it gives up; drives take 3-6."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """A factor of the metres of some edges."""
+
+    of: str
+    """What they are of: "odometry" or "closures"."""
+    edges: Bools
+    """(E,)."""
+    sigma: float
+    """How far from 1 it is expected."""
+    value: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,48 +93,72 @@ def refine(
     settings: RefineSettings,
     fixes: Fixes | None = None,
     gps: GpsSettings | None = None,
+    sigmas: Sigmas = _AS_CLAIMED,
 ) -> Refined:
-    """Solve again with what the constraints kept say of the odometry, and with GPS where there is any.
+    """Solve again with what the constraints kept say of the sensors, and with GPS where there is any.
 
     `of_odometry` (E,) marks edges whose metres are the odometry's: its own, and closures whose scale is taken from it.
-    The weights of edges stay as they are. Raises GraphError where too few fixes agree.
+    `sigmas` are those of the solution. The weights of edges stay as they are. Raises GraphError where too few fixes
+    agree.
     """
     weight, poses, inlier = solution.weight, solution.world_from_body, np.zeros(0)
     loops = is_loop(graph)
+    scales = [Scale("odometry", of_odometry, settings.scale_sigma)] if fixes is not None else []
+    metric = loops & ~of_odometry & (weight > 0)
+    if metric.any() and np.median(_lengths(graph, metric)) >= _LONG:
+        scales.append(Scale("closures", loops & ~of_odometry, settings.closure_scale_sigma))
     checked = bool((weight[loops] > 0).any())
     if fixes is not None and gps is not None:
-        poses, inlier = inlier_fixes(Factors.of(graph), weight, poses, fixes, gps)
+        start = Factors.of(rescaled(graph, [], sigmas))
+        poses, inlier = inlier_fixes(start, weight, poses, fixes, gps)
         checked = True
     if not checked or not (settings.noise or settings.scale):
-        return _refined(graph, solution, poses, 1.0, 1.0, fixes, inlier)
+        return _refined(rescaled(graph, [], sigmas), solution, poses, sigmas, [], fixes, inlier)
 
-    noise, scale, present, before = 1.0, 1.0, graph, (1.0, 1.0)
+    scales = scales if settings.scale else []
     for _ in range(settings.max_rounds):
-        present = rescaled(graph, of_odometry, ~loops, noise, scale)
-        objective = _objective(present, weight, poses, fixes, inlier)
+        objective = _objective(rescaled(graph, scales, sigmas), weight, poses, fixes, inlier)
         poses = minimised(objective, poses, _STEPS, 1e-6).world_from_body
-        before = noise, scale
+        before = sigmas
         if settings.noise:
-            noise *= _variance_factor(objective, poses, ~loops, settings.least_redundancy)
-            noise = float(np.clip(noise, 1.0 / settings.most_change, settings.most_change))
-        if settings.scale:
-            scale += _scale_step(graph, weight, of_odometry, ~loops, noise, scale, poses, fixes, inlier, settings)
-        if abs(np.log(noise / before[0])) < 0.05 and abs(scale - before[1]) < _STEP:
-            break
-    return _refined(present, solution, poses, before[0], before[1], fixes, inlier)
+            sigmas = estimate(objective, poses, sigmas)
+        moved = [_scale_step(graph, weight, scales, n, sigmas, poses, fixes, inlier) for n in range(len(scales))]
+        settled = not sigmas.differ(before, _STEADY) and all(abs(step) < _STEP for step, _ in moved)
+        scales = [replace(one, value=one.value + step) for one, (step, _) in zip(scales, moved, strict=True)]
+        if settled:
+            sure = [
+                one
+                for one, (_, sigma) in zip(scales, moved, strict=True)
+                if abs(one.value - 1.0) > settings.significance * sigma
+            ]
+            if len(sure) == len(scales):
+                break
+            scales = sure
+    present = rescaled(graph, scales, sigmas)
+    poses = minimised(_objective(present, weight, poses, fixes, inlier), poses, _STEPS, 1e-6).world_from_body
+    return _refined(present, solution, poses, sigmas, scales, fixes, inlier)
 
 
-def rescaled(graph: PoseGraph, of_odometry: Bools, odometry: Bools, noise: float, scale: float) -> PoseGraph:
-    """The graph with metres of some edges (E,) multiplied by `scale`, and the covariance of odometry by `noise`.
+def _lengths(graph: PoseGraph, edges: Bools) -> Floats:
+    """Lengths (K,) of the edges in their own sigma."""
+    shift = graph.a_from_b[edges, :3, 3]
+    return np.sqrt(np.einsum("ki,kij,kj->k", shift, graph.information[edges, 3:, 3:], shift))
+
+
+def rescaled(graph: PoseGraph, scales: list[Scale], sigmas: Sigmas) -> PoseGraph:
+    """The graph with metres of some edges multiplied, and its sigmas.
 
     What is multiplied has its noise multiplied too. With the noise left alone every constraint would be met best by a
     world of no size, and the estimate would be too small.
     """
+    if sigmas == _AS_CLAIMED and not scales:
+        return graph
+    graph = claimed_times(graph, sigmas)
     a_from_b, information = graph.a_from_b.copy(), graph.information.copy()
-    a_from_b[of_odometry, :3, 3] *= scale
-    information[of_odometry, 3:] /= scale
-    information[of_odometry, :, 3:] /= scale
-    information[odometry] /= noise
+    for scale in scales:
+        a_from_b[scale.edges, :3, 3] *= scale.value
+        information[scale.edges, 3:] /= scale.value
+        information[scale.edges, :, 3:] /= scale.value
     return replace(graph, a_from_b=a_from_b, information=information)
 
 
@@ -120,83 +168,61 @@ def _objective(graph: PoseGraph, weight: Floats, poses: Floats, fixes: Fixes | N
     return Objective(factors, weight) if fixes is None else with_fixes(factors, weight, poses, fixes, inlier)
 
 
-def _variance_factor(objective: Objective, poses: Floats, odometry: Bools, least_redundancy: float) -> float:
-    """By what factor the odometry's covariance is too small: its chi-square over its share of the redundancy.
-
-    Variance components: Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1979.
-    """
-    graph, edges = objective.factors.graph, np.flatnonzero(odometry)
-    try:
-        checks = redundancy(objective, poses, edges)
-    except GraphError:
-        # noise so large that rounding decides: all that the constraints could check, so that the next round has less
-        checks = float(degrees_of_freedom(graph) * min(np.count_nonzero(objective.weight[~odometry]), len(edges)))
-    if checks < least_redundancy:
-        return 1.0
-    chi2 = float((residual_sigma(graph, poses)[edges] ** 2).sum())
-    return max(chi2, 1e-9) / checks
-
-
 def _scale_step(
     graph: PoseGraph,
     weight: Floats,
-    of_odometry: Bools,
-    odometry: Bools,
-    noise: float,
-    scale: float,
+    scales: list[Scale],
+    number: int,
+    sigmas: Sigmas,
     poses: Floats,
     fixes: Fixes | None,
     inlier: Floats,
-    settings: RefineSettings,
-) -> float:
-    """A secant step towards the scale of least error, poses following it: by the slope here and a step aside.
+) -> tuple[float, float]:
+    """A secant step towards the scale of least error, poses following it, and the sigma of what it leads to.
 
     At the best poses for a scale the error does not change with the poses, so its slope is that with the poses fixed.
     """
+    one = scales[number]
 
-    def gradient(at: float, start: Floats) -> float:
-        present = rescaled(graph, of_odometry, odometry, noise, at)
-        best = minimised(_objective(present, weight, start, fixes, inlier), start, _STEPS, 1e-8).world_from_body
-        errors = [
-            float((weight * residual_sigma(rescaled(graph, of_odometry, odometry, noise, at + side), best) ** 2).sum())
-            for side in (-_STEP, _STEP)
-        ]
-        return (errors[1] - errors[0]) / (4.0 * _STEP) + (at - 1.0) / settings.scale_sigma**2
+    def at(value: float) -> PoseGraph:
+        return rescaled(graph, [*scales[:number], replace(one, value=value), *scales[number + 1 :]], sigmas)
 
-    aside = settings.scale_sigma / 4.0
-    here, there = gradient(scale, poses), gradient(scale + aside, poses)
+    def gradient(value: float) -> float:
+        best = minimised(_objective(at(value), weight, poses, fixes, inlier), poses, _STEPS, 1e-8).world_from_body
+        errors = [float((weight * residual_sigma(at(value + side), best) ** 2).sum()) for side in (-_STEP, _STEP)]
+        return (errors[1] - errors[0]) / (4.0 * _STEP) + (value - 1.0) / one.sigma**2
+
+    aside = one.sigma / 4.0
+    here, there = gradient(one.value), gradient(one.value + aside)
     curve = (there - here) / aside
     if curve <= 0.0:  # nothing to find: the prior alone would curve it upwards
-        return 0.0
-    return float(np.clip(-here / curve, -_LONGEST, _LONGEST))
+        return 0.0, one.sigma
+    return float(np.clip(-here / curve, -_LONGEST, _LONGEST)), curve**-0.5
 
 
 def _refined(
     graph: PoseGraph,
     solution: Solution,
     poses: Floats,
-    noise: float,
-    scale: float,
+    sigmas: Sigmas,
+    scales: list[Scale],
     fixes: Fixes | None,
     inlier: Floats,
 ) -> Refined:
     """The refined solution, its reason saying what was learned."""
     world, sentences = None, []
-    if noise != 1.0:
-        sentences.append(
-            f"The odometry's noise is {np.sqrt(noise):.2g} times what was assumed, by the constraints kept."
-        )
-    if scale != 1.0:
-        sentences.append(f"Its metres are {abs(1.0 / scale - 1.0):.2%} too {'long' if scale < 1.0 else 'short'}.")
+    if sigmas.odometry != 1.0:
+        sentences.append(f"The odometry's noise is {sigmas.odometry:.2g} times what was assumed.")
+    scale = {one.of: one.value for one in scales}
+    for of, value in scale.items():
+        too = "long" if value < 1.0 else "short"
+        whose = "odometry's" if of == "odometry" else "closures'"
+        sentences.append(f"The {whose} metres are {abs(1.0 / value - 1.0):.2%} too {too}.")
     if fixes is not None:
         world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
-        chi2 = chi2_of_fixes(poses, fixes, world)[inlier > 0]
-        beyond = int((chi2 > chi2_quantile(0.99, 3)).sum())
-        sentences.append(
-            f"{int(inlier.sum())} of {len(fixes)} GPS fixes were used, {beyond} of them beyond 99 % of their noise."
-        )
+        sentences.append(f"{int(inlier.sum())} of {len(fixes)} GPS fixes were used.")
     error = float(0.5 * (solution.weight * residual_sigma(graph, poses) ** 2).sum())
     refined = replace(
         solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *sentences])
     )
-    return Refined(graph, refined, noise, scale, inlier, world)
+    return Refined(graph, refined, sigmas.odometry**2, scale.get("odometry", 1.0), inlier, world)

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field
 
-from vplog.graph.consistency import KNOWN_TO, keep_odometry_if_worse
+from vplog.data import Solution
+from vplog.graph.build import checked
+from vplog.graph.consistency import is_loop
+from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
-from vplog.graph.lm import LmSettings
+from vplog.graph.hypotheses import best_hypothesis, bounded
+from vplog.graph.lm import LmSettings, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
+from vplog.graph.variance_components import Sigmas
 
 if TYPE_CHECKING:
-    from vplog.data import PoseGraph, Solution
+    from collections.abc import Callable
+
+    from vplog.data import Floats, PoseGraph
     from vplog.stages import Optimiser
 
 __all__ = [
@@ -24,7 +31,7 @@ __all__ = [
     "LmSettings",
     "OptimiserSettings",
     "PcmSettings",
-    "gated",
+    "decided",
 ]
 
 OptimiserSettings = Annotated[
@@ -33,10 +40,37 @@ OptimiserSettings = Annotated[
 ]
 
 
-def gated(graph: PoseGraph, optimiser: Optimiser) -> Solution:
-    """What the optimiser makes of the graph, or the odometry poses where that cannot be believed.
+class Decision(NamedTuple):
+    """Which closures are true."""
 
-    `gnc` has held every closure that it keeps against all others, so what odometry is bent by is then sooner the noise,
-    which nobody knows so well; what the others believe has to pass by the noise as said.
+    graph: PoseGraph
+    """With the sigmas that are claimed, no closure's far below those of the others."""
+    solution: Solution
+    sigmas: Sigmas
+    """By what the claimed sigmas were multiplied."""
+
+
+def decided(
+    graph: PoseGraph, optimiser: Optimiser, cost: Callable[[Factors, Floats, Floats], float] | None = None
+) -> Decision:
+    """The hypothesis of greatest evidence, less what it costs other measurements, solved.
+
+    Raises GraphError where the graph cannot be solved.
     """
-    return keep_odometry_if_worse(graph, optimiser(graph), KNOWN_TO if isinstance(optimiser, GncSettings) else None)
+    graph, _ = checked(graph)
+    loops = is_loop(graph)
+    if not loops.any():
+        return Decision(graph, optimiser(graph), Sigmas())
+    best = best_hypothesis(graph, optimiser, cost)
+    graph = bounded(graph)
+    count, kept = int(loops.sum()), int(best.weight[loops].sum())
+    if kept == 0:
+        why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
+        return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), best.sigmas)
+    if not isinstance(optimiser, GncSettings):
+        return Decision(graph, optimiser(graph), best.sigmas)
+    found = f"{kept} of {count} closures were kept. "
+    solution = solve_weighted(
+        Factors.of(graph), best.weight, best.poses, optimiser.max_iterations, optimiser.tolerance, found
+    )
+    return Decision(graph, solution, best.sigmas)

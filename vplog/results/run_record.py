@@ -62,8 +62,15 @@ def read_run_json(path: Path) -> dict[str, Any]:
 
 
 def _drop_retired(settings: Any) -> None:
-    """Remove from a tree of settings those that are gone and were off: `verify.direction`."""
-    verify = settings.get("verify") if isinstance(settings, dict) else None
+    """Remove from a tree of settings those that are gone: `verify.direction` where it was off, those of the back end
+    that the evidence has replaced."""
+    if not isinstance(settings, dict):
+        return
+    settings.pop("cross_check", None)
+    verify, refine = settings.get("verify"), settings.get("refine")
+    if isinstance(refine, dict):
+        for name in ("least_redundancy", "most_change"):
+            refine.pop(name, None)
     direction = verify.get("direction") if isinstance(verify, dict) else None
     if isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False:
         del verify["direction"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -13,21 +14,19 @@ from vplog.data import EdgeKind, Verdict
 from vplog.errors import GraphError
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
-from vplog.graph.cross_check import cross_checked
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import fixes_on, with_fixes
-from vplog.graph.gps_gate import keep_odometry_if_further
+from vplog.graph.gps_factors import cost_of_fixes, fixes_on, with_fixes, with_noise_of
+from vplog.graph.hypotheses import claimed_times
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import pose_covariances
 from vplog.graph.noise import edge_covariance
 from vplog.graph.refine import refine
-from vplog.graph.solve import gated
+from vplog.graph.solve import decided
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vplog.data import Closures, Floats, Gps, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory
-    from vplog.graph.cross_check import CrossCheckSettings
+    from vplog.data import Closures, Floats, Gps, Ints, Keyframes, Odometry, PoseGraph, Trajectory
     from vplog.graph.gps_factors import Fixes, GpsSettings
     from vplog.graph.noise import NoiseSettings
     from vplog.graph.refine import Refined, RefineSettings
@@ -35,11 +34,6 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
-
-_CONTRADICTED = (
-    "The odometry's covariance is too small and was replaced by the drift model: with it the solver keeps no "
-    "closure, with the model {kept} of {count}."
-)
 
 
 class BackEnd(Protocol):
@@ -49,8 +43,6 @@ class BackEnd(Protocol):
     def noise(self) -> NoiseSettings: ...
     @property
     def solve(self) -> OptimiserSettings: ...
-    @property
-    def cross_check(self) -> CrossCheckSettings: ...
     @property
     def refine(self) -> RefineSettings: ...
     @property
@@ -77,20 +69,19 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
     """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
     covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
-    solution = solve_gated(graph, settings)
-    if source != "model" and len(rows) and not (solution.weight[is_loop(graph)] > 0.5).any():
-        # a covariance is the least reliable thing in a log; closures that agree with a usual drift speak against it
-        usual = settings.noise.model_copy(update={"source": "model"})
-        modelled, _, _ = edge_covariance(odometry, keyframes.stamp_ns, usual)
-        other, _, _ = build.build_graph(keyframes, modelled, closures)
-        again = solve_gated(other, settings)
-        if kept := int((again.weight[is_loop(other)] > 0.5).sum()):
-            graph, solution, source = other, again, "model"
-            doubts = [*doubts, _CONTRADICTED.format(count=len(rows), kept=kept)]
     fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
+    if fixes is None:
+        decision = decided(graph, settings.solve)
+    else:
+        alone = np.where(is_loop(graph), 0.0, 1.0)
+        fixes = with_noise_of(Factors.of(graph), alone, graph.world_from_body, fixes, settings.gps)
+        decision = decided(graph, settings.solve, partial(cost_of_fixes, fixes=fixes, settings=settings.gps))
+    solution = decision.solution
     if fixes is not None:
-        solution = keep_odometry_if_further(graph, solution, fixes)
-    refined = refine(graph, solution, by_odometry(graph, closures, rows), settings.refine, fixes, settings.gps)
+        present = Factors.of(claimed_times(decision.graph, decision.sigmas))
+        fixes = with_noise_of(present, solution.weight, solution.world_from_body, fixes, settings.gps)
+    of_odometry = by_odometry(graph, closures, rows)
+    refined = refine(decision.graph, solution, of_odometry, settings.refine, fixes, settings.gps, decision.sigmas)
     warnings = doubts + repairs + (fixes.warnings if fixes else [])
     for warning in warnings:
         _log.warning(warning)
@@ -102,11 +93,6 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
         source,
         warnings,
     )
-
-
-def solve_gated(graph: PoseGraph, settings: BackEnd) -> Solution:
-    """The robust solution, or the odometry where that cannot be believed."""
-    return cross_checked(graph, gated(graph, settings.solve), settings.cross_check)
 
 
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from vplog.execution.timing import Watch
 from vplog.geometry.se3 import inverse
 from vplog.graph.build import checked, parts, subgraph
 from vplog.graph.certificate import solve_certified
-from vplog.graph.solve import OptimiserSettings, gated
+from vplog.graph.solve import OptimiserSettings, decided
 from vplog.results.g2o import read_g2o, write_g2o
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def solve_parts(
     for number in np.flatnonzero(size > 1).tolist():
         rows, edges = rows_of(number), edges_of(number)
         alone, repairs = checked(subgraph(graph, rows, edges))
-        solution = gated(alone, optimiser)
+        solution = decided(alone, optimiser).solution
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
         warnings += [where + text for text in repairs]
         poses[rows], weight[edges], information[edges] = solution.world_from_body, solution.weight, alone.information

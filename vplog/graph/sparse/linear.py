@@ -48,6 +48,15 @@ class Supernodes(Cholesky):
         """The inverse (K d, K d) at a few different nodes (K,)."""
         return selected_inversion.joint_inverse(self, nodes)
 
+    def log_determinant(self) -> float:
+        """Log of the determinant of the matrix."""
+        wide = np.diff(self.shape.first) * self.size
+        below = np.diff(self.shape.start) * self.size
+        # the diagonal of each supernode's rows of R, (wide, wide + below) one after the other
+        node = np.repeat(np.arange(len(wide)), wide)
+        column = np.arange(len(node)) - np.repeat(np.cumsum(wide) - wide, wide)
+        return 2.0 * float(np.log(self.values[self.begin[node] + column * (wide + below + 1)[node]]).sum())
+
 
 @dataclass(frozen=True, eq=False)
 class BayesTree:
@@ -106,6 +115,10 @@ class BayesTree:
         """The inverse (K d, K d) at a few different nodes (K,)."""
         joint = self.tree.jointMarginalCovariance(nodes.tolist())
         return np.block([[joint.at(one, other) for other in nodes.tolist()] for one in nodes.tolist()])
+
+    def log_determinant(self) -> float:
+        """Log of the determinant of the matrix."""
+        return 2.0 * float(self.tree.logDeterminant())
 
 
 def _clique_inverse(conditional: gtsam.GaussianConditional, separator: Floats) -> tuple[Floats, int]:

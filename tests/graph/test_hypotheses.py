@@ -1,0 +1,110 @@
+"""True closures are found whatever sigmas are claimed, and whoever agrees with whom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.graph.drive import Drive, position_error, ring
+from vplog.geometry import se3
+from vplog.graph.consistency import OdometryChain, is_loop
+from vplog.graph.evidence import log_evidence, runs
+from vplog.graph.factors import Factors
+from vplog.graph.hypotheses import best_hypothesis, bounded
+from vplog.graph.least_squares import Objective, descend
+from vplog.graph.solve import GncSettings, LmSettings, decided
+
+
+def claiming(drive: Drive, odometry: float = 1.0, closures: float = 1.0) -> Drive:
+    """The drive with claimed sigmas multiplied."""
+    loops = is_loop(drive.graph)
+    factor = np.where(loops, closures, odometry)[:, None, None]
+    return replace(drive, graph=replace(drive.graph, information=drive.graph.information / factor**2))
+
+
+def with_family(drive: Drive, rows: np.ndarray, shift_m: float) -> tuple[Drive, np.ndarray]:
+    """The drive with loops `rows` false, all displaced alike in the world, as the next aisle is; and which (E,)."""
+    D = se3.pose(np.eye(3), np.array([shift_m, 0.0, 0.0]))
+    measured = drive.graph.a_from_b.copy()
+    a, b = drive.graph.a[rows], drive.graph.b[rows]
+    measured[rows] = se3.inverse(drive.true[a]) @ D @ drive.true[a] @ measured[rows]
+    false = np.zeros(len(measured), bool)
+    false[rows] = True
+    assert (a != b).all()
+    return replace(drive, graph=replace(drive.graph, a_from_b=measured)), false
+
+
+@pytest.mark.parametrize("odometry", [0.2, 1.0, 8.0])
+@pytest.mark.parametrize("closures", [0.3, 1.0, 4.0])
+def test_claimed_sigmas_decide_nothing(odometry: float, closures: float) -> None:
+    drive = claiming(ring(120, loops=40, false=20, seed=2), odometry, closures)
+    loops = is_loop(drive.graph)
+    kept = decided(drive.graph, GncSettings()).solution.weight > 0.5
+    assert not (kept & drive.false).any()
+    assert (kept & loops & ~drive.false).sum() >= 39
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_family_that_odometry_contradicts_is_false_though_it_is_larger(seed: int) -> None:
+    drive = ring(160, loops=60, seed=seed)
+    loops = np.flatnonzero(is_loop(drive.graph))
+    drive, false = with_family(drive, np.sort(np.random.default_rng(seed).permutation(loops)[:35]), 8.0)
+    drive = claiming(drive, odometry=6.0)
+    solution = decided(drive.graph, GncSettings()).solution
+    assert not (solution.weight[false] > 0.5).any()
+    assert position_error(solution.world_from_body, drive.true) < 1.0
+
+
+def test_where_all_are_false_odometry_is_kept_with_every_method() -> None:
+    drive = ring(120, loops=0, false=25, seed=4)
+    for optimiser in (GncSettings(), LmSettings()):
+        solution = decided(drive.graph, optimiser).solution
+        assert solution.weight[is_loop(drive.graph)].sum() == 0
+        assert "likelier to be all false" in solution.reason
+
+
+def test_no_closure_outweighs_a_hundred_others() -> None:
+    drive = ring(120, loops=40, seed=5)
+    loops = np.flatnonzero(is_loop(drive.graph))
+    information = drive.graph.information.copy()
+    information[loops[7]] *= 1e21
+    drive = replace(drive, graph=replace(drive.graph, information=information))
+    assert bounded(drive.graph).information[loops[7]].max() <= 1.0001e4 * np.median(information[loops].max((1, 2)))
+    assert decided(drive.graph, GncSettings()).solution.weight[loops].sum() >= 39
+
+
+def test_sigmas_are_those_of_the_world() -> None:
+    honest = best_hypothesis(ring(240, 80, seed=6).graph, GncSettings()).sigmas
+    found = best_hypothesis(claiming(ring(240, 80, seed=6), 0.25, 0.5).graph, GncSettings()).sigmas
+    assert found.odometry == pytest.approx(4.0 * honest.odometry, rel=0.1)
+    assert found.closures == pytest.approx(2.0 * honest.closures, rel=0.1)
+
+
+def test_the_evidence_of_true_closures_is_their_density_under_the_odometry() -> None:
+    """Against the dense joint covariance of closures that are linear in small errors."""
+    drive = ring(30, loops=6, seed=7)
+    graph, weight = drive.graph, np.ones(len(drive.graph.a))
+    factors, chain = Factors.of(graph), OdometryChain.of(graph)
+    loops = np.flatnonzero(is_loop(graph))
+    poses = descend(factors, weight, chain.poses, 100, 1e-9).world_from_body
+    apart = weight.copy()
+    apart[loops] = 0.0
+    change = log_evidence(factors, weight, poses, chain) - log_evidence(factors, apart, chain.poses, chain)
+    fewer = weight.copy()
+    fewer[loops[0]] = 0.0
+    rest = descend(factors, fewer, poses, 100, 1e-9).world_from_body
+    assert change > log_evidence(factors, fewer, rest, chain) - log_evidence(factors, apart, chain.poses, chain)
+    assert np.isfinite(Objective(factors, weight).information(poses).log_determinant())
+
+
+def test_runs_are_of_neighbours_at_both_ends() -> None:
+    graph = ring(120, loops=40, seed=8).graph
+    loops = np.flatnonzero(is_loop(graph))
+    found = list(runs(graph, loops))
+    np.testing.assert_array_equal(np.sort(np.concatenate(found)), loops)
+    for run in found:
+        ends = np.sort(np.stack([graph.a[run], graph.b[run]]), axis=0)
+        assert (np.diff(np.sort(ends[0])) <= 3).all()
+        assert (np.diff(np.sort(ends[1])) <= 3).all()
