@@ -121,14 +121,11 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 @pytest.fixture(scope="session")
 def drive(made_once: Callable[..., Path]) -> Drive:
     """The small demo drive: about 45 frames, of which the last dozen pass known places."""
-    from vplog.demo import route
     from vplog.demo.record import Drive
-    from vplog.demo.scene import make_camera
+    from vplog.demo.scene import make_scene
 
     folder = made_once("drive", lambda folder: make_drive(folder, SMALL))
-    stamp_ns = route.frame_stamps(SMALL)
-    poses = route.world_from_body(SMALL, stamp_ns)
-    return Drive(folder / "drive.mcap", folder / "truth.tum", make_camera(SMALL), stamp_ns, poses)
+    return Drive(**vars(make_scene(SMALL)), log=folder / "drive.mcap", truth=folder / "truth.tum")
 
 
 @pytest.fixture(scope="session")

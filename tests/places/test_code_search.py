@@ -126,7 +126,7 @@ def test_stop_is_a_map_of_the_first_rows() -> None:
 
 def test_a_place_equal_to_the_query_scores_1_and_ties_go_to_the_earlier_row() -> None:
     one = Places(np.array([[2, 5]], np.uint16), np.array([[255, 100]], np.uint8), np.full((1, 2, 9), 7, np.uint8))
-    many = Places(*(np.repeat(part, 50, axis=0) for part in (one.references, one.weights, one.boxes)))
+    many = Places(*(np.repeat(part, 50, axis=0) for part in (one.references, one.weights, one.boxes)))  # type: ignore[arg-type]
     for pairing in PAIRINGS:
         index = many.index(6, pairing)
         np.testing.assert_allclose(index.scores(one.place(0)), 1.0, rtol=1e-6)

@@ -17,7 +17,7 @@ from tests.logs.drives import FRAMES, Drive, ros_messages, write_raw, write_ros2
 from tests.logs.test_rectification import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT
 from tests.logs.test_rectification import drive as write_pair
 from vplog import logs
-from vplog.cli import main, options
+from vplog.cli import main, parser
 from vplog.logs import TopicChoice
 from vplog.results.run_record import plain
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
@@ -120,7 +120,7 @@ def test_the_command_of_a_log_that_cannot_be_run_works_all_the_same(verb: Any, d
     two = write_ros2(tmp_path / "two", messages + spoiled)
     broken = preflight(two, TopicChoice(image="/broken/image/compressed")).record
     assert not broken["ready"]
-    assert preflight(two, options.topics_of(main._parser().parse_args(words_of(broken["command"])))).record["ready"]
+    assert preflight(two, parser.topics_of(main._parser().parse_args(words_of(broken["command"])))).record["ready"]
     assert "--image-topic /cam/image/compressed" in broken["command"]
     images = write_ros2(tmp_path / "images", [m for m in messages if m.topic == "/cam/image/compressed"])
     record = preflight(images).record
@@ -153,7 +153,7 @@ def test_the_command_runs_with_what_was_asked_for(drive: Path, tmp_path: Path) -
     topics = TopicChoice(image="/cam/image/compressed", depth="", calibration_file=file)
     words = shlex.split(command(drive, topics))
     arguments = main._parser().parse_args(words[1:])
-    assert options.topics_of(arguments) == topics
+    assert parser.topics_of(arguments) == topics
     assert arguments.logs == [drive]
 
 

@@ -38,6 +38,10 @@ _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""
 
 
+_LEAST_SIDE_M = 5.0
+"""m; a camera that hardly moves sees as much, and takes any of it for another part of it."""
+
+
 class _Run(NamedTuple):
     """A run of false closures, as one measurement from an earlier to a later pose."""
 
@@ -83,7 +87,7 @@ def log_room(places: Floats, dimension: int) -> float:
     8 pi^2 is the volume of the rotations in units of small rotation vectors.
     """
     side = 2.0 * np.ptp(places, axis=0)[:dimension]
-    side = np.maximum(side, max(_LEAST_SIDE * side.max(), 1e-6))
+    side = np.maximum(side, max(_LEAST_SIDE * side.max(), _LEAST_SIDE_M))
     return float(np.log(side).sum()) + math.log(2.0 * math.pi if dimension == 2 else 8.0 * math.pi**2)
 
 
@@ -159,7 +163,7 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
     inner = -0.5 * float(e @ e - gradient @ displaced[axes]) - float(np.log(np.diag(root)).sum())
     inner -= 0.5 * float(np.linalg.slogdet(information)[1]) + 0.5 * (size - 1) * d * _LOG_2PI
     mean = measured[middle] @ se3.exp(displaced[None])[0]
-    return inner, _Run(at, to, mean, np.linalg.inv(information))
+    return inner, _Run(at, to, mean, np.asarray(np.linalg.inv(information), np.float64))
 
 
 def _forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:

@@ -38,7 +38,8 @@ _ALIKE = 0.01
 """Share of the closures by which a start must differ from what was found to be tried."""
 _VERY_STRONG = 5.0
 """Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
-a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong."""
+a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. What another method that was chosen makes
+of them is used where the odds are even."""
 _STEPS, _TOLERANCE = 100, 1e-6
 
 
@@ -82,7 +83,8 @@ def best_hypothesis(
         found.append(_judged(graph, kept, *_estimated(graph, kept, solution.world_from_body, Sigmas())))
     for sigmas in dict.fromkeys([Sigmas(), *(one.sigmas for one in found)]):
         alone = _judged(graph, none, chain.poses, sigmas)
-        found.append(replace(alone, log_evidence=alone.log_evidence + _VERY_STRONG))
+        margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
+        found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     if cost is None:
         return max(found, key=lambda one: one.log_evidence)
     best, most = found[-1], -np.inf

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _STEP = 1e-4
 """Step of the scale for differences: far above rounding, far below what any drive determines."""
+_SMALL = 0.05
+"""Change of a scale in its sigma at which it is settled."""
 _STEPS = 20
 """Most steps of least squares: each starts from the last round's best poses."""
 _LONGEST = 0.05
@@ -49,9 +51,11 @@ class RefineSettings(Settings):
     closure_scale_sigma: float = Field(default=0.05, gt=0)
     """How far the scale of closures with metres of their own is expected from 1: 5 % are a millimetre of a stereo
     pair's baseline, or a depth camera's error at 4 m."""
-    significance: float = Field(default=5.0, ge=0)
-    """A scale is applied where it is so many sigmas from 1: more than the usual three, as the noise is estimated too,
-    and what errors of neighbouring closures share makes a scale look surer than it is."""
+    significance: float = Field(default=3.0, ge=0)
+    """The odometry's scale is applied where it is so many sigmas from 1."""
+    closure_significance: float = Field(default=5.0, ge=0)
+    """The closures' scale is applied where it is so many sigmas from 1: what errors of neighbouring closures share
+    makes it look surer than it is."""
     max_rounds: int = Field(default=12, ge=1)
     """Rounds after which it gives up; drives take 3-6."""
 
@@ -66,7 +70,12 @@ class Scale:
     """(E,)."""
     sigma: float
     """How far from 1 it is expected."""
+    significance: float
+    """Sigmas that it must be from 1 to be applied."""
     value: float = 1.0
+
+    def is_sure(self, sigma: float) -> bool:
+        return abs(self.value - 1.0) > self.significance * sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +112,11 @@ def refine(
     """
     weight, poses, inlier = solution.weight, solution.world_from_body, np.zeros(0)
     loops = is_loop(graph)
-    scales = [Scale("odometry", of_odometry, settings.scale_sigma)] if fixes is not None else []
+    scales = [Scale("odometry", of_odometry, settings.scale_sigma, settings.significance)] if fixes is not None else []
     metric = loops & ~of_odometry & (weight > 0)
     if metric.any() and np.median(_lengths(graph, metric)) >= _LONG:
-        scales.append(Scale("closures", loops & ~of_odometry, settings.closure_scale_sigma))
+        own, expected = loops & ~of_odometry, settings.closure_scale_sigma
+        scales.append(Scale("closures", own, expected, settings.closure_significance))
     checked = bool((weight[loops] > 0).any())
     if fixes is not None and gps is not None:
         start = Factors.of(rescaled(graph, [], sigmas))
@@ -123,17 +133,16 @@ def refine(
         if settings.noise:
             sigmas = estimate(objective, poses, sigmas)
         moved = [_scale_step(graph, weight, scales, n, sigmas, poses, fixes, inlier) for n in range(len(scales))]
-        settled = not sigmas.differ(before, _STEADY) and all(abs(step) < _STEP for step, _ in moved)
         scales = [replace(one, value=one.value + step) for one, (step, _) in zip(scales, moved, strict=True)]
-        if settled:
-            sure = [
-                one
-                for one, (_, sigma) in zip(scales, moved, strict=True)
-                if abs(one.value - 1.0) > settings.significance * sigma
-            ]
-            if len(sure) == len(scales):
-                break
-            scales = sure
+        if sigmas.differ(before, _STEADY) or any(abs(step) > _SMALL * sigma for step, sigma in moved):
+            continue
+        # what is not sure is left out, and the rest estimated without it
+        sure = [one for one, (_, sigma) in zip(scales, moved, strict=True) if one.is_sure(sigma)]
+        if len(sure) == len(scales):
+            break
+        scales = sure
+    else:
+        scales = []  # they wander
     present = rescaled(graph, scales, sigmas)
     poses = minimised(_objective(present, weight, poses, fixes, inlier), poses, _STEPS, 1e-6).world_from_body
     return _refined(present, solution, poses, sigmas, scales, fixes, inlier)

@@ -23,6 +23,8 @@ and, now and then, by ten."""
 _LEAST_CLOSURES = 0.5
 """Closures are not taken for much better than they claim: those of neighbouring keyframes share landmarks, so they
 agree with each other more than they are right."""
+_LEAST = 2.0**-10
+"""Variance factor beyond which, and beyond whose inverse, a claim is no longer one: 32 times in sigma."""
 _STEPS = 30
 """Most Newton steps in one dimension; 5 are usual."""
 
@@ -54,7 +56,7 @@ def most_likely_variance(chi2: float, redundancy: float) -> float:
         u += min(max(step, -1.0), 3.0)
         if abs(step) < 1e-6:
             break
-    return math.exp(u)
+    return min(max(math.exp(u), _LEAST), 1.0 / _LEAST)
 
 
 def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:

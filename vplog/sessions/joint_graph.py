@@ -11,7 +11,8 @@ from vplog.data import EdgeKind, Verdict
 from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
 from vplog.graph.correct_trajectory import correct_trajectory
-from vplog.graph.refine import rescaled
+from vplog.graph.hypotheses import claimed_times
+from vplog.graph.variance_components import Sigmas
 from vplog.results import tables
 from vplog.run.back_end import by_odometry
 
@@ -53,7 +54,7 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor
     with the odometry's noise before its solve scaled that by `sigma_factor`: the joint solve estimates it again, with
     the same scale for all."""
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
-    claimed = rescaled(graph, odometry, odometry, 1.0 / sigma_factor**2, 1.0)
+    claimed = claimed_times(graph, Sigmas(odometry=1.0 / sigma_factor))
     used = np.flatnonzero(np.isfinite(closures.weight))
     metric = np.array([closures.scale[row] != "none" for row in used.tolist()], bool)
     of_odometry = by_odometry(claimed, closures, np.concatenate([used[metric], used[~metric]]))
