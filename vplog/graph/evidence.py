@@ -130,7 +130,7 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
     """
     axes, X, size = chain.axes, chain.poses, len(run)
     d = len(axes)
-    a, b, measured, noise = _forward(graph, run)
+    a, b, measured, noise = forward(graph, run)
     middle = size // 2
     at, to = int(a[middle]), int(b[middle])
     if size == 1:
@@ -166,7 +166,7 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
     return inner, _Run(at, to, mean, np.asarray(np.linalg.inv(information), np.float64))
 
 
-def _forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
+def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
     """The edges from their earlier pose a to their later one b: a, b, a_from_b and covariance in the frame of b."""
     axes = AXES[graph.dimension]
     back = (graph.a[edges] > graph.b[edges])[:, None, None]
@@ -194,33 +194,41 @@ def _log_displacements(together: list[_Run], chain: OdometryChain, room: float) 
     near &= chain.part[b[one]] == chain.part[b[two]]
     one, two = one[near], two[near]
     measured = np.array([run.a_from_b for run in together])
-    noise = np.array([run.covariance for run in together])
+    claims = Displacements(chain, a, b, measured, np.array([run.covariance for run in together]))
     for start in range(0, len(one), _PAIRS):
         this, other = one[start : start + _PAIRS], two[start : start + _PAIRS]
-        error, covariance = apart(chain, a, b, measured, noise, this, other)
+        error, covariance = claims.apart(this, other)
         log_volume = np.linalg.slogdet(covariance)[1] + error.shape[1] * _LOG_2PI
         density[this, other] = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume)
     choices = np.logaddexp.reduce(np.vstack([np.full(count, -room), density]), axis=0)
     return float(choices.sum()) - math.lgamma(count + 1)
 
 
-def apart(
-    chain: OdometryChain, a: Ints, b: Ints, measured: Floats, noise: Floats, one: Ints, other: Ints
-) -> tuple[Floats, Floats]:
-    """Twist (P, d) between the displacements that pairs `one`, `other` of forward closures claim, and its covariance.
+class Displacements:
+    """What K closures claim: that the world is displaced by D = X_a z X_b^-1 between two visits, X the odometry.
 
-    A closure a, b claims that the world is displaced by D = X_a z X_b^-1 between two visits, X the odometry; two agree
-    where D_i^-1 D_j is the identity but for the noise of both and of the odometry from a_i to a_j and from b_i to b_j.
+    Two agree where D_i^-1 D_j is the identity but for the noise of both and of the odometry from a_i to a_j and from
+    b_i to b_j (Mangelson et al., Pairwise Consistent Measurement Set Maximization, ICRA 2018, eq. 3).
     """
-    axes = chain.axes
-    at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
-    displaced = at_a @ measured @ se3.inverse(at_b)
-    Ad = se3.adjoint(at_b)[:, axes][:, :, axes]
-    own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
-    after = se3.adjoint(se3.inverse(displaced))[:, axes][:, :, axes][one]
-    at_a_end, at_b_end = (
-        np.where(end[other] >= end[one], 1.0, -1.0)[:, None, None] * (chain.total[end[other]] - chain.total[end[one]])
-        for end in (a, b)
-    )
-    covariance = own[one] + own[other] + at_b_end + after @ at_a_end @ np.swapaxes(after, 1, 2)
-    return se3.log(se3.between(displaced[one], displaced[other]))[:, axes], covariance
+
+    def __init__(self, chain: OdometryChain, a: Ints, b: Ints, measured: Floats, noise: Floats) -> None:
+        """Closures z `measured` (K, 4, 4) from earlier poses a to later ones b with `noise` (K, d, d) in b's frame."""
+        self._chain, self._a, self._b = chain, a, b
+        at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
+        self._displaced = at_a @ measured @ se3.inverse(at_b)
+        Ad = self._adjoint(at_b)
+        self._own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
+        self._after = self._adjoint(se3.inverse(self._displaced))
+
+    def _adjoint(self, poses: Floats) -> Floats:
+        return se3.adjoint(poses)[:, self._chain.axes][:, :, self._chain.axes]
+
+    def apart(self, one: Ints, other: Ints) -> tuple[Floats, Floats]:
+        """Twist (P, d) from the displacements `one` (P,) to `other`, about the first pose, and its covariance."""
+        total, after = self._chain.total, self._after[one]
+        of_a, of_b = (
+            np.where(end[other] >= end[one], 1.0, -1.0)[:, None, None] * (total[end[other]] - total[end[one]])
+            for end in (self._a, self._b)
+        )
+        covariance = self._own[one] + self._own[other] + of_b + after @ of_a @ np.swapaxes(after, 1, 2)
+        return se3.log(se3.between(self._displaced[one], self._displaced[other]))[:, self._chain.axes], covariance

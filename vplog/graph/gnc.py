@@ -1,9 +1,9 @@
 """Graduated non-convexity: inconsistent closures are down-weighted, odometry keeps its weight.
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, with three
-additions: the initial inliers are the closures that agree with the odometry (`odometry_mixture`), the scale of the
-noise is estimated from the solved graph too, and each closure, and each group of neighbouring ones, is tested against
-the prediction of the rest (`outlier_test`).
+additions: the initial inliers are the closures that agree with the odometry (`odometry_mixture`); each closure, and
+each group of neighbouring ones, is tested against the prediction of the rest (`outlier_test`); and what comes of
+several starts is compared (`hypotheses`).
 """
 
 from __future__ import annotations

@@ -229,10 +229,3 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes,
     alone, together = Objective(factors, weight), with_fixes(factors, weight, fit, fixes, inlier)
     cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
     return cost + 0.5 * (together.information(fit).log_determinant() - alone.information(poses).log_determinant())
-
-
-def only(fixes: Fixes, rows: Bools) -> Fixes:
-    """Some of the fixes."""
-    return replace(
-        fixes, row=fixes.row[rows], arm_m=fixes.arm_m[rows], enu_m=fixes.enu_m[rows], covariance=fixes.covariance[rows]
-    )

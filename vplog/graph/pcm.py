@@ -12,9 +12,10 @@ import numpy as np
 from pydantic import Field
 
 from vplog.geometry import se3
-from vplog.graph.build import AXES, checked, informed
+from vplog.graph.build import checked
 from vplog.graph.clique import largest_clique
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
+from vplog.graph.evidence import Displacements, forward
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_weighted
@@ -81,38 +82,17 @@ class PcmSettings(Settings):
 def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChain | None = None) -> Bools:
     """(K, K) whether each two of the closures agree: the way round both, by odometry, comes back to where it began.
 
-    A closure a, b claims that the world is displaced by D = X_a z X_b^-1 between two visits, X the odometry; two agree
-    where D_i^-1 D_j is the identity but for the noise of both and of the odometry from a_i to a_j and from b_i to b_j,
-    Mahalanobis distance squared up to `bound` (eq. 3). Closures between other pieces of odometry say nothing about
-    each other, which counts as agreement.
+    Mahalanobis distance squared of what they claim up to `bound` (eq. 3). Closures between other pieces of odometry say
+    nothing about each other, which counts as agreement.
     """
-    axes = AXES[graph.dimension]
     chain = chain or OdometryChain.of(graph)
-    # written from the earlier to the later pose, so that two that are written either way round compare
-    a, b = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
-    back = (graph.a[loops] > graph.b[loops])[:, None, None]
-    measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
-    at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
-    displaced = at_a @ measured @ se3.inverse(at_b)
-    at_end = se3.adjoint(np.where(back, at_a, at_b))[:, axes][:, :, axes]
-    noise = at_end @ np.linalg.inv(informed(graph)[loops]) @ np.swapaxes(at_end, 1, 2)
-    # what happens before the displacement, seen after it: the walk to a, and the noise of a closure written backwards
-    after = se3.adjoint(se3.inverse(displaced))[:, axes][:, :, axes]
-    noise = np.where(back, after @ noise @ np.swapaxes(after, 1, 2), noise)
-    piece = np.stack([chain.part[a], chain.part[b]], axis=1)
+    a, b, measured, noise = forward(graph, loops)
+    claims, piece = Displacements(chain, a, b, measured, noise), np.stack([chain.part[a], chain.part[b]], axis=1)
     result = np.ones((len(loops), len(loops)), bool)
     one, two = np.triu_indices(len(loops), 1)
     alike = (piece[one] == piece[two]).all(1)
     one, two = one[alike], two[alike]
     for first in range(0, len(one), _PAIRS):
         this, other = one[first : first + _PAIRS], two[first : first + _PAIRS]
-        error = se3.log(se3.between(displaced[this], displaced[other]))[:, axes]
-        noise_a, noise_b = (
-            np.where(end[other] >= end[this], 1.0, -1.0)[:, None, None]
-            * (chain.total[end[other]] - chain.total[end[this]])
-            for end in (a, b)
-        )
-        turned = np.swapaxes(after[this], 1, 2)
-        covariance = noise[this] + noise[other] + noise_b + after[this] @ noise_a @ turned
-        result[this, other] = result[other, this] = se3.mahalanobis2(error, covariance) <= bound
+        result[this, other] = result[other, this] = se3.mahalanobis2(*claims.apart(this, other)) <= bound
     return result
