@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from tests.maps.bucket import serving
 from vplog.batch import redescribe
+from vplog.batch.engine import BatchOptions
 from vplog.batch.redescribe import redescribe_map
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
@@ -85,10 +86,9 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
     asked: list[tuple[list[str], str | None, str]] = []
 
     def run_batch(
-        paths: list[Path], root: Path, pipeline: Any, library: Path, topics: Any, *_: Any, join: bool, **workers: Any
+        paths: list[Path], root: Path, pipeline: Any, library: Path, topics: Any, _: Any, options: BatchOptions
     ) -> dict[str, Any]:
-        assert join == bool(asked), "once, when all are there"
-        assert workers == {"engine": "local", "address": None, "retries": 2, "processes": None}
+        assert options == BatchOptions(join=bool(asked)), "joined once, when all are there"
         asked.append(([path.parent.name for path in paths], topics.image, pipeline.places.kind))
         fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
         return {"drives": fate, "joined": None, "join_error": ""}

@@ -118,7 +118,7 @@ def test_a_run_by_a_signed_link_is_gone_on_with_when_it_is_given_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(back_end, "_solve", stop)
+        patch.setattr(back_end, "decided", stop)
         stopped = verb("run", log, "-o", out, "--threads", 2, *QUICK)
     assert stopped.code == 130
     refused = verb("run", "--resume", "-o", out)
