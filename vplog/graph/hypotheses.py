@@ -20,6 +20,7 @@ from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
 from vplog.graph.odometry_mixture import modes
+from vplog.graph.robust_kernels import DcsSettings
 from vplog.graph.variance_components import Sigmas, estimate
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ def best_hypothesis(
     found: list[Hypothesis] = []
     if isinstance(optimiser, GncSettings):
         sets = [np.ones(len(loops), bool)]
-        for sigmas, likely in [(Sigmas(), sets[0]), *modes(graph, loops, chain)]:
+        soft = DcsSettings()(graph).weight[loops] > 0.5  # which starts from all of them, and throws none out
+        for sigmas, likely in [(Sigmas(), sets[0]), *modes(graph, loops, chain), (Sigmas(), soft)]:
             if found and min(float((likely != one).mean()) for one in sets) <= _ALIKE:
                 continue
             try:
