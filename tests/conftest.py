@@ -20,7 +20,7 @@ from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline, run
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from vplog.demo.record import Drive
 
@@ -81,6 +81,14 @@ class Said:
         assert "Internal error" not in lines[0]
         assert "Traceback" not in lines[0]
         return lines[0].removeprefix("vplog: error: ")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests keep out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VPLOG_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture

@@ -80,7 +80,7 @@ def test_every_public_name_is_there_and_documented() -> None:
 
 def test_help_reads_as_documentation() -> None:
     text = pydoc.plain(pydoc.render_doc(vplog))
-    for name in ("run", "open_log", "open_run", "evaluate", "compare", "batch", "open_map"):
+    for name in ("run", "open_log", "open_run", "evaluate", "compare", "batch", "open_map", "localize"):
         assert f"\n    {name}(" in text, name
     assert "Unpack" not in text
 
@@ -91,7 +91,7 @@ def test_errors_are_one_tree_and_all_of_it_is_public() -> None:
     assert {name for name in vplog.__all__ if name.endswith("Error")} == set(tree)
 
 
-@pytest.mark.parametrize("name", ["run", "evaluate", "batch"])
+@pytest.mark.parametrize("name", ["run", "evaluate", "batch", "localize"])
 def test_a_folder_of_the_same_name_leaves_the_function(name: str) -> None:
     __import__(f"vplog.{name}")
     assert inspect.isfunction(getattr(vplog, name))
@@ -220,6 +220,8 @@ EXAMPLE_CALLS = {
     "run_and_evaluate.py": (lambda drive, run, out: [drive.log, drive.truth, out / "run", *QUICK], "ATE after"),
     "closures_to_pandas.py": (lambda drive, run, out: [run.folder], "keyframes"),
     "compare_recognisers.py": (lambda drive, run, out: [drive.log, "features.max_features=300"], "recall at 1"),
+    "own_network.py": (lambda drive, run, out: [drive.log, out, "features.max_features=50"], "means.onnx recall"),
+    "own_vectors.py": (lambda drive, run, out: [drive.log, out / "v.parquet", "features.max_features=50"], "recall"),
     "plot_result.py": (lambda drive, run, out: [run.folder, out / "picture.png"], ""),
 }
 
@@ -228,6 +230,9 @@ EXAMPLE_CALLS = {
 def test_examples(
     name: str, tiny: Drive, run: vplog.RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
+    if name == "own_network.py":
+        pytest.importorskip("onnx", reason="onnx, which makes the network, is not installed")
+        pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'vplog[onnx]'")
     arguments, said = EXAMPLE_CALLS[name]
     monkeypatch.setattr(sys, "argv", [name, *map(str, arguments(tiny, run, tmp_path))])
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")

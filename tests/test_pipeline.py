@@ -22,10 +22,11 @@ from mcap.reader import make_reader
 from vplog.data import Verdict
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.pipeline import CacheOptions, load_pipeline, pipeline_schema, run
+from vplog.pipeline import load_pipeline, pipeline_schema, run
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
 from vplog.run.reference_library import build_library
+from vplog.run.run_folder import CacheOptions
 from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Drive
     assert {"python", "numpy", "gtsam", "pyarrow"} <= record["versions"].keys()
     assert "unknown" not in record["versions"].values()
     stages = record["stages"]
-    names = "read extract choose learn cover describe propose verify solve write report"
+    names = "read extract choose learn cover describe propose verify p_false solve write report"
     assert list(stages) == names.split()
     for stage in stages.values():
         assert stage["result"] == "computed"

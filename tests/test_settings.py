@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from pydantic import Field, ValidationError
 
-from vplog.benchmark.recogniser_specs import known_methods, read_method
+from vplog.benchmark.recogniser_specs import read_method
 from vplog.errors import SettingsError
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
+from vplog.places import KINDS
 from vplog.settings import Settings, load_yaml, override
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def places(settings: Settings, above: tuple[str, ...] = ()) -> Iterator[tuple[st
 
 def trees() -> Iterator[tuple[tuple[str, ...], dict[str, Any], Pipeline]]:
     """Path of every setting of every method, and the least that a file must say to reach it."""
-    for kind in known_methods():
+    for kind in KINDS:
         made = Pipeline.read({"places": {"kind": kind}}, kind)
         yield from ((path, {"places": {"kind": kind}}, made) for path in places(made) if path[0] == "places")
     for kind in ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm"):

@@ -22,7 +22,19 @@ TYPE_CHECKING = False  # for type checkers it is true, and typing takes most of 
 if TYPE_CHECKING:
     from typing import Any
 
-    from vplog.api import Answers, Map, RunFolder, batch, compare, evaluate, open_log, open_map, open_run, run
+    from vplog.api import (
+        Answers,
+        Map,
+        RunFolder,
+        batch,
+        compare,
+        evaluate,
+        localize,
+        open_log,
+        open_map,
+        open_run,
+        run,
+    )
     from vplog.errors import (
         GraphError,
         LibraryError,
@@ -37,8 +49,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "Answers", "GraphError", "LibraryError", "LogError", "Map", "NewerError", "ResultError", "RunFolder",
-    "SettingsError", "TruthError", "VplogError", "batch", "compare", "evaluate", "open_log", "open_map", "open_run",
-    "run",
+    "SettingsError", "TruthError", "VplogError", "batch", "compare", "evaluate", "localize", "open_log", "open_map",
+    "open_run", "run",
 ]  # fmt: skip
 
 

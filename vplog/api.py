@@ -1,4 +1,4 @@
-"""What `import vplog` offers: the program as functions of Python, over which the verbs of the command line are thin."""
+"""The public API of `import vplog`, over which the verbs of the command line are thin."""
 
 from __future__ import annotations
 
@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
     from vplog.batch.worker import Drive
     from vplog.benchmark.compare import Comparison
+    from vplog.data import Camera
     from vplog.execution.execution import Progress
     from vplog.execution.process_pool import OwnProcesses
+    from vplog.localize.localize import LocalizedPicture
+    from vplog.localize.localizer import Localizer
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
@@ -67,8 +70,8 @@ def run(
     threads: None for one a core; results do not depend on it.
     progress: called with a stage, items done and items in all, from any thread.
     """
-    from vplog.pipeline import CacheOptions
     from vplog.pipeline import run as run_drive
+    from vplog.run.run_folder import CacheOptions
     from vplog.sessions.joint_run import run_joint
     from vplog.storage.remote_path import RemotePath, local_copy, local_output, located
 
@@ -79,8 +82,8 @@ def run(
         stack.enter_context(limited(execution.threads))
         folder = stack.enter_context(local_output(place))
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        kept = cache and not remote  # a cache that is sent over the net costs more than it saves
-        options = CacheOptions(use=kept, force=force)
+        # a cache that is sent over the net costs more than it saves
+        options = CacheOptions(use=cache and not remote, force=force)
         if len(paths) > 1 and not one_drive:
             record = run_joint(paths, folder, chosen, references, parts, execution, options)
         else:
@@ -92,7 +95,7 @@ def open_log(log: Place | Sequence[Place], topics: Topics | None = None) -> Log:
     """A drive as vplog reads it, its kind found by content; several files are the parts of one recording.
 
     `stamps()` (F,) i64 in ns, `frames(stamps)` to decode one by one, `camera()`, `odometry()`, `gps()`, `info()` and
-    `warnings`, as vplog.stages.Log says.
+    `warnings`, see vplog.stages.Log.
     """
     from vplog import logs
 
@@ -120,9 +123,9 @@ class RunFolder:
 
     def __init__(self, folder: Path, record: dict[str, Any]) -> None:
         self.folder = folder
-        """On this machine."""
+        """Local folder of the run."""
         self.record = record
-        """What run.json holds: settings, counts, timings, warnings, what was lost."""
+        """Content of run.json: settings, counts, timings, warnings, losses."""
 
     def __repr__(self) -> str:
         return f"RunFolder({str(self.folder)!r})"
@@ -160,6 +163,14 @@ class RunFolder:
         if not (self.folder / f"{name}.parquet").is_file():
             read_single_run(self.folder)  # names the drives where there are several
         return tables.read_arrow(self.folder / f"{name}.parquet")
+
+    def localize(self, image: Place | NDArray[np.uint8], camera: Camera | Place) -> LocalizedPicture:
+        """The pose of one picture in the run, see `Map.localize`."""
+        return self._localizer(image, camera)
+
+    @cached_property
+    def _localizer(self) -> Localizer:
+        return _localizer(self, self.folder)
 
     def images(
         self,
@@ -212,6 +223,37 @@ class RunFolder:
             yield frame.stamp_ns, lambda frame=frame: frame.decode().image
 
 
+def localize(
+    map: Place,
+    pictures: Place | Sequence[Place],
+    *,
+    topics: Topics | None = None,
+    out: Place | None = None,
+    top: int = 10,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The poses of pictures, or of the keyframes of a log, in a run or a map, each with covariance, verdict, sentence.
+
+    `answers` of the result has a record for each: `localized`, `tx ty tz qx qy qz qw` (world_from_camera),
+    `covariance` (6x6, rotation first, in the camera), `longitude latitude altitude_m` where known, ...
+
+    map: a run folder, or a map as `batch` writes it.
+    pictures: files of images, a folder of them, or a log, whose odometry then joins its frames.
+    topics: as in `run`; `{"calibration_file": FILE}` for pictures.
+    out: FILE.parquet for the records, or FILE.tum for the poses.
+    top: places that a picture is verified against.
+    """
+    from vplog.localize.verb import localize_paths
+    from vplog.storage.remote_path import located
+
+    threads = threads or available()
+    with limited(threads):
+        path = None if out is None else located(out)
+        execution = Execution(threads, progress)
+        return localize_paths(located(map), _paths(pictures), _topics(topics), path, execution, top)
+
+
 def evaluate(
     run: RunFolder | Place,
     truth: Place,
@@ -224,7 +266,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """ATE, RPE and drift of a run before and after, and which of its closures are right.
 
-    truth: a TUM file of poses, or `gps`, the log's own fixes.
+    truth: a TUM file of poses, `gps`, the log's own fixes, or `auto`, the ground truth that comes with the log.
     distance_m, heading_deg: bounds of one place; 6 m and 45 degrees unless given.
     align: alignment of the ATE, `se3`, `sim3` or `origin`.
     truth_offset_s: added to the truth's stamps.
@@ -244,7 +286,7 @@ def compare(
     map: Place | None = None,
     *,
     methods: str | Iterable[str],
-    truth: Place,
+    truth: Place | None = None,
     tolerance: int | None = None,
     distance_m: float | None = None,
     heading_deg: float | None = None,
@@ -257,28 +299,37 @@ def compare(
     min_gap: int | None = None,
     sequence: int | None = None,
     out: Place | None = None,
+    cache: Path | None = None,
+    cache_gb: float | None = None,
     threads: int | None = None,
     progress: Progress = silent,
 ) -> Comparison:
     """Compare recognisers on the frames of one drive looked for in another, or in its own past with `min_gap` frames.
 
-    `record` of the result holds the figures, `ranks` what they are of.
+    `record` of the result holds the figures, `ranks` what they are of, `answers` a table with a row for each method and
+    query.
 
     map: None to search the query's own frames, those `min_gap` frames older.
     methods: recognisers or pipelines, `["bobb", "gist"]` or `"bobb,gist"`, each with `:setting=value` as needed.
-    truth: FILE.csv of pairs, `index` (within `tolerance` frames), FILE.tum, `poses` or `gps` (within `distance_m` and
-    `heading_deg`).
+    truth: `index` (equal numbers in file names or of frames, within `tolerance`), FILE.csv (`query,match` or
+    `image,label`), FILE.npy, `labels` (folders), `utm` (file names), FILE.tum, `poses` or `gps` (within `distance_m`
+    and `heading_deg`); None for answers without scores.
     library: a log or a library of reference images, None for `library_size` images of the map drive.
     sequence: also match windows of so many frames.
-    out: a local folder for compare.json, scores and curves.
+    out: a local folder for compare.json, answers.csv, scores and figures.
+    cache, cache_gb: folder and largest size in 10^9 bytes of the cache of features, None for the user's.
     """
     from vplog.benchmark.compare import CompareOptions
     from vplog.benchmark.compare import compare as compare_methods
+    from vplog.benchmark.feature_cache import CacheChoice
     from vplog.benchmark.recogniser_specs import split_methods
     from vplog.evaluate.place_truth import TruthChoice
     from vplog.storage.remote_path import local_copy, located
 
-    threads = threads or available()
+    threads, bounds = threads or available(), (tolerance, distance_m, heading_deg)
+    if truth is None and bounds != (None, None, None):
+        raise SettingsError("--tolerance, --distance-m and --heading-deg are bounds of a truth: name one with --truth.")
+    chosen = None if truth is None else TruthChoice(os.fspath(truth), *bounds)
     with limited(threads), ExitStack() as stack:
         references = None if library is None else stack.enter_context(local_copy(located(library)))
         place = None if out is None else located(out)
@@ -286,9 +337,18 @@ def compare(
             located(query),
             None if map is None else located(map),
             split_methods(methods) if isinstance(methods, str) else methods,
-            TruthChoice(os.fspath(truth), tolerance, distance_m, heading_deg),
+            chosen,
             _pipeline(pipeline, settings),
-            CompareOptions(references, library_size, library_seed, min_gap, sequence, place, _topics(topics)),
+            CompareOptions(
+                references,
+                library_size,
+                library_seed,
+                min_gap,
+                sequence,
+                place,
+                _topics(topics),
+                CacheChoice(cache, cache_gb),
+            ),
             Execution(threads, progress),
         )
 
@@ -309,7 +369,7 @@ def batch(
     join: bool = True,
     keep_cache: bool = False,
     progress: Progress = silent,
-    tell: Callable[[Drive], None] = lambda _: None,
+    on_drive: Callable[[Drive], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Compute many drives into one growing map, each log in a process of its own, here or on a Ray cluster.
 
@@ -321,8 +381,8 @@ def batch(
     jobs: drives at once, each with so many `threads`.
     engine, address: `local` processes, or `ray` with the HOST:PORT of a cluster.
     retries: more attempts at a drive whose process was killed.
-    join: whether closures between drives are looked for at the end.
-    tell: called with each drive as it ends.
+    join: whether closures between drives are searched at the end.
+    on_drive: called with each drive as it ends.
     """
     from vplog.storage.remote_path import local_copy, located
 
@@ -342,7 +402,7 @@ def batch(
         else:
             chosen = _pipeline(pipeline, settings)
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        options = BatchOptions(jobs, engine, address, retries, processes, join, keep_cache, tell)
+        options = BatchOptions(jobs, engine, address, retries, processes, join, keep_cache, on_drive)
         return run_batch(paths, root, chosen, references, parts, Execution(threads, progress), options)
 
 
@@ -369,14 +429,14 @@ def open_map(map: Place) -> Map:
     return Map(place)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Map:
     """A map of many drives: what it holds, and where in it the views of a log are."""
 
     place: Path
 
     def info(self, check: bool = False) -> dict[str, Any]:
-        """Drives, places, library, joins and failures; with `check` every file is held against its checksum."""
+        """Drives, places, library, joins and failures; with `check` every file is compared with its checksum."""
         from vplog.maps.info import describe_map
 
         return describe_map(self.place, check=check)
@@ -403,22 +463,47 @@ class Map:
         engine, address: who searches, as in `batch`.
         cache, cache_gb: folder and size of the cache of a map by URL.
         """
-        from vplog.batch.engine import BatchOptions, opened
+        from vplog.batch.engine import BatchOptions, open_engine
         from vplog.maps.search.query import MapQuery, query_map
         from vplog.maps.storage.download_cache import cache_in
         from vplog.storage.remote_path import RemotePath, located
 
         threads = threads or available()
         downloads = cache_in(cache, cache_gb) if isinstance(self.place, RemotePath) else None
-        with limited(threads), opened(BatchOptions(engine=engine, address=address), threads) as workers:
+        with limited(threads), open_engine(BatchOptions(engine=engine, address=address), threads) as workers:
             query = MapQuery(top, sequence, None if out is None else located(out), workers.executor, downloads)
             found = query_map(self.place, located(log), _topics(topics), query, Execution(threads, progress))
         return Answers(found)
 
+    def localize(self, image: Place | NDArray[np.uint8], camera: Camera | Place) -> LocalizedPicture:
+        """The pose of one picture in the map, with covariance, verdict and sentence.
+
+        `localized` of the result says whether it has one, `found.world_from_camera` (4, 4) and `found.covariance`
+        (6, 6) are it, and `record()` gives all as plain values. The map stays open for the next picture.
+
+        image: a file, or grey (H, W) or red, green, blue (H, W, 3) uint8.
+        camera: a vplog.data.Camera, or a calibration file as --calibration takes it.
+        """
+        return self._localizer(image, camera)
+
+    @cached_property
+    def _localizer(self) -> Localizer:
+        return _localizer(self, self.place)
+
+
+def _localizer(owner: object, root: Path) -> Localizer:
+    """A run or map that is open as long as `owner` lives."""
+    from vplog.localize.localizer import Localizer
+
+    with ExitStack() as stack:
+        found = stack.enter_context(Localizer.opened(root))
+        weakref.finalize(owner, stack.pop_all().close)
+    return found
+
 
 @dataclass(frozen=True)
 class Answers:
-    """Where in a map the views of a log are."""
+    """Answers of a map to the views of a log."""
 
     record: dict[str, Any]
     """Counts, warnings, and the answers as plain values."""
@@ -455,7 +540,7 @@ def _pipeline(pipeline: str | Path | Pipeline, settings: Settings | None) -> Pip
 
 
 def _assignments(settings: Settings | None) -> list[str]:
-    """As --set has them; JSON is YAML."""
+    """Settings as --set takes them; JSON is YAML."""
     import json
 
     if not isinstance(settings, dict):
@@ -464,7 +549,7 @@ def _assignments(settings: Settings | None) -> list[str]:
 
 
 def _topics(topics: Topics | None) -> TopicChoice | None:
-    """With absolute paths of files, so that run.json is understood from any folder."""
+    """The choice of topics, with absolute paths of files, so that run.json is understood from any folder."""
     from vplog.logs import TopicChoice
 
     if topics is None or isinstance(topics, TopicChoice):

@@ -1,4 +1,4 @@
-"""What flows between the stages: frozen dataclasses of arrays, and nothing that computes.
+"""Data that flows between the stages: frozen dataclasses of arrays, and nothing that computes.
 
 Letters: N keyframes, M features, D descriptor length, C candidate closures, E edges, T samples in time.
 Poses are (4, 4) float64 in metres; `a_from_b` maps points in b to a, so `a_from_b @ b_from_c` chains by eye.
@@ -64,6 +64,9 @@ class Frame:
     right: Bytes | None = None
     """(H, W) uint8 grey of the right camera of a stereo pair, both rectified: rows correspond. None without a pair,
     or where this frame's right image is missing or damaged."""
+    colour: Bytes | None = None
+    """(H, W, 3) uint8 red, green, blue of the image, where it was decoded in colour: three times the grey where it has
+    none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,16 @@ class Odometry:
     """(T, 4, 4)."""
     covariance: Floats | None
     """(T, 6, 6) as logged, in the body frame; a row is NaN where that sample's is unusable, None where all are."""
+    drifts: bool = True
+    """Not where every pose is measured by itself, as satellite fixes are; `covariance` then is that of increments, and
+    known."""
+    breaks: Ints | None = None
+    """Rows whose motion since the row before is not known, as where visual odometry lost its track: the pose is held.
+    None without any."""
+
+
+RECEIVER_SIGMA_M = 3.0
+"""m; horizontal noise of a fix whose covariance is unknown: an open sky without corrections."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +101,7 @@ class Gps:
     covariance: Floats
     """(T, 3, 3) m^2, east-north-up; NaN where unknown."""
     antenna_m: Floats | None = None
-    """(3,) where the antenna is on the body, None where the log does not say."""
+    """(3,) position of the antenna on the body, None where the log lacks it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +184,7 @@ class Ranking:
 
 
 class Verdict(StrEnum):
-    """What became of a candidate closure. A rejected loop is a value with a reason, never an exception."""
+    """Verdict on a candidate closure. A rejected loop is a value with a reason, never an exception."""
 
     ACCEPTED = "accepted"
     TOO_FEW_MATCHES = "too_few_matches"
@@ -185,6 +198,7 @@ class Verdict(StrEnum):
     INCONSISTENT = "inconsistent"
     DIRECTION_ONLY = "direction_only"
     REJECTED_BY_SOLVER = "rejected_by_solver"
+    NOT_SIGNIFICANT = "not_significant"
 
     @property
     def sentence(self) -> str:
@@ -204,6 +218,7 @@ _SENTENCES = {
     Verdict.INCONSISTENT: "The pose from query to match and the one from match to query do not agree.",
     Verdict.DIRECTION_ONLY: "Kept by the robust solve with rotation and direction only, without metres.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
+    Verdict.NOT_SIGNIFICANT: "Verified by geometry, but likelier to be false than the rate asked for.",
 }
 
 
@@ -236,7 +251,7 @@ class Closures:
     spread: Float32s
     """(C,) share of the query image that the inliers' bounding box covers, 0..1."""
     reverse_inliers: Int32s
-    """(C,) inliers of the check the other way round, match looked for from query; -1 where it was not tried."""
+    """(C,) inliers of the reverse check, from match to query; -1 where it was not done."""
     scale: list[str]
     """(C,) where the metres of match_from_query come from: `odometry`, `depth`, `stereo`, or `none` without metres."""
     match_from_query: Floats
@@ -244,6 +259,9 @@ class Closures:
     information: Floats
     """(C, 6, 6) of match_from_query, NaN where no pose was found."""
     verdict: list[Verdict]
+    p_false: Floats
+    """(C,) 0..1: the least false rate that admits it, which is the share of false closures expected among it and all
+    better ones; NaN where geometry found no closure, or nothing calibrates it."""
     residual_before: Floats
     """(C,) sigma: Mahalanobis distance of the closure to the odometry, NaN where not in the graph."""
     residual_after: Floats
@@ -292,7 +310,7 @@ class PoseGraph:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What an optimiser made of a pose graph."""
+    """Result of optimising a pose graph."""
 
     world_from_body: Floats
     """(N, 4, 4)."""
@@ -328,17 +346,17 @@ class Topic:
     """`image`, `depth`, `camera_info`, `odometry`, `gps`, `tf_static`, `tf`, or `` where vplog has no use for it."""
     used: bool
     part: str = ""
-    """What it is used as: `image`, `right`, `depth`, `camera_info`, `right_info`, `odometry`, `gps`, `tf_static`, `tf`;
-    empty where it is not used."""
+    """Its use: `image`, `right`, `depth`, `camera_info`, `right_info`, `odometry`, `gps`, `tf_static`, `tf`; empty
+    where it is not used."""
     pixels: str = ""
-    """Of images: pixel layout or format, as the first message names it."""
+    """Pixel layout or format of images, by the first message."""
     width: int = 0
-    """px of the first image; 0 where it is not told without decoding it, as of video."""
+    """px of the first image; 0 where only decoding gives it, as for video."""
     height: int = 0
     frame: str = ""
-    """Of images and calibrations: the frame_id."""
+    """frame_id of images and calibrations."""
     calibrated: bool | None = None
-    """Of calibrations: whether the matrix is set."""
+    """Whether the matrix of a calibration is set."""
     rate_hz: float | None = None
     """Messages a second of the time between its first and last; None where it was not read, or they span no time."""
 
@@ -360,18 +378,22 @@ class OdometrySource:
     jumps: int
     """Steps that no motion of this drive explains."""
     evidence: dict[str, float]
-    """What speaks against it, in words, and the factor that each leaves of a score of 1."""
+    """Evidence against it, in words, and the factor of the score for each."""
     score: float
     """Product of the factors."""
+    kind: str = "poses"
+    """`poses`, `tf`, `twist`, `gps` or `truth`."""
+    used: bool = False
 
 
 @dataclass(frozen=True)
 class LogInfo:
-    """What is in a log and what would be used of it: the answer of `vplog info`."""
+    """Topics of a log and their use: the answer of `vplog info`."""
 
     path: str
     kind: str
-    """`mcap`, `ros1`, `ros2-mcap`, `ros2-db3` or `images`."""
+    """`mcap`, `ros1`, `ros2-mcap`, `ros2-db3`, `images`, or a data set's: `kitti`, `euroc`, `tum-rgbd`, `vslam-lab`,
+    `colmap`, `utm-images`, `video`."""
     start_ns: int
     end_ns: int
     messages: int
@@ -380,6 +402,25 @@ class LogInfo:
     odometry_frames: list[str] = field(default_factory=list)
     """Names of the frames from the one that stands still to the body; empty where the odometry names none."""
     skew_ms: dict[str, float] = field(default_factory=dict)
-    """By topic in use: log time less header stamp, the median."""
+    """Median of log time less header stamp, by topic in use."""
     odometry_sources: list[OdometrySource] = field(default_factory=list)
-    """Those that could be the odometry, the best first."""
+    """Candidates for the odometry, the best first."""
+    truth: str = ""
+    """The ground truth that comes with the log, which `evaluate --truth auto` takes: `poses`, `positions`, a topic, or
+    empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Points of a drive, and in which of its images they are seen."""
+
+    world: Floats
+    """(P, 3) m."""
+    error_px: Floats
+    """(P,) mean reprojection error."""
+    point: Ints
+    """(O,) the point of each observation."""
+    image: Ints
+    """(O,) its image, increasing."""
+    px: Float32s
+    """(O, 2) where, as `Features.points`."""

@@ -26,7 +26,7 @@ class LibraryError(VplogError):
 
 
 class GraphError(VplogError):
-    """A pose graph cannot be built or solved as asked."""
+    """A pose graph cannot be built or solved."""
 
 
 class TruthError(VplogError):
@@ -43,11 +43,11 @@ class NewerError(ResultError):
 
 def was_interrupted(error: BaseException | None) -> bool:
     """Whether Ctrl-C is behind an error: compiled code and imports that it stops raise others in its place."""
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
+    visited: set[int] = set()
+    while error is not None and id(error) not in visited:
         if isinstance(error, KeyboardInterrupt):
             return True
-        seen.add(id(error))
+        visited.add(id(error))
         error = error.__cause__ or error.__context__
     return False
 

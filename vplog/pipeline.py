@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from vplog.cache.input_hashes import files_of
 from vplog.cache.steps import Steps
 from vplog.errors import SettingsError, nearest
 from vplog.execution.execution import Execution
+from vplog.features.extractors import FeatureSettings
 from vplog.features.sift import SiftSettings
 from vplog.features.stereo_depth import StereoSettings
 from vplog.graph.gps_factors import GpsSettings
@@ -20,10 +20,12 @@ from vplog.graph.joint import JoinSettings
 from vplog.graph.noise import NoiseSettings
 from vplog.graph.refine import RefineSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
+from vplog.loops.false_rate import FalseRateSettings
 from vplog.loops.propose import ProposeSettings
 from vplog.loops.verify import VerifySettings
-from vplog.places import PlaceSettings
+from vplog.places import KINDS, PlaceSettings
 from vplog.places.bobb import BobbSettings
+from vplog.places.plugin import as_plugin
 from vplog.places.reference_choice import LibrarySettings
 from vplog.places.sequence import SequenceSettings
 from vplog.results import tables
@@ -31,12 +33,14 @@ from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
 from vplog.run.back_end import solve
-from vplog.run.feature_extraction import decoded, extract, read
+from vplog.run.false_rate import rate_closures
+from vplog.run.feature_extraction import decoded, extract
 from vplog.run.keyframes import KeyframeSettings
+from vplog.run.odometry import read
 from vplog.run.outputs import Run, finish, report, write
 from vplog.run.place_recognition import describe, find_candidates, name_shared
 from vplog.run.reference_library import check_library, cover, given_references, learn, own_images, own_references
-from vplog.run.run_folder import begun
+from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.run.verification import verify
 from vplog.settings import Settings, load_yaml, override
 
@@ -49,7 +53,7 @@ class Pipeline(Settings):
 
     keyframes: KeyframeSettings = KeyframeSettings()
     """Which frames become nodes."""
-    features: SiftSettings = SiftSettings()
+    features: FeatureSettings = SiftSettings()
     """Local features of a frame."""
     stereo: StereoSettings = StereoSettings()
     """Depth of features from a stereo pair."""
@@ -63,6 +67,8 @@ class Pipeline(Settings):
     """Candidate closures."""
     verify: VerifySettings = VerifySettings()
     """Geometry of a candidate."""
+    false_rate: FalseRateSettings = FalseRateSettings()
+    """The share of false closures that is admitted."""
     noise: NoiseSettings = NoiseSettings()
     """Odometry noise."""
     solve: OptimiserSettings = GncSettings()
@@ -76,13 +82,22 @@ class Pipeline(Settings):
     pictures: PictureSettings = PictureSettings()
     """What result.mcap and report.html show of the camera's images."""
 
+    @property
+    def null_pairs(self) -> FalseRateSettings:
+        """`false_rate`, without mirrored candidates for features whose descriptors do not say how a mirror changes
+        them."""
+        mirrored = {} if self.features.kind == "sift" else {"null_pairs": 0}
+        return self.false_rate.model_copy(update=mirrored)
+
     @model_validator(mode="before")
     @classmethod
     def _default_kinds(cls, tree: Any) -> Any:
-        """A setting of a method may be changed without naming the method: no `kind` means the default's."""
+        """A setting of a method may be changed without naming the method: no `kind` means the default's. Plug-ins are
+        named by their own kind."""
         if not isinstance(tree, dict):
             return tree
         kinds = {name: getattr(known.default, "kind", None) for name, known in cls.model_fields.items()}
+        tree = {name: as_plugin(part, KINDS) if name == "places" else part for name, part in tree.items()}
         return {
             name: {"kind": kinds[name], **part} if kinds.get(name) and isinstance(part, dict) else part
             for name, part in tree.items()
@@ -121,18 +136,6 @@ def pipeline_folder() -> Path:
     return inside if inside.is_dir() else package.parent / "pipelines"
 
 
-@dataclass(frozen=True)
-class CacheOptions:
-    """Where the results of stages are cached, and what a run folder that is there may lose."""
-
-    folder: Path | None = None
-    """A folder of this drive alone; None for `.cache` in the run folder."""
-    use: bool = True
-    """Whether results are found there, and stay."""
-    force: bool = False
-    """Whether the run of another log is replaced."""
-
-
 def run(
     path: Path | Sequence[Path],
     out: Path,
@@ -150,12 +153,12 @@ def run(
     topics = topics or logs.TopicChoice()
     log = logs.open_drive(files_of(path), topics)
     check_library(library, pipeline)
-    resumable, head = cache.use and not cache.folder, provenance.head(pipeline, path, execution.threads, topics)
+    head = provenance.head(pipeline, path, execution.threads, topics)
     with (
-        begun(out, head, files_of(path), library, topics, resumable=resumable, force=cache.force) as folder,
+        staged_run(out, head, files_of(path), library, topics, cache=cache) as folder,
         Steps(path, cache.folder or (out if cache.use else folder) / CACHE, execution, use_cache=cache.use) as do,
     ):
-        odometry, camera, selected = do(read, log, pipeline.keyframes)
+        odometry, camera, selected = do(read, log, topics, pipeline.keyframes)
         features = do(extract, log, topics, selected, pipeline)
         keyframes = decoded(selected, features)
         if library is None:
@@ -165,9 +168,13 @@ def run(
             references = do(given_references, library)
         state = do(learn, pipeline.places, references, library)
         coverage = do(cover, keyframes, references, library is not None, features)
-        descriptors = do(describe, state, features)
+        descriptors = do(describe, state, log, features)
         proposals = do(find_candidates, state, descriptors, keyframes, pipeline.propose, pipeline.sequence)
         closures = do(verify, proposals, keyframes, camera, features, pipeline.verify)
+        closures = do(
+            rate_closures, closures, odometry, keyframes, camera, features, pipeline.null_pairs, pipeline.propose,
+            pipeline.verify, pipeline.noise,
+        )  # fmt: skip
         closures = name_shared(closures, state, descriptors)
         solved = do(solve, odometry, keyframes, closures, log.gps(), pipeline)
         result = Run(

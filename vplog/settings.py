@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
-"""What the parser raises: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
+"""Errors of the parser: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
 
 _A_SETTING = "`vplog config` prints every setting."
 _A_FILE = "`vplog config` prints one that is."
@@ -27,6 +27,12 @@ class Settings(BaseModel):
     """Base of every settings object: frozen, no unknown names, one sentence below each field."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+    LOCATIONS: ClassVar[frozenset[str]] = frozenset()
+    """Names of those that say where a file is: not they, but its content decides results."""
+
+    def identity(self) -> dict[str, Any]:
+        """The settings that results depend on, as plain values."""
+        return self.model_dump(mode="json", exclude=set(self.LOCATIONS))
 
     @classmethod
     def read(cls, tree: dict[str, Any], where: str, assignments: Iterable[str] = ()) -> Self:
@@ -42,7 +48,8 @@ class Settings(BaseModel):
             parts = name.split(".")
             set_by = [one for one in assignments if _same_branch(one.partition("=")[0].split("."), parts)]
             place = f"--set {set_by[-1]}" if set_by else where
-            raise SettingsError(f"{place}: {text} {_A_SETTING}") from None
+            remedy = "" if _A_SETTING in text else f" {_A_SETTING}"  # of a file that these settings name
+            raise SettingsError(f"{place}: {text}{remedy}") from None
 
 
 @cache
@@ -134,24 +141,24 @@ def _allowed(node: dict[str, Any]) -> str:
     return f"{kind}{f' ({limits})' if limits else ''}{items}"
 
 
-def load_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file as a tree. Raises SettingsError where it is not one."""
+def load_yaml(path: Path, remedy: str = _A_FILE) -> dict[str, Any]:
+    """A YAML file as a tree. Raises SettingsError, which ends with the remedy, where it is not one."""
     try:
         if path.stat().st_size > 1_000_000:  # a pipeline is a few lines; refuse what could blow up the parser
-            raise SettingsError(f"{path} is larger than 1 MB, so it is not a pipeline file. {_A_FILE}")
+            raise SettingsError(f"{path} is larger than 1 MB, so it is no file of settings. {remedy}")
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or error) if isinstance(error, OSError) else error
-        raise SettingsError(f"Cannot read {path}: {why}. {_A_FILE}") from None
+        raise SettingsError(f"Cannot read {path}: {why}. {remedy}") from None
     except _NOT_YAML as error:
         mark = getattr(error, "problem_mark", None)
         line = "" if mark is None else f" in line {mark.line + 1}"
         why = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise SettingsError(f"{path} is not YAML{line}: {why}. {_A_FILE}") from None
+        raise SettingsError(f"{path} is not YAML{line}: {why}. {remedy}") from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):
-        raise SettingsError(f"{path} holds no settings (name: value each) at its top level. {_A_FILE}")
+        raise SettingsError(f"{path} holds no settings (name: value each) at its top level. {remedy}")
     return tree
 
 

@@ -20,21 +20,21 @@ class EncodedFrame(Protocol):
     @property
     def stamp_ns(self) -> int: ...
 
-    def decode(self) -> data.Frame:
-        """The grey image with its depth. Raises LogError where the bytes are not an image."""
+    def decode(self, colour: bool = False) -> data.Frame:
+        """The grey image with its depth, and with its `colour`. Raises LogError where the bytes are not an image."""
         ...
 
 
 @runtime_checkable
 class Log(Protocol):
-    """One recorded drive. `vplog.logs.open(path)` tells the kind by content."""
+    """One recorded drive. `vplog.logs.open(path)` finds the kind by content."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def warnings(self) -> list[str]:
-        """What was found wrong so far, one sentence each; grows while reading."""
+        """Problems found so far, one sentence each; grows while reading."""
         ...
 
     def info(self) -> data.LogInfo: ...
@@ -49,9 +49,25 @@ class Log(Protocol):
         """The frames with these stamps, in order of time."""
         ...
 
+    def file_names(self) -> list[str] | None:
+        """Path of each frame's file below the folder of images, in the order of `stamps()`; None of a recording."""
+        ...
+
     def odometry(self) -> data.Odometry | None: ...
 
+    def has_depth(self) -> bool:
+        """Whether its frames come with depth or with a right image."""
+        ...
+
     def gps(self) -> data.Gps | None: ...
+
+    def truth(self) -> data.Trajectory | data.Gps | None:
+        """Ground truth that comes with it: poses of the body or the camera, or positions."""
+        ...
+
+    def without_odometry(self) -> str:
+        """What can be done where `odometry()` is None, in a sentence."""
+        ...
 
 
 class Extractor(Protocol):
@@ -74,7 +90,7 @@ class PlaceIndex(Protocol):
 
 @runtime_checkable
 class ProbableIndex(PlaceIndex, Protocol):
-    """A map that also says how probable each of its places is."""
+    """A map that also gives the probability of each of its places."""
 
     def posterior(self, descriptor: Any, stop: int | None = None) -> tuple[data.Floats, float]:
         """(stop,) float64 probability of each place, and that of a place that is not in the map; they sum to 1."""
@@ -110,6 +126,28 @@ class PlaceState(Protocol):
     def index(self, descriptors: Sequence[Any]) -> PlaceIndex: ...
 
     def save(self, folder: Path) -> None: ...
+
+
+@runtime_checkable
+class FrameState(PlaceState, Protocol):
+    """A recogniser that looks at the image itself."""
+
+    @property
+    def colour(self) -> bool:
+        """Whether frames are decoded in colour for it."""
+        ...
+
+    def describe_frame(self, frame: data.Frame) -> Any: ...
+
+
+@runtime_checkable
+class StoredState(PlaceState, Protocol):
+    """A recogniser whose descriptors were computed elsewhere."""
+
+    def stored(self, log: Log, stamp_ns: data.Ints, query: bool | None) -> Sequence[Any]:
+        """The descriptors of frames of a log, which is the `query` of a pair of logs or its map, or None where it is
+        one of many. Raises LibraryError where they are not those of this log."""
+        ...
 
 
 @runtime_checkable

@@ -26,7 +26,7 @@ from mcap.writer import Writer
 
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
-from vplog.batch.engine import BatchOptions, LocalEngine, computed
+from vplog.batch.engine import BatchOptions, LocalEngine, as_completed
 from vplog.batch.worker import Outcome, Task
 from vplog.demo import SMALL, make_drive
 from vplog.demo.record import IMAGE
@@ -246,12 +246,12 @@ class Fated:
     fates: dict[str, list[Outcome | Exception]]
     begun: list[str] = field(default_factory=list)
     cores: int = 4
-    widest: int = 4
+    max_cores: int = 4
 
-    def at_once(self, threads: int) -> int:
+    def concurrency(self, threads: int) -> int:
         return self.cores // threads
 
-    def helpers(self, threads: int) -> Executor | None:
+    def executor_for(self, threads: int) -> Executor | None:
         return None
 
     @property
@@ -265,7 +265,7 @@ class Fated:
         future.set_exception(fate) if isinstance(fate, Exception) else future.set_result(fate)
         return future
 
-    def take(self, task: Task, outcome: Outcome) -> None:
+    def fetch(self, task: Task, outcome: Outcome) -> None:
         if outcome.worker == "gone":
             raise BrokenExecutor("What it gave back was lost.")
 
@@ -273,7 +273,7 @@ class Fated:
 def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path: Path) -> None:
     died, bad, good = BrokenExecutor("Its worker was killed."), Outcome("No such topic."), Outcome(worker="here")
     engine = Fated({
-        "unlucky": [died, Outcome("Out of memory.", may_pass=True), good],
+        "unlucky": [died, Outcome("Out of memory.", retryable=True), good],
         "bad": [bad],
         "good": [good],
         "lost": [Outcome(worker="gone"), good],
@@ -282,7 +282,7 @@ def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path:
     })  # fmt: skip
     topics, pipeline = TopicChoice(), load_pipeline("default")
     tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
-    found = computed(cast("LocalEngine", engine), tasks, BatchOptions(2))
+    found = as_completed(cast("LocalEngine", engine), tasks, BatchOptions(2))
     ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in found}
     assert ended == {
         "unlucky": ("", 3),
@@ -317,7 +317,7 @@ def computed_by(
     engine = LocalEngine(processes, 1)
     monkeypatch.setattr(engine, "start", lambda _: processes.submit(function, *args))
     task = Task("drive", "log", Path(), Path(), load_pipeline("default"), TopicChoice(), 1, {})
-    [(_, outcome, _)] = computed(engine, [task], BatchOptions(1, retries=0))
+    [(_, outcome, _)] = as_completed(engine, [task], BatchOptions(1, retries=0))
     return outcome
 
 
@@ -450,7 +450,7 @@ def test_what_was_found_stays_known_after_ctrl_c(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(batch, "computed", interrupted)
+    monkeypatch.setattr(batch, "as_completed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_batch([bad, *logs], root, load_pipeline("default", QUICK))
     assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
@@ -485,12 +485,12 @@ def test_the_exit_status_is_that_of_the_batch(
 def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "monday").mkdir()
     monkeypatch.chdir(tmp_path / "monday")
-    found = (batch._name(Path()), batch._name(Path("../monday")), batch._place(Path("../monday")))
+    found = (batch._name(Path()), batch._name(Path("../monday")), batch._absolute_log(Path("../monday")))
     assert found == ("monday", "monday", str(tmp_path / "monday"))
     (tmp_path / "far" / "below").mkdir(parents=True)
     (tmp_path / "link").symlink_to("far/below")
-    assert batch._place(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
-    assert (batch._place(Path("../link")), batch._name(Path("../link"))) == (str(tmp_path / "link"), "link")
+    assert batch._absolute_log(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
+    assert (batch._absolute_log(Path("../link")), batch._name(Path("../link"))) == (str(tmp_path / "link"), "link")
 
 
 def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:

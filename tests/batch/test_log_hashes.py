@@ -181,7 +181,7 @@ def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatc
     large.write_bytes(MAGIC)
     with large.open("r+b") as file:
         file.truncate(10**13)
-    monkeypatch.setattr(log_hashes, "_TELL_EVERY_S", 0.05)
+    monkeypatch.setattr(log_hashes, "_PROGRESS_EVERY_S", 0.05)
 
     def interrupt(*what: Any) -> None:
         told.append(what)

@@ -44,8 +44,8 @@ def make_map(root: Path, finished: Path, logs: dict[str, tuple[str, dict[str, An
             run_record.write_run_json(
                 made / "run.json", {**run_record.read_run_json(made / "run.json"), "topics": topics}
             )
-            about = {"drive": drive, "log": log, "key": "k", "library": library, "inputs": {}}
-            run_record.write_run_json(made / "drive.json", about)
+            record = {"drive": drive, "log": log, "key": "k", "library": library, "inputs": {}}
+            run_record.write_run_json(made / "drive.json", record)
             map_store.publish(store, drive, made)
     return library
 
@@ -64,7 +64,7 @@ def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Drive, verb:
         assert "/no/such.mcap no longer exists" in told["drives"][1]["error"]
         with map_store.reading(new) as store:
             made_by = tables.read_metadata(store.table("descriptors", "drive"))["vplog.library"]
-            assert map_store.one_library(store)[0] == told["library"] == made_by != library
+            assert map_store.common_library(store)[0] == told["library"] == made_by != library
             settings = run_record.read_run_json(store.file("drive", "run.json"))["settings"]
             assert settings["features"]["max_features"] == 200, "those of the map"
         assert [one["state"] for one in json.loads(verb(*again, drive.log).out)["drives"]] == ["unchanged", "failed"]

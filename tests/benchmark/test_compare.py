@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import shutil
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -13,25 +15,29 @@ import pytest
 from tests.places.sequence_matrix import match_sequences
 from vplog import logs
 from vplog.benchmark import compare
+from vplog.benchmark.compare_figures import queries_shown
+from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_bytes
-from vplog.benchmark.recogniser_specs import known_methods, read_method, split_methods
+from vplog.benchmark.recogniser_specs import read_method, split_methods
+from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import candidate_stops, extract_traversal
 from vplog.errors import LogError, SettingsError
-from vplog.evaluate.pairs import index_pairs
+from vplog.evaluate.open_set import score_open_set
+from vplog.evaluate.pairs import index_pairs, listed_pairs
 from vplog.evaluate.place_truth import TruthChoice
 from vplog.evaluate.retrieval import rank_queries, score_retrieval
 from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings
-from vplog.features.store import FeatureStore
 from vplog.geometry import se3
 from vplog.pipeline import Pipeline, load_pipeline
+from vplog.places import KINDS
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.sequence import SequenceSettings
 from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from conftest import Said
@@ -72,17 +78,16 @@ def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[FeatureStore]:
-    with FeatureStore(tmp_path / "features") as found:
-        yield found
+def store(tmp_path: Path) -> FeatureFolder:
+    (tmp_path / "features").mkdir()
+    return FeatureFolder(tmp_path / "features")
 
 
 @pytest.fixture(scope="module")
-def day(traversals: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Traversal]:
-    with FeatureStore(tmp_path_factory.mktemp("day") / "features") as found:
-        yield extract_traversal(
-            logs.open(traversals[0]), SIFT, found, chosen=np.array([1, 5, 9, 13]), execution=Execution(2)
-        )
+def day(traversals: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Traversal:
+    folder = FeatureFolder(tmp_path_factory.mktemp("day"))
+    chosen = np.array([1, 5, 9, 13])
+    return extract_traversal(logs.open(traversals[0]), SIFT, folder, chosen=chosen, execution=Execution(2))
 
 
 def inputs_of(walk: Traversal, truth: Pairs, stops: Ints, *more: Any, **others: Any) -> MethodInputs:
@@ -101,7 +106,7 @@ def without_times(record: dict[str, Any]) -> dict[str, Any]:
 # One walk, one method
 
 
-def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: FeatureStore) -> None:
+def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: FeatureFolder) -> None:
     log = logs.open(traversals[0])
     seen = []
     walk = extract_traversal(
@@ -110,15 +115,15 @@ def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: Fe
     assert walk.frames.tolist() == [2, 3, 7]
     assert walk.stamp_ns.tolist() == log.stamps()[[2, 3, 7]].tolist()
     assert [reference.stamp_ns for reference in walk.references] == [int(log.stamps()[3])]
-    assert len(walk.feature_ms) == len(store) == 3
+    assert len(walk.feature_ms) == len(walk.store) == 3
     assert (walk.feature_ms > 0).all()
     assert seen == [("extract day", done, 3) for done in (1, 2, 3)]
     frame = next(iter(log.frames(log.stamps()[[7]]))).decode()
-    np.testing.assert_array_equal(store[2].descriptors, SIFT(frame.image).descriptors)
+    np.testing.assert_array_equal(walk.store[2].descriptors, SIFT(frame.image).descriptors)
 
 
 def test_frames_keep_their_numbers_where_others_are_damaged(
-    traversals: tuple[Path, Path], store: FeatureStore, tmp_path: Path
+    traversals: tuple[Path, Path], store: FeatureFolder, tmp_path: Path
 ) -> None:
     folder = tmp_path / "damaged"
     folder.mkdir()
@@ -177,7 +182,8 @@ def test_figures_of_sequences(day: Traversal, tmp_path: Path) -> None:
         lines = rank_queries(match_sequences(single.scores, sequence, stops), truth, stops)
         found = both.figures.pop("sequence")
         assert without_times({"methods": {"m": both.figures}}) == without_times({"methods": {"m": single.figures}})
-        assert found == sequence.model_dump() | asdict(score_retrieval(lines))
+        scored = {**asdict(score_retrieval(lines)), "open_set": score_open_set(lines)}
+        assert found == sequence.model_dump() | scored
         assert both.sequence_ranks is not None
         np.testing.assert_array_equal(both.sequence_ranks.top_row, lines.top_row)
 
@@ -212,7 +218,7 @@ def test_methods_by_kind_pipeline_and_setting(tmp_path: Path) -> None:
     assert read_method("bobb_paper:boxes=9:aspects=[1, 2]", SMALL).aspects == (1.0, 2.0)
     assert read_method("paper", SMALL) == load_pipeline("paper").places
     assert read_method(f"{file}:seed=3", SMALL) == PaperBobbSettings(boxes=2, seed=3)
-    for kind, settings in known_methods().items():
+    for kind, settings in KINDS.items():
         assert read_method(kind, Pipeline()).kind == kind == settings().kind
 
 
@@ -250,7 +256,8 @@ def test_the_same_frames_at_dusk(traversals: tuple[Path, Path]) -> None:
     options = compare.CompareOptions(library_size=8)
     done = compare.compare(dusk, day, methods, TruthChoice("index"), SMALL, options, Execution(2))
     assert done.record["queries"] == done.record["map_frames"] == done.record["positives"] == FRAMES
-    assert done.record["truth"] == {"source": "index", "tolerance": 0, "pairs": FRAMES}
+    truth = {"source": "index", "tolerance": 0, "by": "names", "same_place": "the same number in the file name"}
+    assert done.record["truth"] == {**truth, "pairs": FRAMES}
     assert done.record["library"]["size"] == 8
     assert list(done.record["methods"]) == list(done.ranks) == methods
     assert done.record["methods"]["bovf:words=300"]["r_at_1"] > 0.9
@@ -299,14 +306,16 @@ def test_files_are_the_same_every_time(verb: Verb, traversals: tuple[Path, Path]
         assert "bobb" in said.out
         assert "paper:partitions=5" in said.out
     names = sorted(file.name for file in outs[0].iterdir())
-    assert names == [
+    assert [name for name in names if not name.startswith("misses-")] == [
+        "answers.csv",
         "compare.json",
         "curves.png",
         "curves.svg",
         "scores-01-bobb.npz",
         "scores-02-paper_partitions=5.npz",
+        "similarity.png",
     ]
-    for name in names[1:]:
+    for name in set(names) - {"compare.json"}:
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
     records = [read_run_json(out / "compare.json") for out in outs]
     assert without_times(records[0]) == without_times(records[1])
@@ -315,7 +324,118 @@ def test_files_are_the_same_every_time(verb: Verb, traversals: tuple[Path, Path]
         assert scores["scores"].shape == (FRAMES, FRAMES)
         assert scores["scores"].dtype == np.float32
         assert scores["query_frame"].tolist() == scores["map_frame"].tolist() == list(range(FRAMES))
+        assert scores["query_name"].tolist() == scores["map_name"].tolist() == [f"{i}.png" for i in range(FRAMES)]
     assert b"paper:partitions=5" in (outs[0] / "curves.svg").read_bytes()
+
+
+def test_a_row_for_every_query(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """By file names; a table by names leaves queries without a match, and the protocol says how many have one."""
+    day, dusk = traversals
+    truth = tmp_path / "truth.csv"
+    truth.write_text("query,match\n" + "".join(f"dusk/{i}.png,{i}.png\n" for i in range(0, FRAMES, 2)))
+    arguments = ("compare", dusk, day, "--methods", "thumbnail,gist", "--sequence", 3, "--truth", truth, *QUICK)
+    found = verb(*arguments, "--json", "-o", tmp_path / "out").json
+    assert found["protocol"]["with_match"] == found["positives"] == FRAMES // 2
+    assert found["protocol"]["text"] in verb(*arguments).out
+    assert f"{FRAMES // 2} of {FRAMES} queries have a match, {FRAMES // 2} pairs" in found["protocol"]["text"]
+    rows = list(csv.DictReader((tmp_path / "out" / "answers.csv").open()))
+    assert len(rows) == 4 * FRAMES
+    single = [row for row in rows if row["method"] == "thumbnail"]
+    assert [row["query_name"] for row in single] == [f"{i}.png" for i in range(FRAMES)]
+    assert [row["true_name"] for row in single] == [f"{i}.png" if i % 2 == 0 else "" for i in range(FRAMES)]
+    right = [row["match_name"] == row["true_name"] for row in single if row["true_name"]]
+    assert np.mean(right) == pytest.approx(found["methods"]["thumbnail"]["r_at_1"])
+    assert [row["right"] for row in single if row["true_name"]] == ["true" if one else "false" for one in right]
+    assert all((row["rank"] == "1") == (row["right"] == "true") for row in single)
+
+
+def test_without_a_truth_there_are_answers(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    day, dusk = traversals
+    arguments = ("compare", dusk, day, "--methods", "thumbnail,gist", *QUICK)
+    found = verb(*arguments, "-o", tmp_path / "out", "--json")
+    assert found.err == ""  # nothing about times, odometry or truth
+    assert "r_at_1" not in found.json["methods"]["gist"]
+    names = {file.name for file in (tmp_path / "out").iterdir()}
+    assert {"answers.csv", "answers-01-thumbnail.png", "answers-02-gist.png", "similarity.png"} <= names
+    assert not names & {"curves.png", "misses-01-thumbnail.png"}
+    said = verb(*arguments).out
+    assert "7.png" in said
+    assert "no truth was given, so nothing is scored" in said
+    assert "--truth" in verb(*arguments, "--tolerance", 1).error
+
+
+def test_features_are_kept_between_calls(
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    day, dusk = traversals
+    arguments = ("compare", dusk, day, "--methods", "bovf:words=50", "--truth", "index", "--json", *QUICK)
+    cache = ("--cache", tmp_path / "cache")
+    before = verb(*arguments, *cache).json
+    with monkeypatch.context() as patch:
+        patch.setattr(SiftSettings, "__call__", None)  # no image is described again
+        assert without_times(verb(*arguments, *cache).json) == without_times(before)
+        assert verb(*arguments, *cache, "--set", "features.max_features=249").code == 1
+    files = sorted((tmp_path / "cache" / "features").iterdir())
+    files[0].write_bytes(files[0].read_bytes()[:-1])  # damaged: made again
+    assert without_times(verb(*arguments, *cache).json) == without_times(before)
+    assert verb(*arguments, *cache, "--cache-gb", 0.00001).code == 0
+    assert not list((tmp_path / "cache" / "features").iterdir())
+    assert verb(*arguments, "--cache", tmp_path / "none", "--cache-gb", 0).code == 0
+    assert not (tmp_path / "none").exists()
+
+
+def test_misses_are_those_given_another_row() -> None:
+    """The most certain first; queries without a match after those with one; no row that is right among equals."""
+    scores = np.array([[9, 0, 0], [5, 7, 0], [0, 8, 0], [6, 6, 6], [0, 0, 4]], np.float32)
+    truth = listed_pairs(np.array([[0, 0], [1, 0], [2, 0], [3, 0]]), np.arange(5), np.arange(3))
+    ranks = rank_queries(scores, truth, np.full(5, 3))
+    assert queries_shown(ranks).tolist() == [2, 1, 4]
+    unscored = rank_queries(scores, listed_pairs(np.zeros((0, 2), int), np.arange(5), np.arange(3)), np.full(5, 3))
+    assert queries_shown(unscored).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_misses_are_drawn(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """Beside the given and the right answer; where the truth is wrong all but one are."""
+    day, dusk = traversals
+    truth = tmp_path / "truth.csv"
+    truth.write_text("query,match\n" + "".join(f"{i},{(i + 7) % FRAMES}\n" for i in range(FRAMES - 2)))
+    out = tmp_path / "out"
+    arguments = ("compare", dusk, day, "--methods", "thumbnail", "--truth", truth, "-o", out, *QUICK)
+    assert verb(*arguments).code == 0
+    image = np.asarray(cv2.imread(str(out / "misses-01-thumbnail.png")))
+    assert image.shape[0] > image.shape[1]
+    assert image.std() > 20
+
+
+@pytest.mark.parametrize(("step", "said"), [(1, ""), (3, "advance by 3 frames"), (-1, "run back or jump")])
+def test_sequences_that_do_not_fit_are_warned_of(step: int, said: str) -> None:
+    """The map advances by `step` frames a view of the query, and lines of about 1 are tried."""
+    listed = np.column_stack([np.arange(30), (step * np.arange(30)) % 90])
+    pairs = listed_pairs(listed, np.arange(30), np.arange(90))
+    found = sequence_warning(pairs, SequenceSettings(length=11), has_truth=True)
+    assert [said in one and "harms" in one for one in found] == ([True] if said else [])
+    fitting = SequenceSettings(length=11, slowest=2.7, fastest=3.3)
+    assert bool(sequence_warning(pairs, fitting, has_truth=True)) == (step != 3)
+
+
+def test_folders_are_labels(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """Four views a place, in folders; `study` takes them too, and a table of pairs of two drives both ways."""
+    sets = [tmp_path / name for name in ("one", "two")]
+    for source, target in zip(traversals, sets, strict=True):
+        for number in range(FRAMES):
+            (target / f"place {number // 4}").mkdir(parents=True, exist_ok=True)
+            shutil.copy(source / f"{number}.png", target / f"place {number // 4}" / f"{number % 4}.png")
+    found = verb("compare", sets[1], sets[0], "--methods", "thumbnail", "--truth", "labels", "--json", *QUICK).json
+    assert (found["queries"], found["truth"]["labels"], found["truth"]["pairs"]) == (FRAMES, 4, 4 * FRAMES)
+    assert found["answers"][5]["query_name"] == "place 1/1.png"
+    truth = tmp_path / "truth.csv"
+    truth.write_text("query,match\nplace 1/0.png,place 3/1.png\nplace 2/0.png,place 3/1.png\n")
+    study = ("study", *sets, "--methods", "thumbnail", "--only", "pairs", "--seeds", 1, "--json", *QUICK)
+    labels = verb(*study, "--truth", "labels", "-o", tmp_path / "a").json
+    assert [one["pairs"] for one in labels["protocol"]] == [4 * FRAMES] * 2
+    topics = ("--image-topic", "*")
+    pairs = verb(*study, "--truth", truth, "-o", tmp_path / "b", *topics).json
+    assert [(one["query"], one["with_match"]) for one in pairs["protocol"]] == [("two", 1), ("one", 2)]
 
 
 def test_probabilities_are_held_against_the_truth(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
@@ -347,7 +467,7 @@ def test_an_interrupted_comparison_leaves_the_one_before(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    for last in ("vplog.benchmark.compare._write_scores", "vplog.benchmark.compare.draw_curves"):
+    for last in ("vplog.benchmark.compare._write_scores", "vplog.benchmark.compare_figures.draw_curves"):
         with monkeypatch.context() as patch:
             patch.setattr(last, interrupted)
             assert verb(*arguments, "--library-size", 5).code == 130
@@ -401,7 +521,10 @@ def test_frames_without_truth_are_left_out(verb: Verb, drive: Drive, tmp_path: P
         (("DAY", "--truth", "index", "--min-gap", "5"), "none of the 16 frames of day shows a place of a frame of day"),
         (("DUSK", "DAY", "--truth", "index", "--methods", "bobb,bobb"), "name each method once"),
         (("DUSK", "DAY", "--truth", "index", "--methods", "bobb,surf"), "No method 'surf'. Methods: bobb"),
-        (("DUSK", "DAY", "--truth", "index", "--distance-m", "3"), "takes no --distance-m: it is for poses and a TUM"),
+        (
+            ("DUSK", "DAY", "--truth", "index", "--distance-m", "3"),
+            "takes no --distance-m: it is for utm, poses, a TUM",
+        ),
         (("DUSK", "DAY", "--truth", "gps", "--heading-deg", "3"), "takes no --heading-deg"),
         (("DUSK", "DAY", "--truth", "index", "--sequence", "4"), "length 4 is even"),
         (("DUSK", "DAY", "--truth", "poses"), "has no odometry"),
@@ -437,3 +560,60 @@ def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive
 )
 def test_wrong_usage(verb: Verb, wrong: tuple[str, str]) -> None:
     assert verb("compare", "a", "b", "--truth", "index", "--methods", "bobb", *wrong).code == 2
+
+
+# Answers from a file
+
+
+def test_answers_of_a_file_stand_beside_the_methods(traversals: tuple[Path, Path], tmp_path: Path, verb: Verb) -> None:
+    numbers = tmp_path / "numbers.csv"
+    wrong = {3: 4, 8: 12}
+    lines = [f"{query},{wrong.get(query, query)},{0.5 if query in wrong else 0.9}" for query in range(FRAMES - 1)]
+    numbers.write_text("\n".join(["query,match,score", *lines, "3,3,0.4", ""]))
+    names = tmp_path / "names.csv"
+    named = [f"{query}.png,{wrong.get(query, query)}.png" for query in range(FRAMES - 1)]
+    names.write_text("\n".join(["query,match", *named, "3.png,3.png"]))
+    methods = ["gist", f"answers:{numbers}", f"answers:{names}"]
+    options = compare.CompareOptions(library_size=4, out=tmp_path / "out")
+    done = compare.compare(*traversals, methods, TruthChoice("index"), SMALL, options)
+    of_gist, by_number, by_name = done.record["methods"].values()
+    for found in (by_number, by_name):
+        assert found["answers"] == FRAMES
+        assert found["r_at_1"] == pytest.approx((FRAMES - 3) / FRAMES, abs=0.005)
+        assert found["r_at_5"] >= (FRAMES - 2) / FRAMES
+        assert "bytes_per_image" in of_gist.keys() - found.keys()
+    assert by_number["recall_at_p100"] == pytest.approx((FRAMES - 3) / FRAMES, abs=0.005)
+    said = verb(
+        "compare", *map(str, traversals), "--methods", f"gist,answers:{names}", "--truth", "index", "--library-size",
+        "4", *QUICK[:4],
+    )  # fmt: skip
+    assert said.code == 0
+    assert f"answers:{names}" in said.out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "No such file"),
+        ("", "answers none of 16 frames"),
+        ("a,b\n1,2\n", r":1 is not the header"),
+        ("query,match\n1\n", r":2 has 1 cells"),
+        ("query,match\n1,16\n", r":2: '16' is no frame of dusk, which has 16"),
+        ("query,match\n-1,2\n", r"'-1' is no frame of day"),
+        ("query,match\nx.png,2\n", r"'x.png' is no frame of day"),
+        ("query,match,score\n1,1,nan\n", r"'nan' is no score"),
+        ("query,match\n" + "1" * 5000, "longer than 4096"),
+        ("query,match\n\xff", "not a CSV file"),
+    ],
+)
+def test_answers_that_do_not_fit_are_one_line(
+    text: str | None, message: str, traversals: tuple[Path, Path], tmp_path: Path
+) -> None:
+    file = tmp_path / "answers.csv"
+    if text is not None:
+        file.write_bytes(text.encode("latin-1"))
+    pipeline = Pipeline(features=SiftSettings(max_features=20, max_megapixels=0.01))
+    options = compare.CompareOptions(library_size=2)
+    with pytest.raises(SettingsError, match=message) as caught:
+        compare.compare(*traversals, [f"answers:{file}"], TruthChoice("index"), pipeline, options)
+    assert "\n" not in str(caught.value)

@@ -21,6 +21,7 @@ from tests.benchmarks.discovery import discovery
 from tests.benchmarks.graphs import graphs
 from tests.benchmarks.images import drives
 from tests.benchmarks.large_graphs import large
+from tests.benchmarks.localize import SCENES, localize
 from tests.benchmarks.mining import describing, mining
 from tests.benchmarks.reading import LARGE_GB, SMALL_GB, reading
 from tests.benchmarks.scale import scale
@@ -46,7 +47,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch"}
+LONG = {"large", "batch", "localize"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -71,9 +72,21 @@ def main() -> int:
 
 
 def _arguments() -> argparse.Namespace:
-    kinds = ("mining", "describe", "discovery", "search", "growth", "scale", "graphs", "reading", "large", "batch")
+    kinds = (
+        "mining",
+        "describe",
+        "discovery",
+        "search",
+        "growth",
+        "scale",
+        "graphs",
+        "reading",
+        "large",
+        "batch",
+        "localize",
+    )
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
-    named = f"of {', '.join(kinds)}; all but large and batch where none is named. Or backend, which has its own --help"
+    named = f"of {', '.join(kinds)}; where none is named all but {', '.join(sorted(LONG))}. Or backend (its own --help)"
     parser.add_argument("what", nargs="*", metavar="WHAT", help=named)
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")
@@ -87,6 +100,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=[], help="parts of `batch`")
     parser.add_argument("--kills", type=int, default=10, help="of a batch, at random moments")
     parser.add_argument("--set", nargs="+", default=[], metavar="A.B=C", help="settings of the drives of `batch`")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[], help="of `localize`")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.what) - set(kinds))
     if unknown:
@@ -130,6 +144,9 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
         yield from large(arguments.poses)
     if "batch" in arguments.what:
         yield from batch(arguments.only, arguments.kills, arguments.set)
+    if "localize" in arguments.what:
+        with tempfile.TemporaryDirectory() as made:
+            yield from localize(arguments.scenes, Path(made))
 
 
 def _pipelines() -> Iterator[tuple[str, Pipeline]]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tests.benchmarks.images import Images
     from vplog.data import Bytes, Floats, Int32s, Ints
-    from vplog.features.sift import SiftSettings
+    from vplog.features.extractors import FeatureSettings
     from vplog.places.bobb import BobbSettings
     from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
 
@@ -67,7 +67,7 @@ def dominant_box(V: Floats, grid_x: Int32s, grid_y: Int32s, shapes: Int32s) -> t
 
 
 def discovery(
-    images: Images, extractor: SiftSettings, ours: BobbSettings, paper: PaperBobbSettings, bar: float
+    images: Images, extractor: FeatureSettings, ours: BobbSettings, paper: PaperBobbSettings, bar: float
 ) -> list[Figure]:
     """Windows of one image found on the reference that explains it best: the three ways, seconds a window."""
     references = images.references(extractor)

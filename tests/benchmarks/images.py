@@ -16,7 +16,7 @@ from vplog.demo import make_drive
 
 if TYPE_CHECKING:
     from vplog.data import Bytes
-    from vplog.features.sift import SiftSettings
+    from vplog.features.extractors import FeatureSettings
 
 REAL = ("gardens_day_left.mcap", "kitti00")
 """A walk of 960 x 540 px and a street of 1241 x 376 px, in the folder VPLOG_DATA / drives."""
@@ -32,7 +32,7 @@ class Images:
     images: list[Bytes]
     library: list[Bytes]
 
-    def references(self, extractor: SiftSettings) -> list[Reference]:
+    def references(self, extractor: FeatureSettings) -> list[Reference]:
         return [Reference(image, extractor(image), self.name, row) for row, image in enumerate(self.library)]
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from tests.benchmarks.images import Images
     from vplog.data import Bytes, Features
-    from vplog.features.sift import SiftSettings
+    from vplog.features.extractors import FeatureSettings
     from vplog.pipeline import Pipeline
     from vplog.places.bobb import BobbState
 
@@ -70,8 +70,9 @@ def describing(images: Images, pipeline: Pipeline, name: str, bar: float, rounds
     )
 
 
-def bare_sift(settings: SiftSettings) -> Callable[[Bytes], Any]:
+def bare_sift(settings: FeatureSettings) -> Callable[[Bytes], Any]:
     """OpenCV's SIFT alone, with the extractor's numbers and on images as small as it makes them."""
+    assert settings.kind == "sift"
 
     def detect(image: Bytes) -> Any:
         share = min(math.sqrt(settings.max_megapixels * 1e6 / image.size), 1.0)

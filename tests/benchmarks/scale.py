@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from vplog.maps.search.index import Part
+    from vplog.maps.search.index import SegmentView
 
 PART = 250 * DRIVE
 """Places made at a time."""
@@ -103,7 +103,7 @@ def write_drive(store: Store, first: int, places: Places, state: BobbState) -> N
     run_record.write_run_json(run / "drive.json", record)
 
 
-def _parts(store: Store, state: BobbState, threads: int) -> list[Part]:
+def _parts(store: Store, state: BobbState, threads: int) -> list[SegmentView]:
     return update_index(store, store.drives(), state, Execution(threads))[0]
 
 
@@ -136,7 +136,7 @@ def _building(store: Store, state: BobbState, count: int, threads: int) -> Figur
     return Figure(f"index of {count:,} places, microseconds a place", 1e6 * built / count, None, True, facts)
 
 
-def are_exact(store: Store, state: BobbState, parts: Sequence[Part], asked: list[Place]) -> bool:
+def are_exact(store: Store, state: BobbState, parts: Sequence[SegmentView], asked: list[Place]) -> bool:
     """The best places are those of a full sort of Eq. (1) over every place, drive by drive, to the last bit."""
     J, windows, pairing = state.settings.references, state.settings.boxes, state.settings.pairing
     best: list[list[tuple[float, int, int]]] = [[] for _ in asked]
@@ -171,7 +171,9 @@ def _cold(store: Store, state: BobbState, asked: list[Place]) -> float:
     return round(1000 * statistics.median(spent), 1)
 
 
-def _searching(state: BobbState, parts: list[Part], asked: list[Place], threads: int, told: dict[str, Any]) -> Figure:
+def _searching(
+    state: BobbState, parts: list[SegmentView], asked: list[Place], threads: int, told: dict[str, Any]
+) -> Figure:
     def one(view: Place, cores: int) -> None:
         best_places(parts, state, [view], BEST, Execution(cores))
 

@@ -223,6 +223,7 @@ def ledger(pairs: Pairs, measured: Floats, information: Floats, scale: list[str]
         match_from_query=measured,
         information=information,
         verdict=[Verdict.ACCEPTED] * count,
+        p_false=unknown,
         residual_before=unknown,
         residual_after=unknown,
         weight=unknown,

@@ -140,7 +140,7 @@ def test_lines_on_stderr_wrap_too_and_by_its_own_width(
     text = f"error: No topic '/left' in run.mcap. Image topics: {LONG}, /right. Choose one with --image-topic."
     for width in WIDTHS:
         monkeypatch.setattr(printing, "terminal_width", lambda of, width=width: width if of is sys.stderr else 30)
-        printing.say(text)
+        printing.print_status(text)
         err = capsys.readouterr().err
         assert err.split() == ["vplog:", *text.split()]
         assert (len(err.splitlines()) == 1) == (width is None or width == 200)
@@ -201,7 +201,7 @@ def test_the_outcome_is_that_of_the_tables(finished: Path) -> None:
     ],
 )
 def test_what_came_of_a_run_is_said_in_metres(outcome: Outcome, gps: Any, said: str) -> None:
-    assert printing._came_of(outcome, {"gps": gps, "solution": {"reason": "No closure passed."}}).endswith(said)
+    assert printing._outcome_text(outcome, {"gps": gps, "solution": {"reason": "No closure passed."}}).endswith(said)
 
 
 def test_a_joint_run_says_what_next(joint: Path, capsys: pytest.CaptureFixture[str]) -> None:

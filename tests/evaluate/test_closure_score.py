@@ -53,6 +53,7 @@ def ledger(pairs: Sequence[tuple[int, int, float, bool]]) -> Closures:
         match_from_query=np.full((count, 4, 4), np.nan),
         information=np.full((count, 6, 6), np.nan),
         verdict=[Verdict.ACCEPTED if a else Verdict.TOO_FEW_INLIERS for a in accepted],
+        p_false=nan,
         residual_before=nan,
         residual_after=nan,
         weight=nan,

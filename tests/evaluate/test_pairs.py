@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vplog.data import Trajectory
-from vplog.errors import TruthError
 from vplog.evaluate import pairs
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -162,45 +155,3 @@ def test_no_sample_knows_nothing() -> None:
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
     assert not pairs.poses_at(nothing, np.arange(3))[1].any()
     assert not pairs.positions_at(nothing.stamp_ns, np.zeros((0, 2)), np.arange(3))[1].any()
-
-
-def test_a_table_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "truth.csv"
-    path.write_text("\ufeffquery, match\r\n\n0,4\n2,0\n 1 , 3 \n2,0\n", encoding="utf-8")
-    assert pairs.read_pairs(path, 3, 5).tolist() == [[0, 4], [2, 0], [1, 3], [2, 0]]
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("0,1\n", ":1 is not the header"),
-        ("query;match\n0;1\n", ":1 is not the header"),
-        ("query,match\n0,1\n2\n", ":3 is not two frame numbers"),
-        ("query,match\n\n1.5,1\n", ":3 is not two frame numbers"),
-        ("query,match\n-1,1\n", ":2 is not two frame numbers"),
-        ("query,match\n²,1\n", ":2 is not two frame numbers"),
-        ("query,match\n1,99999999999999999999\n", ":2 is not two frame numbers"),
-        ("query,match\n3,1\n", ":2: 3 is not a frame of the query, whose 3 frames"),
-        ("query,match\n1,5\n", ":2: 5 is not a frame of the map, whose 5 frames"),
-        ("query,match\n", "holds no pair"),
-        ("", "holds no pair"),
-        ("query,match\n" + "0" * 5000, ":2 is longer than"),
-    ],
-)
-def test_what_does_not_fit_is_named_with_its_line(tmp_path: Path, text: str, said: str) -> None:
-    path = tmp_path / "truth.csv"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(TruthError) as error:
-        pairs.read_pairs(path, 3, 5)
-    assert said in str(error.value)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_a_table_that_is_no_text_or_is_missing(tmp_path: Path) -> None:
-    path = tmp_path / "truth.csv"
-    with pytest.raises(TruthError, match="Cannot read"):
-        pairs.read_pairs(path, 3, 5)
-    path.write_bytes(b"\xff\xfe\x00\x81" * 10)
-    with pytest.raises(TruthError, match="is not text"):
-        pairs.read_pairs(path, 3, 5)

@@ -41,6 +41,9 @@ class Recorded:
     def stamps(self) -> Ints:
         return self.stamp_ns
 
+    def file_names(self) -> list[str] | None:
+        return None
+
     def camera(self) -> Camera:
         return Camera("camera", None, "none", np.zeros(0), 640, 480, self.body_from_camera)
 
@@ -121,7 +124,7 @@ def test_a_camera_that_is_rolled_about_its_axis_sees_the_same_place() -> None:
 
 def test_a_heading_is_not_for_fixes() -> None:
     log = straight("a", 0, 0)
-    with pytest.raises(TruthError, match="takes no --heading-deg: it is for poses and a TUM file"):
+    with pytest.raises(TruthError, match="takes no --heading-deg: it is for utm, poses and a TUM file"):
         open_truth(TruthChoice("gps", heading_deg=3.0), cast("Log", log), cast("Log", log))
 
 

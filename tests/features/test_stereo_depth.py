@@ -88,7 +88,8 @@ def test_a_stereo_closure_has_metres_without_odometry() -> None:
         left, right = pair(place, at, rng)
         seen.append(replace(left, depth_m=stereo_depth(left, right, 500.0, BASELINE_M, StereoSettings())))
     still = keyframes([poses[0], poses[0]])  # the odometry says nothing of how they lie
-    ledger = verify(proposals([(1, 0)]), still, LENS, seen.__getitem__, VerifySettings(), baseline_m=BASELINE_M)
+    lens = replace(LENS, baseline_m=BASELINE_M)
+    ledger = verify(proposals([(1, 0)]), still, lens, seen.__getitem__, VerifySettings())
     assert ledger.verdict == [Verdict.ACCEPTED]
     assert ledger.scale == ["stereo"]
     assert ledger.reverse_inliers[0] > 50

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vplog.data import Gps
-from vplog.geometry.geodesy import geodetic, local_enu
+from vplog.geometry.geodesy import geodetic, local_enu, utm, utm_zone
 
 ORIGINS = st.tuples(
     st.floats(-90.0, 90.0), st.floats(-180.0, 180.0), st.floats(-400.0, 9000.0)
@@ -41,3 +42,20 @@ def test_known_lengths_of_a_degree() -> None:
     east = geodetic(np.array([[1.0, 0.0, 0.0]]), (0.0, 0.0, 0.0))[0]
     np.testing.assert_allclose(1.0 / north[0], 110_574.3, rtol=1e-5)
     np.testing.assert_allclose(1.0 / east[1], 111_319.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "zone", "east", "north"),
+    [
+        (11.5755, 48.1372, 32, 691603.7765982752, 5334757.803636242),
+        (151.2153, -33.8568, 56, 334900.56965226424, 6252288.752888294),
+        (5.3221, 60.3913, 32, 297353.93272915104, 6700648.345231735),
+        (-70.6693, -33.4489, 19, 344846.72031010315, 6297700.155609685),
+        (15.6, 78.22, 33, 513674.0649389056, 8682991.984972183),
+    ],
+)
+def test_utm_is_that_of_proj(longitude: float, latitude: float, zone: int, east: float, north: float) -> None:
+    """Values of PROJ 9 (pyproj 3.7.2), proj=utm ellps=WGS84; Bergen and Svalbard lie in widened zones."""
+    assert utm_zone(longitude, latitude) == zone
+    found = utm(np.array([latitude]), np.array([longitude]), zone)
+    np.testing.assert_allclose(found, [[east, north]], rtol=0, atol=1e-7)

@@ -76,6 +76,7 @@ def ledger(query: np.ndarray, match: np.ndarray, match_from_query: Floats) -> Cl
         match_from_query=match_from_query,
         information=np.broadcast_to(np.diag(CLOSURE_SIGMA**-2.0), (n, 6, 6)).copy(),
         verdict=[Verdict.ACCEPTED] * n,
+        p_false=np.full(n, np.nan),
         residual_before=np.full(n, np.nan),
         residual_after=np.full(n, np.nan),
         weight=np.full(n, np.nan),

@@ -91,6 +91,18 @@ def test_indefinite_information_is_repaired_with_a_warning() -> None:
     assert np.isfinite(GncSettings()(graph).world_from_body).all()
 
 
+def test_an_impossible_correlation_leaves_the_rest_as_it_is() -> None:
+    """As in the public graph cubicle: x-yaw and y-yaw stand where z-roll and z-pitch belong."""
+    information = DRIVE.graph.information.copy()
+    information[4] = np.diag([10.0, 10.0, 9e4, 2.5e6, 1.5e7, 10.0])
+    information[4, 3, 4] = information[4, 4, 3] = 5.4e6
+    expected = information[4].copy()
+    information[4, [0, 5, 1, 5], [5, 0, 5, 1]] = [8e4, 8e4, 1.3e5, 1.3e5]
+    graph, warnings = checked(replace(DRIVE.graph, information=information))
+    np.testing.assert_allclose(graph.information[4], expected, rtol=1e-9, atol=1e-6)
+    assert len(warnings) == 1
+
+
 def test_a_graph_without_poses_is_refused() -> None:
     with pytest.raises(GraphError, match="1 keyframes"):
         build_graph(replace(DRIVE.keyframes, stamp_ns=DRIVE.keyframes.stamp_ns[:1]), np.zeros((0, 6, 6)), None)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.graph.drive import Drive, position_error, ring
+from tests.graph.drive import ODOMETRY_SIGMA, Drive, position_error, ring
 from vplog.geometry import se3
 from vplog.graph.consistency import OdometryChain, is_loop
-from vplog.graph.evidence import log_evidence, runs
+from vplog.graph.evidence import log_evidence, log_partition, log_room, runs
 from vplog.graph.factors import Factors
 from vplog.graph.hypotheses import best_hypothesis, bounded
 from vplog.graph.least_squares import Objective, descend
 from vplog.graph.solve import GncSettings, LmSettings, decided
+from vplog.graph.variance_components import Sigmas, estimate
 
 
 def claiming(drive: Drive, odometry: float = 1.0, closures: float = 1.0) -> Drive:
@@ -78,7 +80,7 @@ def test_no_closure_outweighs_a_hundred_others() -> None:
 def test_sigmas_are_those_of_the_world() -> None:
     honest = best_hypothesis(ring(240, 80, seed=6).graph, GncSettings()).sigmas
     found = best_hypothesis(claiming(ring(240, 80, seed=6), 0.25, 0.5).graph, GncSettings()).sigmas
-    assert found.odometry == pytest.approx(4.0 * honest.odometry, rel=0.1)
+    assert found.translation == pytest.approx(4.0 * honest.translation, rel=0.1)
     assert found.closures == pytest.approx(2.0 * honest.closures, rel=0.1)
 
 
@@ -108,3 +110,40 @@ def test_runs_are_of_neighbours_at_both_ends() -> None:
         ends = np.sort(np.stack([graph.a[run], graph.b[run]]), axis=0)
         assert np.diff(np.sort(ends[0]), axis=0).max(initial=0) <= 3
         assert np.diff(np.sort(ends[1]), axis=0).max(initial=0) <= 3
+
+
+@pytest.mark.parametrize("room", [True, False])
+def test_a_pair_of_poses_is_no_surprise_where_most_pairs_see_the_same(room: bool) -> None:
+    """A hand-held camera within a room crosses its own views all the time, a vehicle hardly ever does."""
+    random = np.random.default_rng(4)
+    positions = random.normal(size=(300, 3)) if room else 2.0 * np.arange(300)[:, None] * [1.0, 0.0, 0.0]
+    graph = ring(300, 60, seed=4).graph
+    loops = np.flatnonzero(is_loop(graph))
+    measured = graph.a_from_b.copy()
+    measured[loops] = se3.exp(random.normal(size=(60, 6)) * np.repeat([0.2, 2.0], 3))
+    found = log_room(replace(graph, a_from_b=measured), se3.pose(np.eye(3), np.asarray(positions, np.float64)))
+    reach = 3.0 * np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    spread = 3.0 * math.log(0.2**2 + 0.2**2) + 3.0 * math.log(4.0 + reach**2)
+    of_views = 0.5 * (6.0 * (math.log(2.0 * math.pi) + 1.0) + spread)
+    assert found - of_views == pytest.approx(0.0 if room else math.log(300**2 / 2 / 60), abs=1.0)
+
+
+def test_the_number_of_families_is_not_known_beforehand() -> None:
+    """As many as there are runs, or one of all, cost next to nothing; what lies between, the ways to part them."""
+    assert log_partition([1] * 200) > -8.0
+    assert log_partition([200]) > -8.0
+    assert log_partition([100, *[1] * 100]) < -100.0
+
+
+def test_odometry_is_no_noisier_than_what_it_measures() -> None:
+    """Closures anywhere do not bend it into a knot in which all of them are true."""
+    drive = ring(120, loops=2, false=60, seed=6)
+    graph = claiming(drive, odometry=0.1).graph
+    weight = np.ones(len(graph.a))
+    poses = descend(Factors.of(graph), weight, graph.world_from_body, 30, 1e-3).world_from_body
+    sigmas = estimate(Objective(Factors.of(graph), weight), poses, Sigmas())
+    step = graph.a_from_b[~is_loop(graph)]
+    motion = np.sqrt((se3.log(step).reshape(-1, 2, 3) ** 2).mean((0, 2)))
+    claimed = 0.1 * ODOMETRY_SIGMA[[0, 3]]
+    assert sigmas.rotation <= 1.001 * motion[0] / claimed[0]
+    assert sigmas.translation <= 1.001 * motion[1] / claimed[1]

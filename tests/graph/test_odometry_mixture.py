@@ -22,7 +22,7 @@ def test_true_and_false_are_told_apart(share: float) -> None:
     sigmas, true = modes(graph, loops)[0]
     assert true[~false[loops]].mean() > 0.95
     assert true[false[loops]].mean() < 0.1
-    assert 0.5 <= sigmas.odometry <= 2.0
+    assert 0.5 <= sigmas.translation <= 2.0
 
 
 @pytest.mark.parametrize("factor", [1 / 8, 1 / 4, 4.0])
@@ -33,7 +33,7 @@ def test_sigmas_claimed_wrongly_are_found_and_change_little(factor: float) -> No
     (honest, expected), (sigmas, true) = (
         modes(one, np.flatnonzero(~odometry))[0] for one in (graph, replace(graph, information=information))
     )
-    assert factor / 2.0 <= sigmas.odometry / honest.odometry <= factor * 2.0
+    assert factor / 2.0 <= sigmas.translation / honest.translation <= factor * 2.0
     assert (true != expected).mean() < 0.02
 
 

@@ -23,8 +23,8 @@ from tests.logs.drives import (
 from vplog import logs
 from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import PoseMessage
-from vplog.logs.recorder_clock import mend_steps_back
-from vplog.logs.stamps import Stamps, share_clock
+from vplog.logs.recorder_clock import correct_clock_steps
+from vplog.logs.stamps import Stamps, set_common_clock
 from vplog.logs.tracks import PoseTrack
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ def stamps(header_ns: np.ndarray, log_ns: np.ndarray, received_ns: np.ndarray | 
 def ordered(*topics: Stamps) -> tuple[list[np.ndarray], list[np.ndarray], list[str]]:
     """Stamps and rows of each, and what was said."""
     notes = Notes()
-    mend_steps_back(topics, notes)
-    share_clock(topics)
+    correct_clock_steps(topics, notes)
+    set_common_clock(topics)
     found = [one.order(f"/{number}", notes) for number, one in enumerate(topics)]
     return [one[0] for one in found], [one[1] for one in found], notes.lines
 
@@ -235,14 +235,14 @@ def test_a_clock_is_set_back_by_more_than_had_passed(seed: int, size_s: float) -
     true_ns, log_ns = topic(rng, 30, rng.uniform(10, 60))
     steps = [(START_NS + 12 * SECOND, int((30 + size_s) * SECOND))]
     found = stamps(after(true_ns, true_ns, steps), after(log_ns, log_ns, steps))
-    found.places = true_ns[:, None] / SECOND * [1.0, 0.0, 0.0]
+    found.xyz_m = true_ns[:, None] / SECOND * [1.0, 0.0, 0.0]
     _, rows, said = ordered(found)
     np.testing.assert_array_equal(rows[0], np.arange(len(true_ns)))
     assert any("set back" in line for line in said)
     parts = np.array_split(np.arange(len(true_ns)), 4)
     mixed = np.concatenate([parts[3], parts[0], parts[1]])
     found = stamps(true_ns[mixed], log_ns[mixed])
-    found.places = true_ns[mixed, None] / SECOND * [1.0, 0.0, 0.0]
+    found.xyz_m = true_ns[mixed, None] / SECOND * [1.0, 0.0, 0.0]
     times, _, said = ordered(found)
     np.testing.assert_array_equal(times[0], np.sort(true_ns[mixed]))
     assert not [line for line in said if "set" in line]

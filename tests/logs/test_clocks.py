@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from tests.logs.drives import START_NS, Drive, ros_messages, write_ros2
 from vplog import logs
-from vplog.logs.clocks import on_one_clock
+from vplog.logs.clocks import align_clock
 from vplog.logs.formats.container import Notes
-from vplog.logs.stamps import Stamps, rate_hz, share_clock
+from vplog.logs.stamps import Stamps, rate_hz, set_common_clock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,7 +46,7 @@ def test_a_clock_that_is_set_is_followed(count: int, jumps: list[tuple[int, int]
     header_ns = true_ns.copy()
     for at, step in jumps:
         header_ns[at:] += step
-    found = on_one_clock(header_ns, log_ns)
+    found = align_clock(header_ns, log_ns)
     assert found is not None
     assert found.valid.all()
     errors = found.stamp_ns - true_ns
@@ -64,7 +64,7 @@ def test_stray_stamps_are_told_and_nothing_else(count: int, data: st.DataObject)
         step = data.draw(steps)
         header_ns[row] += step + step // 4  # by less than 2 s a message may be late
     header_ns = np.maximum(header_ns, 1)
-    found = on_one_clock(header_ns, log_ns)
+    found = align_clock(header_ns, log_ns)
     assert found is not None
     assert np.flatnonzero(~found.valid).tolist() == rows
     np.testing.assert_array_equal(found.stamp_ns[found.valid], true_ns[found.valid])
@@ -75,7 +75,7 @@ def test_any_clock_that_runs_is_left_as_it_is(offset_ns: int, rate: float) -> No
     """A simulation's, at any rate, and one far from the recorder's."""
     true_ns, log_ns = times(50)
     header_ns = ((true_ns - START_NS) * rate).astype(np.int64) + START_NS + offset_ns
-    found = on_one_clock(header_ns, log_ns)
+    found = align_clock(header_ns, log_ns)
     assert found is not None
     assert found.valid.all()
     np.testing.assert_array_equal(found.stamp_ns, header_ns)
@@ -151,7 +151,7 @@ def test_topics_end_on_the_clock_that_most_messages_are_on() -> None:
     camera = stamps(np.where(np.arange(100) < 20, true_ns, true_ns - 50 * SECOND), log_ns)
     true2_ns, log2_ns = times(200, seed=1)
     odometry = stamps(true2_ns, log2_ns)
-    share_clock([camera, odometry])
+    set_common_clock([camera, odometry])
     assert np.abs(camera.order("/camera", Notes())[0] - true_ns).max() <= JITTER_NS
     np.testing.assert_array_equal(odometry.order("/odometry", Notes())[0], true2_ns)
 
@@ -160,7 +160,7 @@ def test_a_topic_on_another_clock_is_moved_where_it_fits_nowhere_and_told_of_whe
     true_ns, log_ns = times(100)
     for offset, moved in ((-1_000_000 * SECOND, True), (5 * SECOND, False)):
         camera, odometry = stamps(true_ns, log_ns), stamps(true_ns[::2] + offset, log_ns[::2])
-        share_clock([camera, odometry])
+        set_common_clock([camera, odometry])
         camera.order("/camera", quiet := Notes())
         stamp_ns, _ = odometry.order("/odometry", notes := Notes())
         assert (np.abs(stamp_ns - true_ns[::2]).max() <= JITTER_NS) == moved

@@ -11,8 +11,8 @@ import pytest
 from tests.logs.drives import START_NS
 from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import PoseMessage
-from vplog.logs.recorder_clock import mend_steps_back
-from vplog.logs.stamps import Stamps, share_clock
+from vplog.logs.recorder_clock import correct_clock_steps
+from vplog.logs.stamps import Stamps, set_common_clock
 from vplog.logs.tracks import PoseTrack
 
 if TYPE_CHECKING:
@@ -84,9 +84,9 @@ def test_nothing_is_interleaved(still: bool) -> None:
         camera.extend(one.header_ns.tolist(), one.log_ns.tolist(), one.received_ns.tolist())
         one = topics["imu"]
         imu.extend([0] * len(one.log_ns), one.log_ns.tolist(), one.received_ns.tolist())
-        track.give_places()
-        mend_steps_back([camera, track.stamps, imu], notes := Notes())
-        share_clock([camera, track.stamps])
+        track.set_xyz()
+        correct_clock_steps([camera, track.stamps, imu], notes := Notes())
+        set_common_clock([camera, track.stamps])
         for name, stamps in {"camera": camera, "odom": track.stamps}.items():
             _, rows = stamps.order(f"/{name}", notes)
             true_ns = topics[name].true_ns

@@ -34,9 +34,11 @@ from tests.logs.drives import (
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel
-from vplog.logs.image_folder import ImageFolder, stamps_of
+from vplog.logs.image_folder import stamps_of
 from vplog.logs.messages.decode import decode, read_poses, read_ros_poses
 from vplog.logs.messages.records import PoseMessage
+from vplog.logs.recorded_log import RecordedLog
+from vplog.logs.topic_selection import TopicChoice
 from vplog.stages import Log
 
 if TYPE_CHECKING:
@@ -164,8 +166,11 @@ def test_image_folder(names: list[str], stamps: list[int], note: str, tmp_path: 
     start = 0 if note else START_NS
     np.testing.assert_array_equal(log.stamps() - start, stamps)
     assert [int(f.decode().image[0, 0]) for f in log.frames(log.stamps())] == [2, 0, 1]
-    assert note in " ".join(log.warnings)
+    assert "not times" not in " ".join(log.warnings)  # nothing is compared with them
     assert (log.camera().matrix, log.camera().width, log.odometry()) == (None, 6, None)
+    truth = tmp_path.parent / f"{tmp_path.name}.tum"
+    truth.write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    assert note in " ".join(logs.open(tmp_path, TopicChoice(odometry_file=truth)).warnings)
 
 
 @pytest.mark.parametrize(
@@ -217,7 +222,7 @@ def test_damaged_images_of_a_folder_keep_their_time_and_are_counted(tmp_path: Pa
     (tmp_path / "2.png").write_bytes(b"")
     (tmp_path / "4.png").write_bytes(b"no image")
     log = logs.open(tmp_path)
-    assert isinstance(log, ImageFolder)
+    assert isinstance(log, RecordedLog)
     assert log.camera().width == 6
     np.testing.assert_array_equal(log.stamps(), np.array([0, 1, 3, 5]) * 100_000_000)
     for frame in log.frames(log.stamps()):

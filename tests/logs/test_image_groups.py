@@ -97,11 +97,27 @@ def test_a_few_images_of_another_size_are_resampled_or_left_out(tmp_path: Path) 
     assert [loss.messages for loss in log.account.losses] == [1]
 
 
-def test_folders_in_a_folder_are_named(tmp_path: Path) -> None:
+def test_folders_of_several_cameras_are_named(tmp_path: Path) -> None:
     for name in ("left", "right"):
         write(tmp_path / name, [f"{i}.png" for i in range(4)])
-    with pytest.raises(LogError, match=r"folders in it do: left \(4\), right \(4\)\. Give one of them\."):
+    with pytest.raises(LogError, match=r"several cameras: left \(4\), right \(4\)\. Choose one") as found:
         logs.open(tmp_path)
+    assert "\n" not in str(found.value)
+    assert logs.open(tmp_path, TopicChoice(image="left")).file_names() == [f"left/{i}.png" for i in range(4)]
+    assert len(logs.open(tmp_path, TopicChoice(image="*")).stamps()) == 8
+
+
+def test_folders_of_places_are_one_set(tmp_path: Path) -> None:
+    """A few views of many places, with the same names in each folder; what is no image is passed over."""
+    for place in ("10", "9", "b/1"):
+        (tmp_path / place).mkdir(parents=True)
+        write(tmp_path / place, ["1.png", "2.png"])
+    (tmp_path / "9" / "notes.txt").write_text("none")
+    log = logs.open(tmp_path)
+    assert log.file_names() == ["9/1.png", "9/2.png", "10/1.png", "10/2.png", "b/1/1.png", "b/1/2.png"]
+    assert not log.warnings
+    frames = [frame.decode().image for frame in log.frames(log.stamps()[[3, 4]])]
+    np.testing.assert_array_equal(frames[0], cv2.imread(str(tmp_path / "10" / "2.png"), cv2.IMREAD_GRAYSCALE))
 
 
 @pytest.mark.parametrize("verb", ["info", "run", "library", "compare"])

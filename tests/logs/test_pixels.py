@@ -18,6 +18,8 @@ from tests.logs.drives import PERIOD_NS, START_NS, Written, store, write_foxglov
 from vplog import logs
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
+from vplog.logs.messages.pixels import rgb
+from vplog.logs.messages.records import ImageMessage
 from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
@@ -216,3 +218,46 @@ def test_pixels_are_those_of_the_reference_readers(form: Format, encoding: str, 
             assert len(images) == len(expected)
             for image, reference in zip(images, expected, strict=True):
                 np.testing.assert_array_equal(image, reference)
+
+
+def test_colours_of_every_layout_are_those_of_the_picture() -> None:
+    """Two halves of one colour each, so that a mosaic and rows of shared chroma hold them, too."""
+    picture = np.full((16, 24, 3), (200, 60, 30), np.uint8)
+    picture[:, 12:] = 20, 90, 220
+    blue_first = picture[..., ::-1]
+    alpha = np.full((16, 24, 1), 255, np.uint8)
+    mosaic = picture[..., 2].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = picture[::2, ::2, 0], blue_first[1::2, 1::2, 0]
+    mosaic[::2, 1::2], mosaic[1::2, ::2] = picture[::2, 1::2, 1], picture[1::2, ::2, 1]
+    # ITU-R BT.601, 2.5.3: luma over 16..235, both differences over 16..240
+    coded = picture / 255 @ np.array([[65.481, -37.797, 112.0], [128.553, -74.203, -93.786], [24.966, 112.0, -18.214]])
+    y, u, v = np.moveaxis(np.rint(coded + np.array([16, 128, 128])).astype(np.uint8), 2, 0)
+    uyvy = np.stack([np.where(np.arange(24) % 2, v, u), y], axis=-1)
+    raw = {
+        "rgb8": picture, "bgr8": blue_first, "rgba8": np.concatenate([picture, alpha], 2),
+        "bgra8": np.concatenate([blue_first, alpha], 2), "bayer_rggb8": mosaic, "uyvy": uyvy, "yuyv": uyvy[..., ::-1],
+    }  # fmt: skip
+    for encoding, pixels in raw.items():
+        data = np.ascontiguousarray(pixels).tobytes()
+        message = ImageMessage(0, "", encoding, data, False, 24, 16, len(data) // 16, False)
+        error = np.abs(rgb(message).astype(int) - picture)[:, [4, 5, 18, 19]]
+        assert error.max() <= (3 if encoding in ("uyvy", "yuyv") else 0), encoding
+    for suffix in (".png", ".jpg", ".webp"):
+        coded = cv2.imencode(suffix, blue_first)[1].tobytes()
+        error = np.abs(rgb(ImageMessage(0, "", suffix, coded, True)).astype(int) - picture)[:, [4, 5, 18, 19]]
+        assert error.max() <= (0 if suffix == ".png" else 12), suffix
+    shades = cv2.imencode(".png", picture[..., 0])[1].tobytes()
+    np.testing.assert_array_equal(rgb(ImageMessage(0, "", "png", shades, True)), np.dstack([picture[..., 0]] * 3))
+
+
+def test_a_folder_keeps_colour_where_it_is_requested(tmp_path: Path) -> None:
+    picture = np.zeros((40, 60, 3), np.uint8)
+    picture[:, :30], picture[:, 30:] = (250, 10, 10), (10, 10, 250)
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), picture[..., ::-1])
+    log = logs.open(tmp_path)
+    plain, coloured = (next(log.frames(log.stamps())).decode(colour) for colour in (False, True))
+    assert plain.colour is None
+    assert coloured.colour is not None
+    np.testing.assert_array_equal(coloured.colour, picture)
+    np.testing.assert_array_equal(coloured.image, plain.image)

@@ -12,7 +12,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.propose import Proposals
-from vplog.loops.verify import drive_of, verify_between
+from vplog.loops.verify import calibration_share, drive_of, verify_between
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -113,8 +113,8 @@ def verify(
     features: Callable[[int], Features],
     settings: VerifySettings,
     execution: Execution = Execution(),
-    baseline_m: float | None = None,
 ) -> Closures:
     """The ledger of the proposals of one drive."""
-    alone = drive_of(frames, lens, features, settings, baseline_m)
-    return verify_between(found, alone, alone, execution)
+    alone = drive_of(frames, lens, features, settings)
+    share = calibration_share(alone, execution) if lens.matrix is not None and len(found.query) else 0.0
+    return verify_between(found, alone, alone, execution, share)

@@ -82,7 +82,7 @@ def test_a_lone_keyframe_has_no_landmarks() -> None:
 
 def test_depth_has_the_sensors_noise() -> None:
     depth = np.array([0.5, 2.0, 8.0, np.nan, 0.0, -1.0, np.inf, 1e9])
-    found = landmarks.from_depth(np.zeros((8, 2)), depth, 500.0, LandmarkSettings(depth_share=0.0))
+    found = landmarks.from_depth(np.zeros((8, 2)), depth, camera(), LandmarkSettings(depth_share=0.0))
     np.testing.assert_array_equal(found.known, [True] * 3 + [False] * 5)
     sigma_z = np.sqrt(found.covariance[:3, 2, 2]) * depth[:3] ** 2
     np.testing.assert_allclose(sigma_z, 1.425e-3 * depth[:3] ** 2)

@@ -13,6 +13,10 @@ def landmarks(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(0.1, 0.5, count)])
 
 
+def of_rays(sigma: float, count: int) -> np.ndarray:
+    return np.tile(sigma**2 * np.eye(2), (count, 1, 1))
+
+
 def predict(match_from_query: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(x, y, rho) in the query, and the derivatives by pose and landmark."""
     back = se3.inverse(match_from_query)
@@ -50,7 +54,7 @@ def test_the_pose_is_found_and_its_covariance_is_that_of_its_errors(deep: bool) 
         rho = exact[:, 2] + rng.normal(0, rho_sigma, 40) if deep else np.full(40, np.nan)
         start = true @ se3.exp(rng.normal(0, 0.02, 6))
         found, hessian, excess = pose_refinement.fit(
-            start, points, np.zeros((40, 3, 3)), seen, rho, np.full(40, rho_sigma**2), sigma
+            start, points, np.zeros((40, 3, 3)), seen, rho, np.full(40, rho_sigma**2), of_rays(sigma, 40)
         )
         error = se3.log(se3.between(true, found))
         errors.append(error @ hessian @ error / 6)
@@ -62,17 +66,17 @@ def test_a_landmark_explained_by_its_own_uncertainty_agrees() -> None:
     points, seen = np.array([[0.1, 0.0, 0.5]]), np.array([[0.11, 0.0]])
     for variance, near in ((0.0, False), (1e-4, True)):
         covariance = np.diag([variance, variance, 0.0])[None]
-        squared, length = pose_refinement.agreement(np.eye(4), points, covariance, seen, 1e-3)
+        squared, alone = pose_refinement.agreement(np.eye(4), points, covariance, seen, of_rays(1e-3, 1))
         assert (squared[0] < 9.21) == near
-        assert length[0] == pytest.approx(0.01)
+        assert alone[0] == pytest.approx(10.0**2)
     behind = se3.pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    assert np.isnan(pose_refinement.agreement(behind, points, np.zeros((1, 3, 3)), seen, 1e-3)[0]).all()
+    assert np.isnan(pose_refinement.agreement(behind, points, np.zeros((1, 3, 3)), seen, of_rays(1e-3, 1))[0]).all()
 
 
 def test_landmarks_on_one_line_through_the_camera_leave_the_pose_where_it_was() -> None:
     points = np.column_stack([np.zeros((8, 2)), np.linspace(0.1, 0.5, 8)])
     found, hessian, _ = pose_refinement.fit(
-        np.eye(4), points, np.zeros((8, 3, 3)), np.zeros((8, 2)), np.full(8, np.nan), np.ones(8), 1e-3
+        np.eye(4), points, np.zeros((8, 3, 3)), np.zeros((8, 2)), np.full(8, np.nan), np.ones(8), of_rays(1e-3, 8)
     )
     np.testing.assert_array_equal(found, np.eye(4))
     assert np.linalg.cond(hessian) > 1e12

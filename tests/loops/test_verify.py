@@ -72,9 +72,10 @@ def test_revisits_are_found_with_the_pose_and_the_certainty_they_have(depth: boo
     assert sigmas(part, poses).max() < 3.0
 
 
-@pytest.mark.parametrize("depth", [False, True])
-def test_without_floors_the_covariance_is_the_errors_own(depth: bool) -> None:
-    lens, frames, poses, seen = drive(depth)
+@pytest.mark.parametrize(("depth", "model"), [(False, "none"), (True, "none"), (True, "equidistant")])
+def test_without_floors_the_covariance_is_the_errors_own(depth: bool, model: str) -> None:
+    """Without what real cameras err by beyond the noise of features. Landmarks from motion share errors: 1.5."""
+    lens, frames, poses, seen = drive(depth, model)
     bare = EXACT.model_copy(
         update={
             "metric": MetricSettings(systematic_px=0.0, scale_share=0.0),
@@ -85,7 +86,7 @@ def test_without_floors_the_covariance_is_the_errors_own(depth: bool) -> None:
     ledger = verify(proposals(pairs), frames, lens, seen.__getitem__, bare)
     ratio = sigmas(ledger, poses)[[v is Verdict.ACCEPTED for v in ledger.verdict]]
     assert len(ratio) > 24
-    assert 0.6 < np.sqrt(np.mean(ratio**2)) < 2.0
+    assert 0.7 < np.mean(ratio**2) < 1.8
 
 
 @pytest.mark.parametrize("depth", [False, True])

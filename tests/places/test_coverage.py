@@ -15,11 +15,18 @@ from tests.places.pictures import SMALL, noisy, nothing, reference
 from vplog.data import Keyframes, Reference
 from vplog.execution.execution import Execution
 from vplog.places import coverage as cov
+from vplog.places.library import WordSettings
 from vplog.places.reference_choice import LEAST_SIZE, LibrarySettings
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Features
     from vplog.places.bobb_paper import PaperBobbState
+
+
+@pytest.fixture(scope="module")
+def state(references: list[Reference]) -> PaperBobbState:
+    """With the words of `WordSettings`, as runs measure coverage by them."""
+    return SMALL.model_copy(update={"l1_range": WordSettings().l1_range}).learn(references, Execution(2))
 
 
 def _sparse(matrix: np.ndarray) -> cov.Explanations:
@@ -189,7 +196,7 @@ def test_the_figure_of_a_run(state: PaperBobbState) -> None:
 def test_more_frames_are_looked_at_where_few_leave_it_open(
     state: PaperBobbState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cov, "_FIRST", 8)
+    monkeypatch.setattr(cov, "_FIRST_FRAMES", 8)
     known, elsewhere = [0, 1, 2, 3, 4, 5, 6, 7], [60, 61, 62, 63, 64, 65, 66, 67]
     good = _measure(state, [*known, 8, 9, 10, 11])
     assert (good.explained, good.frames) == (1.0, 8)

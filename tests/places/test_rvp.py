@@ -64,7 +64,8 @@ def _fast(case: Case) -> tuple[np.ndarray, Int32s, Int32s]:
     totals = rvp.patch_totals(patches, np.array([len(each) for each in case.picture.words], np.int32), count)
     grid_x, grid_y = rvp.grid_cuts(case.picture.width, case.grid), rvp.grid_cuts(case.picture.height, case.grid)
     H = np.array([case.H[word] for word in words], np.int32)
-    cells = rvp.vote(H, case.H.total(), start, posting, patches, totals, case.cuts[0], case.cuts[1], grid_x, grid_y)
+    listed = np.array(words, np.int32), start, posting
+    cells = rvp.vote(H, case.H.total(), rvp.Pattern(*listed, patches, totals, *case.cuts, grid_x, grid_y))
     return cells, grid_x, grid_y
 
 

@@ -77,6 +77,7 @@ def make_run(seed: int = 0) -> Run:
         match_from_query=random_poses(rng, count) * known[:, None, None],
         information=(square @ square.transpose(0, 2, 1) + np.eye(6)) * known[:, None, None],
         verdict=verdict,
+        p_false=rng.random(count) * known,
         residual_before=rng.random(count) * known,
         residual_after=rng.random(count) * known,
         weight=rng.random(count) * known,

@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from tests.results.example import COUNT, METADATA, Run, make_run
 from vplog.data import Closures, EdgeKind, Keyframes, Verdict
 from vplog.geometry import se3
-from vplog.results.mcap import write_mcap
+from vplog.results.mcap import McapExtras, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,7 +27,9 @@ RUN = make_run()
 
 
 def write(path: Path, run: Run = RUN) -> bytes:
-    write_mcap(path, run.keyframes, run.solution.world_from_body, run.graph, run.closures, METADATA, camera=run.camera)
+    write_mcap(
+        path, run.keyframes, run.solution.world_from_body, run.graph, run.closures, METADATA, McapExtras(run.camera)
+    )
     return path.read_bytes()
 
 

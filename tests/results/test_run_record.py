@@ -16,7 +16,7 @@ from vplog.pipeline import Pipeline
 from vplog.results.run_record import read_finished_run, read_run_json, write_run_json
 from vplog.results.tables import TableMetadata, write_closures, write_keyframes
 from vplog.run.provenance import OWN_LIBRARY, head
-from vplog.run.run_folder import begun
+from vplog.run.run_folder import staged_run
 from vplog.verbs.resume import resume_request
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def test_a_record_without_a_checksum_is_read(tmp_path: Path) -> None:
 
 def test_the_request_of_an_unfinished_run_has_a_checksum(tmp_path: Path) -> None:
     out, log = tmp_path / "out", written(tmp_path / "a.mcap", b"a log")
-    with pytest.raises(KeyboardInterrupt), begun(out, head(Pipeline(), log, 1), [log]):
+    with pytest.raises(KeyboardInterrupt), staged_run(out, head(Pipeline(), log, 1), [log]):
         (out / ".cache" / "extract-0.stage").write_text("a result")
         raise KeyboardInterrupt
     request = out / ".cache" / "run.json"

@@ -24,7 +24,7 @@ from vplog.errors import ResultError
 from vplog.results import geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.geo import Earth
-from vplog.results.mcap import Explained, Shown, camera_topic, write_mcap
+from vplog.results.mcap import McapExtras, ReferenceBoxes, camera_topic, write_mcap
 from vplog.results.previews import PictureSettings, jpeg, preview, scaled_size, shrink
 from vplog.storage.image_file import decode_image
 
@@ -46,10 +46,10 @@ def picture(value: int, width: int = SIZE[0], height: int = SIZE[1]) -> bytes:
     return jpeg(np.full((height, width), value, np.uint8), 75)
 
 
-def explained(row: int) -> Explained | None:
+def explained(row: int) -> ReferenceBoxes | None:
     windows = np.array([[0.0, 0.0, 0.5, 0.5], [0.5, 0.5, 1.0, 1.0]])
     boxes = np.array([[0.25, 0.25, 0.75, 0.75], [np.nan] * 4])
-    return None if row == 1 else Explained([row % 2, 5], windows, boxes)
+    return None if row == 1 else ReferenceBoxes([row % 2, 5], windows, boxes)
 
 
 ROWS: Any = np.arange(COUNT // 3)
@@ -60,7 +60,8 @@ GPS = Gps(
     100.0 + ROWS,
     np.where(ROWS[:, None, None] % 2, np.eye(3), np.nan),
 )
-SHOWN = Shown(
+SHOWN = McapExtras(
+    camera=CAMERA,
     image=picture,
     image_size=SIZE,
     explained=explained,
@@ -72,8 +73,8 @@ SHOWN = Shown(
 )
 
 
-def write(path: Path, shown: Shown = SHOWN) -> bytes:
-    write_mcap(path, RUN.keyframes, RUN.solution.world_from_body, RUN.graph, RUN.closures, METADATA, CAMERA, shown)
+def write(path: Path, shown: McapExtras = SHOWN) -> bytes:
+    write_mcap(path, RUN.keyframes, RUN.solution.world_from_body, RUN.graph, RUN.closures, METADATA, shown)
     return path.read_bytes()
 
 

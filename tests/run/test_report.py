@@ -20,7 +20,7 @@ from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, tables
-from vplog.results.report.page import Judged
+from vplog.results.report.page import TruthComparison
 from vplog.results.report.page import page as write_page
 from vplog.results.run_record import read_run_json
 from vplog.run.report import gather
@@ -107,6 +107,13 @@ def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finishe
         assert f'id="closure-{row}"' in page
 
 
+def test_the_certificate_and_the_sigma_of_keyframes_are_told(page: str, finished: Path) -> None:
+    assert read_run_json(finished / "run.json")["certificate"]["reason"].split(":")[0] in page
+    covariance = tables.read_keyframe_covariance(finished / "keyframes.parquet")
+    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
+    assert f"median {np.median(sigma_m):.3f} m, largest {sigma_m.max():.3f} m" in page
+
+
 def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> None:
     record = read_run_json(finished / "run.json")
     for name in record["stages"]:
@@ -156,7 +163,7 @@ def test_accepted_closures_that_are_false_stand_out(finished: Path, wrong: int) 
     true, known = np.ones(len(verdicts), bool), np.ones(len(verdicts), bool)
     true[accepted[:wrong]] = False
     known[accepted[-1]] = False
-    text = write_page(gather(finished, {}, Judged("truth.tum", {}, true=true, known=known)))
+    text = write_page(gather(finished, {}, TruthComparison("truth.tum", {}, true=true, known=known)))
     assert ("accepted closures that are false" in text) == bool(wrong)
     [edges] = re.findall(r'<path class="edge false" d="(.*?)"/>', text)
     assert edges.count("M") == wrong

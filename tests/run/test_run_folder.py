@@ -24,7 +24,7 @@ from vplog.results.run_record import read_finished_run
 from vplog.run import run_folder
 from vplog.run.provenance import head
 from vplog.run.reference_library import build_library
-from vplog.run.run_folder import begun
+from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.sessions.joint_run import _names
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def complete(out: Path, logs: Path | list[Path], force: bool = False, joint: boo
     asked = head(Pipeline(), paths[0] if joint else paths, 1)
     if joint:
         asked |= run_folder.provenance.logs_of(paths)
-    with begun(out, asked, paths, drives=drives, force=force) as made:
+    with staged_run(out, asked, paths, drives=drives, cache=CacheOptions(force=force)) as made:
         for name, one in {**drives, **({} if joint else {"": paths})}.items():
             if name:
                 complete(made / name, one)
@@ -207,7 +207,7 @@ def test_an_unfinished_run_of_another_log_is_not_dropped(log: Path, other: Path,
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, LogError, ResultError])
 def test_a_run_that_came_to_nothing_leaves_nothing(error: type[BaseException], log: Path, tmp_path: Path) -> None:
-    with pytest.raises(error), begun(tmp_path / "new" / "out", head(Pipeline(), log, 1), [log]):
+    with pytest.raises(error), staged_run(tmp_path / "new" / "out", head(Pipeline(), log, 1), [log]):
         raise error
     assert not (tmp_path / "new").exists()
 
@@ -216,7 +216,7 @@ def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: P
     """It would fail again; stages that it finished stay for other runs."""
     out = tmp_path / "out"
     asked = {**head(Pipeline(), log, 1), **run_folder.provenance.logs_of([log, other])}
-    with pytest.raises(LogError) as failed, begun(out, asked, [log, other], drives=["a", "b"]):
+    with pytest.raises(LogError) as failed, staged_run(out, asked, [log, other], drives=["a", "b"]):
         written(out / ".cache" / "extract-0.stage", b"a result")
         raise LogError
     assert not hasattr(failed.value, "__notes__")
@@ -227,7 +227,7 @@ def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: P
 def test_a_request_stays_while_it_is_gone_on_with(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for stage in (True, False):
-        with pytest.raises(KeyboardInterrupt), begun(out, head(Pipeline(), log, 1), [log]):
+        with pytest.raises(KeyboardInterrupt), staged_run(out, head(Pipeline(), log, 1), [log]):
             if stage:
                 (out / ".cache" / "extract-0.stage").write_text("a result")
             raise KeyboardInterrupt

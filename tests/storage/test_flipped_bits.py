@@ -26,7 +26,7 @@ from vplog.maps.search.segment import open_segment
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings
 from vplog.places.library_files import load_references, save_references
-from vplog.results import geo, kept_features, places_map, tables
+from vplog.results import feature_table, geo, places_map, tables
 from vplog.results.geo import Earth
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def features(row: int) -> Features:
 
 
 def read_kept(path: Path) -> Any:
-    kept = kept_features.KeptFeatures(path, "state", 20)
+    kept = feature_table.FeatureTable(path, "state", 20)
     try:
         return [plain(kept[row]) for row in range(len(kept))]
     finally:
@@ -68,7 +68,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     exported = folder / "map.parquet"
     places_map.write_map(exported, [folder / "run"])
     kept, joins, answers = folder / "features.parquet", folder / "joins.parquet", folder / "placed.parquet"
-    kept_features.write_features(kept, 5, features, 20, "state")
+    feature_table.write_features(kept, 5, features, 20, "state")
     tables.write_joins(joins, [(RUN.keyframes, RUN.keyframes, RUN.closures)], METADATA)
     rows = np.arange(9, dtype=np.int32)
     values = [rows, rows.astype(np.int64), rows, ["a"] * 9, rows, rows.astype(np.int64), rows.astype(np.float32), rows]
@@ -85,7 +85,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
         kept: [read_kept],
         exported: [
             lambda path: list(places_map.read_drives(path, KIND)),
-            places_map.about_map,
+            places_map.read_places_header,
             places_map.places_by_drive,
         ],
         answers: [],

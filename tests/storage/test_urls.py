@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.storage.test_remote_path import QUICK, RangeHandler
-from vplog.cache.input_hashes import hash_inputs, look_of
+from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import SettingsError
 from vplog.storage.remote_path import RemotePath, located, reason
 from vplog.storage.urls import shown, without_secrets
@@ -225,4 +225,4 @@ def test_logs_that_differ_in_their_queries_are_two(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(RemotePath, "version", lambda self: self.url[-1])
     monkeypatch.setattr(RemotePath, "is_dir", lambda _: False)
     paths: list[Any] = [RemotePath(f"http://h/get?id={number}") for number in range(4)]
-    assert sorted(hash_inputs(paths).values()) == sorted(look_of(paths).values()) == ["0", "1", "2", "3"]
+    assert sorted(hash_inputs(paths).values()) == sorted(stat_signature(paths).values()) == ["0", "1", "2", "3"]

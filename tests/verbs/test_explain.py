@@ -64,7 +64,8 @@ def a_row(verdict: Verdict, **values: Any) -> dict[str, Any]:
         "matches": 83, "landmarks": 61, "inliers": 47, "spread": 0.31, "reverse_inliers": 44,
         "scale": "depth" if posed else "none", **{name: value if posed else None for name, value in pose.items()},
         "covariance": np.diag([1e-4] * 3 + [4e-2] * 3).ravel().tolist() if posed else None,
-        "verdict": verdict.value, "reason": verdict.sentence, "residual_before": 7.5 if posed else None,
+        "verdict": verdict.value, "reason": verdict.sentence, "p_false": 0.02,
+        "residual_before": 7.5 if posed else None,
         "residual_after": 1.5 if posed else None, "weight": float(verdict is Verdict.ACCEPTED) if posed else None,
         **values,
     }  # fmt: skip
@@ -322,7 +323,7 @@ def test_matches_by_chance_agree_with_nothing(count: int) -> None:
 
 def test_the_windows_drawn_are_those_whose_boxes_agree_best(finished: Path) -> None:
     ledger = tables.read_closures(finished / "closures.parquet")
-    state = Pipeline().places.load(finished / "library", Execution())
+    state: Any = Pipeline().places.load(finished / "library", Execution())
     places = state.from_arrow(tables.read_descriptors(finished / "descriptors.parquet")[0])
     number = of(finished, Verdict.ACCEPTED)
     numbers = ledger.shared_references[number].tolist()

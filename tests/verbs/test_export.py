@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import duckdb
 import numpy as np
@@ -137,6 +138,29 @@ def test_geoparquet_says_where_every_sample_is(exported: Callable[[str], Path], 
     assert rows == len(stamp_ns)
 
 
+def test_kml_has_the_lines_of_geojson(exported: Callable[[str], Path]) -> None:
+    tree = json.loads(exported("geojson").read_text())
+    names = {"k": "http://www.opengis.net/kml/2.2"}
+    marks = ElementTree.fromstring(exported("kml").read_text()).findall("k:Document/k:Placemark", names)  # noqa: S314
+    assert len(marks) == len(tree["features"])
+    for mark, feature in zip(marks, tree["features"], strict=True):
+        found = [one.split(",") for one in str(mark.findtext("k:LineString/k:coordinates", None, names)).split()]
+        expected = np.array(feature["geometry"]["coordinates"])[:, :2]
+        np.testing.assert_allclose(np.array(found, float), expected, atol=1e-8)
+
+
+def test_utm_is_the_path_in_metres(exported: Callable[[str], Path], finished: Path) -> None:
+    lines = [line.split(",") for line in exported("utm").read_text().splitlines()]
+    assert lines[0] == ["stamp_ns", "easting_m", "northing_m", "altitude_m", "zone"]
+    stamp_ns, poses = after(finished)
+    assert [int(line[0]) for line in lines[1:]] == stamp_ns.tolist()
+    metres = np.array([line[1:4] for line in lines[1:]], float)
+    steps = [np.linalg.norm(np.diff(one, axis=0), axis=1) for one in (metres, poses[:, :3, 3])]
+    # the scale of the projection is .9996 to 1.001 within a zone
+    np.testing.assert_allclose(steps[0], steps[1], rtol=1.1e-3, atol=4e-3)
+    assert len({line[4] for line in lines[1:]}) == 1
+
+
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
 def test_rerun_reads_its_own(exported: Callable[[str], Path], finished: Path, tmp_path: Path) -> None:
     path = exported("rrd")
@@ -175,7 +199,7 @@ def test_without_rerun_one_line_says_what_to_install(
 
 def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, tmp_path: Path) -> None:
     from vplog.data import Camera
-    from vplog.results.mcap import write_mcap
+    from vplog.results.mcap import McapExtras, write_mcap
 
     folder = tmp_path / "run"
     shutil.copytree(finished, folder)
@@ -183,8 +207,10 @@ def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, t
     graph, _, _ = tables.read_edges(folder / "edges.parquet", world)
     ledger = tables.read_closures(folder / "closures.parquet")
     camera = Camera("c", None, "none", np.zeros(0), 4, 4, np.eye(4))
-    write_mcap(folder / "result.mcap", keyframes, world, graph, ledger, tables.TableMetadata({}, ""), camera)
-    for kind in ("geojson", "geoparquet"):
+    write_mcap(
+        folder / "result.mcap", keyframes, world, graph, ledger, tables.TableMetadata({}, ""), McapExtras(camera)
+    )
+    for kind in ("geojson", "geoparquet", "kml", "utm"):
         assert (
             "fewer than three satellite fixes" in verb("export", folder, "--format", kind, "-o", tmp_path / "x").error
         )

@@ -21,7 +21,7 @@ from vplog.cli import main, parser
 from vplog.logs import TopicChoice
 from vplog.results.run_record import plain
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
-from vplog.verbs.info import command, in_words, page, preflight
+from vplog.verbs.info import command, page, preflight, preflight_lines
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,7 +75,7 @@ def test_what_is_left_out_says_why_and_how_to_take_it(drive: Path, tmp_path: Pat
     assert record["gps"] is None
     assert record["scale"]["source"] == "odometry"
     assert preflight(drive, TopicChoice(odometry="/odom")).record["odometry"]["source"] == "/odom"
-    assert why(preflight(drive, TopicChoice(odometry="/odom")).record)["/odom"] == "used as odometry, as asked for"
+    assert why(preflight(drive, TopicChoice(odometry="/odom")).record)["/odom"] == "used as odometry, as requested"
     pair = preflight(write_pair(tmp_path, PINHOLES, RIGHT_FROM_LEFT, tf=True)).record
     assert why(pair)["/stereo/right/image_raw"] == "used as right image of the pair"
     assert pair["scale"]["source"] == "stereo"
@@ -222,7 +222,7 @@ def test_page_is_whole_and_escapes_what_the_log_says(drive: Path, tmp_path: Path
     assert not re.search(r"url\(|@import|https?://", text)
     assert "prefers-color-scheme: dark" in text
     assert 'name="viewport"' in text
-    for name, line in in_words(found.record):
+    for name, line in preflight_lines(found.record):
         assert f"<dt>{name}</dt>" in text
         assert line.split(":", maxsplit=1)[0] in text
     out = tmp_path / "info.html"

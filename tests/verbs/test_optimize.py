@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.benchmarks.graphs import city, spoiled
+from tests.graph.drive import ring
 from vplog.cli import main, results
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
@@ -116,6 +118,33 @@ def test_indefinite_information_is_mended_with_a_warning(tmp_path: Path) -> None
     (tmp_path / "in.g2o").write_text(f"EDGE_SE2 0 1 {EDGE}EDGE_SE2 1 2 1 0 0 100 200 0 100 0 100\n")
     done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o")
     assert any("not positive" in text for text in done.record["warnings"])
+
+
+def test_a_graph_with_every_oddity_is_solved(tmp_path: Path) -> None:
+    """Edges of a pose to itself, said twice, nearly singular, impossible, and a piece that nothing joins."""
+    ring = [f"EDGE_SE2 {at} {at + 1} 1 0 {np.pi / 4} 100 0 0 100 0 100\n" for at in range(16)]
+    loops = [f"EDGE_SE2 {at} {at + 8} 0 0 0 100 0 0 100 0 100\n" for at in range(8)]
+    odd = [loops[3], loops[3], f"EDGE_SE2 5 5 {EDGE}", "EDGE_SE2 2 10 0 0 0 100 100 0 100 0 1e-9\n"]
+    odd += ["EDGE_SE2 4 12 0 0 0 100 300 0 100 0 100\n", f"EDGE_SE2 90 91 {EDGE}", f"EDGE_SE2 91 91 {EDGE}"]
+    (tmp_path / "in.g2o").write_text("".join(ring + loops + odd))
+    done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o", certify=True).record
+    assert (done["kept"], done["loops"], done["converged"]) == (12, 12, True)
+    said = " ".join(done["warnings"])
+    assert all(words in said for words in ("2 edges of a pose to itself", "1 edges is not positive", "2 unconnected"))
+    again = read_g2o(tmp_path / "out.g2o").graph.world_from_body
+    np.testing.assert_allclose(again[8:17], again[:9], atol=1e-6)
+
+
+def test_edges_that_say_nothing_of_one_direction_leave_the_closures_true(tmp_path: Path) -> None:
+    """Else they are less certain there than a false closure is anywhere."""
+    graph, random = ring(40, 12).graph, np.random.default_rng(1)
+    direction = random.normal(size=(len(graph.a), 6))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    flat = np.eye(6) - direction[:, :, None] * direction[:, None, :]
+    some = (random.random(len(graph.a)) < 0.4)[:, None, None]
+    graph = replace(graph, information=np.where(some, flat @ graph.information @ flat, graph.information))
+    write_g2o(tmp_path / "in.g2o", graph, graph.world_from_body)
+    assert optimize(tmp_path / "in.g2o", tmp_path / "out.g2o").record["kept"] == 12
 
 
 def test_what_cannot_be_is_said(path: Path, tmp_path: Path) -> None:

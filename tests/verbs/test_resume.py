@@ -9,7 +9,7 @@ import random
 import shutil
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,24 +22,31 @@ from hypothesis import strategies as st
 from tests.logs import drives
 from tests.logs.drives import ros_messages, write_raw, write_ros2
 from tests.logs.messages.test_video import messages, packets
-from tests.results.example import make_run
 from vplog import logs
-from vplog.cache import code_hash, feature_shards
+from vplog.cache import feature_shards
 from vplog.cache.codecs import closures_codec, columns_codec, images_codec
 from vplog.cache.feature_shards import Extracted
-from vplog.cache.stage_cache import CONTENT_AT, DamagedError, StageCache, digest_of, inputs_of, key_of, sealed
+from vplog.cache.stage_cache import CONTENT_AT, DamagedError, StageCache, inputs_of, sealed
 from vplog.cache.steps import Steps
-from vplog.data import Closures, Keyframes
+from vplog.data import Keyframes
 from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.logs.frames import RecordedFrame
 from vplog.loops.propose import Proposals
-from vplog.pipeline import CacheOptions, Pipeline, load_pipeline, run
+from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results.run_record import read_run_json
-from vplog.run import feature_extraction, verification
-from vplog.run.feature_extraction import compute_part, cut, extract, missing_parts, parts_of, put_part, stored_features
+from vplog.run import feature_extraction
+from vplog.run.feature_extraction import (
+    compute_part,
+    extract,
+    missing_parts,
+    parts_of,
+    put_part,
+    split_keyframes,
+    stored_features,
+)
 from vplog.run.provenance import head
-from vplog.run.run_folder import begun
+from vplog.run.run_folder import CacheOptions, staged_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,7 +66,7 @@ COUNT = 24
 OPTIONS = [option for one in QUICK for option in ("--set", one)]
 SAME = ("*.parquet", "result.mcap", "trajectory.tum", "graph.g2o", "library/*")
 """What must be the same byte for byte, however often a run was begun."""
-KEPT = ("extract", "choose", "cover", "describe", "propose", "verify")
+STEPS = ("extract", "choose", "cover", "describe", "propose", "verify")
 PART = 8
 """Keyframes of a part here, so that there are several."""
 
@@ -73,7 +80,7 @@ def results(out: Path) -> dict[str, str]:
 def computed(out: Path) -> list[str]:
     """Of the stages that are kept, those that the last run into `out` computed, in part at least."""
     stages = read_run_json(out / "run.json")["stages"]
-    return [name for name in KEPT if stages[name]["result"] != "reused"]
+    return [name for name in STEPS if stages[name]["result"] != "reused"]
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +114,7 @@ def whole(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(feature_extraction, "PART_KEYFRAMES", PART)
         run(log, out, load_pipeline("default", QUICK))
-    assert computed(out) == list(KEPT)
+    assert computed(out) == list(STEPS)
     return out
 
 
@@ -194,7 +201,7 @@ def test_settings_of_features_and_pictures_extract_anew(log: Path, again: Path, 
 
 def test_without_a_cache_nothing_is_found_and_nothing_stays(log: Path, whole: Path, again: Path) -> None:
     run(log, again, load_pipeline("default", QUICK), cache=CacheOptions(use=False))
-    assert computed(again) == list(KEPT)
+    assert computed(again) == list(STEPS)
     assert not (again / ".cache").exists()
     assert results(again) == results(whole)
 
@@ -236,31 +243,12 @@ def test_a_log_is_known_by_its_content_where_its_times_are_new(
     assert missing_parts(again / ".cache", parts_of(copy, pipeline, cache=again / ".cache"))
 
 
-def test_no_flipped_bit_of_a_logs_identity_is_believed(tmp_path: Path) -> None:
-    """The log has the name it had in the cache, or another that nothing is kept by."""
-    file, cache, chance = tmp_path / "a.mcap", tmp_path / "cache", random.Random(5)
-    file.write_bytes(b"a log")
-    with StageCache(cache, file, []) as stages:
-        stages.store("extract-000000", "0" * 64, [], b"")
-        stages.finish(["extract-000000.stage"])
-    os.utime(file, ns=(0, 0))
-    known, sound = inputs_of(file, cache), (cache / "inputs.json").read_bytes()
-    assert known.token != key_of(known.look)
-    for _ in range(200):
-        flipped = bytearray(sound)
-        flipped[chance.randrange(len(sound))] ^= 1 << chance.randrange(8)
-        (cache / "inputs.json").write_bytes(flipped)
-        found = inputs_of(file, cache)
-        assert found.token in (known.token, key_of(known.look))
-        assert found.look == known.look
-
-
 def test_what_was_lost_and_said_is_told_again(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     original, bad = RecordedFrame.decode, [part.stamp_ns[3] for part in parts_of(log, load_pipeline("default", QUICK))]
 
     def damaged(frame: RecordedFrame) -> Any:
         if frame.stamp_ns in bad:
-            frame._lose(frame.image.channel)
+            frame._count_undecodable(frame.image.channel)
             raise LogError("it is damaged")
         return original(frame)
 
@@ -324,7 +312,7 @@ def drive_of(path: Path) -> tuple[Any, Keyframes, list[Any]]:
     """A log, its frames as keyframes, and these in parts."""
     log = logs.open(path)
     keyframes = Keyframes(log.name, log.stamps(), np.tile(np.eye(4), (len(log.stamps()), 1, 1)))
-    return log, keyframes, cut([path], None, Pipeline(), keyframes, inputs_of(path, None))
+    return log, keyframes, split_keyframes([path], None, Pipeline(), keyframes, inputs_of(path, None))
 
 
 @pytest.mark.parametrize("kind", ["video", "damaged video", "depth"])
@@ -407,82 +395,6 @@ def test_no_bytes_harm_the_reader_of_a_stage(
         return
 
 
-@pytest.mark.parametrize("size", [1, 3, 100])
-def test_a_ledger_in_parts_is_the_ledger(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part has all candidates of its map frames; written, read back and put together they are what they were."""
-    monkeypatch.setattr(verification, "_PART_CANDIDATES", size)
-    known, codec = make_run(size).closures, closures_codec()
-    rows = verification._parts(known.match)
-    assert (len(rows) == 1) == (size == 100)
-    assert sorted(np.concatenate(rows).tolist()) == list(range(len(known)))
-    matches = [set(known.match[part].tolist()) for part in rows]
-    assert sum(map(len, matches)) == len(set.union(*matches))
-    taken = [_taken(known, part) for part in rows]
-    found = verification.merged([codec.from_bytes(codec.to_bytes(part)) for part in taken], rows)
-    assert digest_of(found) == digest_of(known)
-    assert found.verdict == known.verdict
-    nothing = _taken(known, np.empty(0, np.int64))
-    assert len(codec.from_bytes(codec.to_bytes(nothing))) == 0
-
-
-def _taken(closures: Closures, rows: Any) -> Closures:
-    columns: dict[str, Any] = {field.name: getattr(closures, field.name) for field in fields(Closures)}
-    taken: dict[str, Any] = {
-        name: column[rows] if isinstance(column, np.ndarray) else [column[row] for row in rows]
-        for name, column in columns.items()
-    }
-    return Closures(**taken)
-
-
-EXTRACTION = ("vplog.run.feature_extraction", "vplog.features.sift")
-COUNTS = ("logs/messages/h264.py", "features/sift.py", "features/stereo_depth.py", "features/__init__.py")
-OTHERS = ("graph/gnc.py", "run/report.py", "pipeline.py", "loops/verify.py", "places/bobb.py", "run/provenance.py")
-
-
-def test_code_counts_where_it_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copy = tmp_path / "vplog"
-    shutil.copytree(code_hash._PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(code_hash, "_PACKAGE", copy)
-
-    def hashed(*changed: str) -> str:
-        for file in changed:
-            with (copy / file).open("a") as stream:
-                stream.write("\n# changed\n")
-        return code_hash.code_of.__wrapped__(*EXTRACTION)["code"]
-
-    before = hashed()
-    assert hashed(*OTHERS) == before
-    found = [hashed(file) for file in COUNTS]
-    assert len({before, *found}) == len(COUNTS) + 1
-
-
-def test_all_code_that_a_part_runs_counts(log: Path, tmp_path: Path) -> None:
-    """What of the package a process has loaded after computing a part is among the files that its key is made of."""
-    code = f"""
-import sys
-from dataclasses import fields, replace
-from pathlib import Path
-from vplog.run.keyframes import KeyframeSettings
-from vplog.features.sift import SiftSettings
-from vplog.features.stereo_depth import StereoSettings
-from vplog.results.previews import PictureSettings
-from types import SimpleNamespace
-from vplog.run import feature_extraction
-from vplog.run.feature_extraction import compute_part, parts_of
-feature_extraction.PART_KEYFRAMES = 1
-asked = SimpleNamespace(keyframes=KeyframeSettings(), features=SiftSettings(max_features=10), stereo=StereoSettings(),
-                        pictures=PictureSettings())
-compute_part(parts_of(Path({str(log)!r}), asked)[0])
-print(*[name for name in sys.modules if name.split(".")[0] == "vplog"])
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded, (files, packages) = set(done.stdout.split()), code_hash.imported(EXTRACTION)
-    assert {"vplog.run.feature_extraction", "vplog.logs.recorded_log", "vplog.logs.formats.mcap_file"} <= loaded
-    assert loaded <= files.keys()
-    assert {"cv2", "numpy", "mcap"} <= packages
-    assert "gtsam" not in packages
-
-
 def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_is_given(tmp_path: Path) -> None:
     out, pipeline = tmp_path / "out", load_pipeline("default", QUICK)
     log, staging = tmp_path / "log", out / ".vplog-staging"
@@ -493,7 +405,7 @@ def test_a_run_begins_where_another_was_killed_at_once_and_keeps_a_library_that_
 
     def done(library: Path | None = None) -> None:
         account = head(pipeline, log, 1)
-        with begun(out, account, [log], library) as made:
+        with staged_run(out, account, [log], library) as made:
             (made / "run.json").write_text(json.dumps(account))
 
     done()
@@ -513,18 +425,18 @@ def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, v
     out = tmp_path / "out"
     out.mkdir()
 
-    def begun(**changed: Any) -> str:
+    def resume(**changed: Any) -> str:
         (out / "run.json").write_text(json.dumps({**account, "finished": False, **changed}))
         return verb("run", "--resume", "-o", out).error
 
-    assert "no longer exists" in begun(log=str(tmp_path / "gone.mcap")) or "No log at" in begun(
+    assert "no longer exists" in resume(log=str(tmp_path / "gone.mcap")) or "No log at" in resume(
         log=str(tmp_path / "gone")
     )
-    assert "lacks log" in begun(log=None)
-    assert "without --resume" in begun(topics=None)
-    assert "lacks library.from" in begun(library={})
-    assert "no_such_setting" in begun(settings={"no_such_setting": 1})
-    assert "is not a library" in begun(library={"from": str(tmp_path / "lost")})
+    assert "lacks log" in resume(log=None)
+    assert "without --resume" in resume(topics=None)
+    assert "lacks library.from" in resume(library={})
+    assert "no_such_setting" in resume(settings={"no_such_setting": 1})
+    assert "is not a library" in resume(library={"from": str(tmp_path / "lost")})
     (out / "run.json").write_text(json.dumps({**account, "finished": False}))
     other = tmp_path / "other.mcap"
     assert "Leave out the log" in verb("run", "--resume", other, "-o", out).error

@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.batch.engine import BatchOptions, LocalEngine, computed, opened
+from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
 from vplog.batch.worker import Drive, Task, made_by
 from vplog.cache.input_hashes import bytes_of
 from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.execution.execution import Execution
-from vplog.maps.import_places import ALONE
+from vplog.maps.import_places import PLACES_ONLY
 from vplog.maps.joining.join import join as join_drives
 from vplog.maps.joining.join import load_places
 from vplog.maps.storage import layout, map_store
-from vplog.maps.storage.contents import left_out
+from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import drive_record, folder_name
 from vplog.pipeline import load_pipeline, pipeline_from
 from vplog.storage.remote_path import RemotePath, located
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
 _FREE_BYTES = 10**10
-"""Of the map's disk that stay free of what would only be quicker to have: what a drive of several hours needs while it
-is computed, at 0.3 MB a keyframe."""
+"""Free space of the map's disk below which stage caches are removed: what a drive of several hours needs while it is
+computed, at 0.3 MB a keyframe."""
 _CODE = ("code", "versions")
 """Fields of drive.json that name the program that made it."""
 
@@ -51,7 +51,7 @@ def settings_for(root: Path, name: str | None = None, assignments: Sequence[str]
     else the default. Raises SettingsError, ResultError."""
     if name is None and (root / "map.json").exists():
         with map_store.reading(root) as store:
-            head = store.sound_head()
+            head = store.recovered_head()
         if head.library is not None:  # there may be drives
             try:
                 return pipeline_from(head.settings, f"{root}/map.json", assignments)
@@ -73,77 +73,77 @@ def run_batch(
     fit the library or the settings.
     """
     topics, options = topics or logs.TopicChoice(), options or BatchOptions()
-    began, given = time.perf_counter(), [_place(path) for path in paths]
+    began, given = time.perf_counter(), [_absolute_log(path) for path in paths]
     if twice := [log for log, count in Counter(given).items() if count > 1]:
         raise SettingsError(f"{shown(twice[0])} is given twice. Give each log once.")
     with (
         map_store.writing(root) as store,
-        ThreadPoolExecutor(1) as aside,
-        opened(options, execution.threads, store.staging) as workers,
+        ThreadPoolExecutor(1) as background,
+        open_engine(options, execution.threads, store.staging) as workers,
     ):
-        maker = aside.submit(made_by)
+        versions = background.submit(made_by)
         digest = map_library(store, paths, library, pipeline, topics, execution)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
         inputs, errors = known_hashes(dict(zip(given, paths, strict=True)), topics, store.root / NAME, execution)
         reserved = {**_failed(store), **known}
         drives = layout.drive_names([_name(path) for path in paths], list(map(shown, given)), reserved, inputs)
-        alike = _alike(pipeline, topics, digest) | maker.result()
+        common = _common_record(pipeline, topics, digest) | versions.result()
         done, wanted = dict[str, Drive](), list[dict[str, Any]]()
         urls = dict(zip(drives, given, strict=True))
         for drive, content in zip(drives, inputs, strict=True):
-            about, log = {"drive": drive, "inputs": content, **alike}, shown(urls[drive])
-            about |= {"key": layout.key_of(about), "log": log}
+            record, log = {"drive": drive, "inputs": content, **common}, shown(urls[drive])
+            record |= {"key": layout.key_of(record), "log": log}
             if why := errors.get(urls[drive]):
                 done[drive] = Drive(drive, log, "failed", error=why)
-                options.tell(done[drive])
-            elif drive in known and known[drive]["key"] == about["key"] and not _is_damaged(store, drive):
+                options.on_drive(done[drive])
+            elif drive in known and known[drive]["key"] == record["key"] and not _is_damaged(store, drive):
                 done[drive] = Drive(drive, log, "unchanged")
-                _relocate(store, drive, known[drive]["log"], log)
+                map_store.relocate(store, drive, log)
             else:
-                wanted.append(about)
-        each, at_once = _shares(workers, options.jobs, len(wanted))
+                wanted.append(record)
+        each, concurrency = _divide_cores(workers, options.jobs, len(wanted))
         execution.progress("drives", len(done), len(paths))
         keep = options.join or options.keep_cache
         like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, keep)
-        tasks = _tasks(store, wanted, like, urls, longest_first=at_once > 1)
+        tasks = _tasks(store, wanted, like, urls, longest_first=concurrency > 1)
         places = None
         if options.join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
-            places = aside.submit(load_places, like.library, pipeline, execution)
+            places = background.submit(load_places, like.library, pipeline, execution)
         try:
-            for ended in computed(workers, tasks, options):
-                found = done[ended[0].drive] = _put_in(store, *ended)
+            for ended in as_completed(workers, tasks, options):
+                found = done[ended[0].drive] = _publish(store, *ended)
                 if found.state == "computed" and not (keep and shutil.disk_usage(store.root).free > _FREE_BYTES):
                     shutil.rmtree(
                         _cache(store, found.drive), ignore_errors=True
                     )  # else for another attempt or the join
-                options.tell(found)
+                options.on_drive(found)
                 execution.progress("drives", len(done), len(paths))
         finally:  # of a batch that was interrupted, too
-            unsaid = _write_failures(store, done)
+            failures_warning = _write_failures(store, done)
         joined, join_error = None, ""
         if options.join:
-            helpers = workers.helpers(execution.threads)
-            joined, join_error = _join(store, pipeline, execution, helpers, places and places.result, urls)
+            executor_for = workers.executor_for(execution.threads)
+            joined, join_error = _join(store, pipeline, execution, executor_for, places and places.result, urls)
         if not options.keep_cache and not join_error:  # another join would need it
             _clear_caches(store)
-    fate = [done[drive] for drive in drives]
+    outcomes = [done[drive] for drive in drives]
     return {
         "map": str(root),
         "library": digest,
         "engine": options.engine,
-        "jobs": at_once,
+        "jobs": concurrency,
         "threads_per_job": each,
         "seconds": round(time.perf_counter() - began, 3),
-        "failed": sum(one.state == "failed" for one in fate),
-        "drives": [asdict(one) for one in fate],
+        "failed": sum(one.state == "failed" for one in outcomes),
+        "drives": [asdict(one) for one in outcomes],
         "joined": joined,
         "join_error": join_error,
         "warnings": [
-            *unsaid,
-            *([] if joined else left_out(store)),
-            *_same(fate, inputs),
-            *_mixed([about for drive, about in known.items() if drive not in done], alike),
+            *failures_warning,
+            *([] if joined else damage_warnings(store)),
+            *_duplicate_recordings(outcomes, inputs),
+            *_other_versions([record for drive, record in known.items() if drive not in done], common),
         ],
     }
 
@@ -183,26 +183,26 @@ def _write_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
     return []
 
 
-def _same(fate: Sequence[Drive], inputs: Sequence[dict[str, str]]) -> list[str]:
-    """A warning for each recording that is in under several names: closures between them say nothing."""
-    alike: dict[tuple[str, ...], list[Drive]] = {}
-    for one, content in zip(fate, inputs, strict=True):
+def _duplicate_recordings(outcomes: Sequence[Drive], inputs: Sequence[dict[str, str]]) -> list[str]:
+    """A warning for each recording that the map has under several names: closures between them mean nothing."""
+    common: dict[tuple[str, ...], list[Drive]] = {}
+    for one, content in zip(outcomes, inputs, strict=True):
         if content and one.state != "failed" and "://" not in one.log:  # of those the bytes are not known
-            alike.setdefault(tuple(sorted(content.values())), []).append(one)
+            common.setdefault(tuple(sorted(content.values())), []).append(one)
     return [
         f"{these[0].log} and {these[1].log} are the same recording, byte for byte: it is in the map as "
         f"{' and '.join(one.drive for one in these)}."
-        for these in alike.values()
+        for these in common.values()
         if len(these) > 1
     ]
 
 
-def _mixed(others: Sequence[dict[str, Any]], alike: dict[str, Any]) -> list[str]:
+def _other_versions(others: Sequence[dict[str, Any]], common: dict[str, Any]) -> list[str]:
     """Warnings where drives that are no part of this batch were made with other settings, or by another vplog."""
-    made = [about for about in others if ALONE not in about]
+    made = [record for record in others if PLACES_ONLY not in record]
     warnings = []
     for what, names in (("Other settings", ["settings"]), ("Another version of vplog or its packages", _CODE)):
-        other = [about["log"] for about in made if any(about.get(name) != alike[name] for name in names)]
+        other = [record["log"] for record in made if any(record.get(name) != common[name] for name in names)]
         if other:
             warnings.append(
                 f"{what} made {len(other)} of the drives that were in the map before. Give their logs too, to compute "
@@ -212,7 +212,7 @@ def _mixed(others: Sequence[dict[str, Any]], alike: dict[str, Any]) -> list[str]
 
 
 def _cache(store: Store, drive: str) -> Path:
-    """Where a drive's stages are kept until it is in the map."""
+    """Stage cache of a drive, until it is in the map."""
     return store.root / ".cache" / folder_name(drive)
 
 
@@ -222,12 +222,6 @@ def _clear_caches(store: Store) -> None:
         shutil.rmtree(_cache(store, drive), ignore_errors=True)
     with suppress(OSError):  # not empty: what failed goes on there
         _cache(store, "").parent.rmdir()
-
-
-def _relocate(store: Store, drive: str, before: str, log: str) -> None:
-    """Follow a log that was moved: joins and other libraries may need it."""
-    if before != log:
-        map_store.relocate(store, drive, log)
 
 
 def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:
@@ -245,15 +239,15 @@ def _tasks(
 
     With `longest_first` none of the long drives is begun when all others are done.
     """
-    sizes = {about["drive"]: _log_bytes(urls[about["drive"]]) for about in wanted}
-    order = sorted(wanted, key=lambda about: -sizes[about["drive"]]) if longest_first else wanted
+    sizes = {record["drive"]: _log_bytes(urls[record["drive"]]) for record in wanted}
+    order = sorted(wanted, key=lambda record: -sizes[record["drive"]]) if longest_first else wanted
     return [
         replace(
-            like, drive=about["drive"], log=urls[about["drive"]], about=about, cache=_cache(store, about["drive"]),
+            like, drive=record["drive"], log=urls[record["drive"]], record=record, cache=_cache(store, record["drive"]),
             folder=like.folder / f"{os.getpid()}-{number}",
-            in_parts=len(wanted) == 1 or 2 * sizes[about["drive"]] > sum(sizes.values()),
+            in_parts=len(wanted) == 1 or 2 * sizes[record["drive"]] > sum(sizes.values()),
         )
-        for number, about in enumerate(order)
+        for number, record in enumerate(order)
     ]  # fmt: skip
 
 
@@ -262,11 +256,11 @@ def _log_bytes(url: str) -> int:
     path = located(url)
     try:
         return 0 if isinstance(path, RemotePath) else bytes_of(path)
-    except OSError:  # its own run says why
+    except OSError:  # its own run raises it
         return 0
 
 
-def _shares(workers: Engine, jobs: int | None, drives: int) -> tuple[int, int]:
+def _divide_cores(workers: Engine, jobs: int | None, drives: int) -> tuple[int, int]:
     """Threads of each drive, and drives at once.
 
     On this machine each has all threads, which the system shares out: drives are not equally long, and the last has the
@@ -274,12 +268,12 @@ def _shares(workers: Engine, jobs: int | None, drives: int) -> tuple[int, int]:
     """
     if isinstance(workers, LocalEngine):
         return workers.cores, jobs or 1
-    wanted = min(jobs or max(workers.at_once(1), 1), max(drives, 1))
-    each = min(max(workers.cores // wanted, 1), workers.widest)
-    return each, jobs or workers.at_once(each)
+    wanted = min(jobs or max(workers.concurrency(1), 1), max(drives, 1))
+    each = min(max(workers.cores // wanted, 1), workers.max_cores)
+    return each, jobs or workers.concurrency(each)
 
 
-def _place(path: Path) -> str:
+def _absolute_log(path: Path) -> str:
     """Absolute path of a log as it was named, links not resolved, or its URL with the query."""
     if isinstance(path, RemotePath):
         return path.url
@@ -291,13 +285,13 @@ def _place(path: Path) -> str:
 
 def _name(path: Path) -> str:
     """The name of a log: its file without the ending, or its folder."""
-    with suppress(OSError):  # its own run says why it cannot be read
+    with suppress(OSError):  # its own run raises it
         if path.is_dir():
             return path.name if path.name not in ("", "..") else path.resolve().name
     return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
 
 
-def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, Any]:
+def _common_record(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, Any]:
     """Fields of drive.json that are the same for each drive of a batch. Every setting counts, as every table names them
     all; the place of a log does not: a map may move with its logs."""
     return {
@@ -307,7 +301,7 @@ def _alike(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, A
     }
 
 
-def _put_in(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
+def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
     """Rename a finished drive in."""
     error = outcome.error
     if not error:
@@ -319,4 +313,6 @@ def _put_in(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
         shutil.rmtree(task.folder, ignore_errors=True)
     figures = {name: value for name, value in vars(outcome).items() if name in Drive.__dataclass_fields__}
     state = "failed" if error else "computed"
-    return Drive(**{**figures, "error": error}, drive=task.drive, log=task.about["log"], state=state, attempts=attempts)
+    return Drive(
+        **{**figures, "error": error}, drive=task.drive, log=task.record["log"], state=state, attempts=attempts
+    )

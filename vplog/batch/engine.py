@@ -1,4 +1,4 @@
-"""Where the drives of a batch are computed: on this machine, each in a process of its own, or over a Ray cluster."""
+"""Engines of a batch: processes on this machine, one a drive, or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _KILLED = "Its process was killed, as for want of memory. Make room or use fewer
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Who computes the drives of a batch, and what is done beside. The map depends on `join` alone."""
+    """How the drives of a batch are computed. The content of the map depends on `join` alone."""
 
     jobs: int | None = None
     """Drives at once: one on this machine where not given, over Ray as many as it has cores for."""
@@ -38,17 +38,17 @@ class BatchOptions:
     """HOST:PORT of a Ray cluster; None: one of this machine for the time of the batch."""
     retries: int = RETRIES
     processes: OwnProcesses | None = None
-    """Those of this machine that the caller has begun; else there is one more than `jobs`."""
+    """Pool of processes on this machine that the caller has started; else one of `jobs` + 1."""
     join: bool = True
     """Whether closures join what the map has at the end."""
     keep_cache: bool = False
     """Whether results of stages stay in MAP/.cache, so that other settings do not need the images again."""
-    tell: Callable[[Drive], None] = lambda _: None
+    on_drive: Callable[[Drive], None] = lambda _: None
     """Called with each drive as it ends."""
 
 
 @contextmanager
-def opened(options: BatchOptions, threads: int, folder: Path | None = None) -> Iterator[Engine]:
+def open_engine(options: BatchOptions, threads: int, folder: Path | None = None) -> Iterator[Engine]:
     """The engine of these options, for a writer of a map with this folder; what it started ends with the block. Raises
     SettingsError where there is no such engine."""
     if options.engine not in ENGINES:
@@ -66,8 +66,8 @@ def opened(options: BatchOptions, threads: int, folder: Path | None = None) -> I
         yield LocalEngine(own, threads)
 
 
-def computed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -> Iterator[tuple[Task, Outcome, int]]:
-    """Every drive when it is finished or given up, its outcome, and at which attempt.
+def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -> Iterator[tuple[Task, Outcome, int]]:
+    """Yield every drive when it is finished or given up, its outcome, and the number of attempts.
 
     One that died is tried again when the others have had their turn: whatever it lacked may be there then.
     """
@@ -76,30 +76,30 @@ def computed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -> It
     running: dict[Future[Outcome], tuple[Task, int]] = {}
     while waiting or running:
         # without `jobs` one stands in line behind each, so that no core waits for this loop
-        while waiting and len(running) < (jobs or 2 * engine.at_once(waiting[0][0].threads)):
+        while waiting and len(running) < (jobs or 2 * engine.concurrency(waiting[0][0].threads)):
             task, attempt = waiting.popleft()
             running[engine.start(task)] = task, attempt
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             task, attempt = running.pop(future)
-            outcome = _brought(engine, task, future)
-            if outcome.may_pass and attempt <= options.retries:
+            outcome = _outcome_of(engine, task, future)
+            if outcome.retryable and attempt <= options.retries:
                 waiting.append((task, attempt + 1))
             else:
                 yield task, outcome, attempt
 
 
-def _brought(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
-    """What became of an attempt, its run folder at hand."""
+def _outcome_of(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
+    """The outcome of an attempt, its run folder fetched."""
     try:
         outcome = future.result()
         if not outcome.error:
-            engine.take(task, outcome)
+            engine.fetch(task, outcome)
     except ProcessExpired:
-        return Outcome(_KILLED, may_pass=True)
+        return Outcome(_KILLED, retryable=True)
     except BrokenExecutor as error:
-        return Outcome(str(error), may_pass=True)
+        return Outcome(str(error), retryable=True)
     except OSError as error:  # no process more, or no room for what a machine brings
-        return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", may_pass=True)
+        return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", retryable=True)
     except VplogError as error:
         return Outcome(str(error))
     except Exception as error:  # what a worker cannot even begin with
@@ -113,16 +113,16 @@ class LocalEngine:
     executor = None
 
     def __init__(self, processes: OwnProcesses, threads: int) -> None:
-        self._processes, self.cores, self.widest = processes, threads, threads
+        self._processes, self.cores, self.max_cores = processes, threads, threads
 
-    def at_once(self, threads: int) -> int:
+    def concurrency(self, threads: int) -> int:
         return 1
 
     def start(self, task: Task) -> Future[Outcome]:
         return self._processes.submit(compute_drive, task)
 
-    def helpers(self, threads: int) -> Executor | None:
+    def executor_for(self, threads: int) -> Executor | None:
         """None: this process has the threads itself."""
 
-    def take(self, task: Task, outcome: Outcome) -> None:
+    def fetch(self, task: Task, outcome: Outcome) -> None:
         """No-op: the folder is local."""

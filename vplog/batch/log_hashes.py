@@ -10,7 +10,7 @@ from threading import Event
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs as all_logs
-from vplog.cache.input_hashes import bytes_of, changed_s, hash_inputs, look_of
+from vplog.cache.input_hashes import bytes_of, changed_s, hash_inputs, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.remote_path import RemotePath
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from vplog.logs import TopicChoice
 
 NAME = ".inputs.json"
-"""In the map: hidden, as it tells of the logs on this machine and nothing of the map."""
+"""Name of the record in the map: hidden, as it concerns the logs on this machine, not the map."""
 _SETTLED_S = 3.0
 """A file written this short a time ago could be written again without a change of its times: some file systems count
 them in steps of two seconds."""
 _MOST_BYTES = 10**9
 """Longest record that is read: a million logs of several files."""
 
-_TELL_EVERY_S = 0.2
+_PROGRESS_EVERY_S = 0.2
 """Interval of progress."""
 
 Hashes = dict[str, str]
@@ -54,8 +54,8 @@ def known_hashes(
     def one(path: Path, number: int) -> Hashes:
         if isinstance(path, RemotePath):
             return hash_inputs(path)
-        name, look = str(path.absolute()), look_of(path)
-        if name in known and known[name]["look"] == look:
+        name, stat = str(path.absolute()), stat_signature(path)
+        if name in known and known[name]["look"] == stat:
             current[name] = known[name]
             return known[name]["hashes"]
 
@@ -68,8 +68,8 @@ def known_hashes(
             all_logs.check(path)  # a folder of other things may hold anything
         began, total[number] = time.time(), total[number] + bytes_of(path)
         hashes = hash_inputs(path, read)
-        if look_of(path) == look and changed_s(path) < began - _SETTLED_S:
-            current[name] = {"look": look, "hashes": hashes}
+        if stat_signature(path) == stat and changed_s(path) < began - _SETTLED_S:
+            current[name] = {"look": stat, "hashes": hashes}
         return hashes
 
     def of_log(path: Path, number: int) -> Hashes | str:
@@ -84,7 +84,7 @@ def known_hashes(
     with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, path, number) for number, path in enumerate(logs.values())]
         try:
-            while wait(waiting, _TELL_EVERY_S).not_done:
+            while wait(waiting, _PROGRESS_EVERY_S).not_done:
                 execution.progress("check (MB)", sum(done) // 10**6, sum(total) // 10**6)
         except BaseException:
             stop.set()
@@ -96,13 +96,13 @@ def known_hashes(
     if any(known.get(name) != about for name, about in current.items()):
         every = {name: about for name, about in sorted({**known, **current}.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
         with suppress(ResultError):
-            write_run_json(record, every, checksum=True)
+            write_run_json(record, every)
     errors = {log: answer for log, answer in answers.items() if isinstance(answer, str)}
     return [{} if isinstance(answer, str) else answer for answer in answers.values()], errors
 
 
 def _read(record: Path) -> dict[str, dict[str, Any]]:
-    """By log, its `look` and its `hashes`; nothing where there is no such file, or another thing."""
+    """By log, its `stat` and its `hashes`; nothing where there is no such file, or another thing."""
     try:
         known = read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {}
     except (OSError, ResultError):

@@ -36,7 +36,7 @@ def map_library(
     Raises LibraryError where another one is given, or where the settings describe places otherwise.
     """
     begun = (store.root / "map.json").exists()
-    known = store.sound_head().library if begun else None
+    known = store.recovered_head().library if begun else None
     if known is not None and not store.library(known).is_dir():
         raise LibraryError(
             f"{store} lacks its library {known[:12]}. Copy it back, or make another map with `vplog batch`."
@@ -71,8 +71,8 @@ def map_library(
 
 
 def _decodable(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
-    """The first logs that have a frame that decodes, as many as a library has references. The others' own runs say what
-    is wrong with them. Raises the error of the first where there is none."""
+    """The first logs that have a frame that decodes, as many as a library has references. Errors of the others are
+    raised by their own runs. Raises the error of the first where there is none."""
     sound, first = [], None
     for path in paths:
         try:

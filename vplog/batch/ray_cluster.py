@@ -21,21 +21,21 @@ from vplog.storage.scratch import scratch
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_CONNECT_S = 5.0
-"""Until a machine that does not take a connection counts as away: TCP has then tried three times."""
-_ANSWER_S = 30.0
-"""Until a cluster that says nothing counts as none. Ray's own tools wait for minutes; a loaded head needs seconds."""
+_CONNECT_TIMEOUT_S = 5.0
+"""Time after which a machine that does not take a connection counts as unreachable: TCP has then tried three times."""
+_ANSWER_TIMEOUT_S = 30.0
+"""Limit of the health check of a cluster. Ray's own tools wait for minutes; a loaded head needs seconds."""
 _LOST_S = 30.0
-"""Until a head that takes no connections counts as lost. Ray ends this process after twice that."""
+"""Time after which a head that takes no connections counts as lost. Ray ends this process after twice that."""
 _RAY_WAITS = "RAY_gcs_rpc_server_reconnect_timeout_s"
 """Environment variable: for how long Ray waits, as for a head that starts again by itself."""
 _ENVIRONMENT = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Of workers, as cli.py has it for the batch itself: another number of BLAS threads could give other last bits."""
+"""Environment of workers, as cli.py has it for the batch: another number of BLAS threads could give other last bits."""
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-"""Ray reports nothing to its makers, and warns of no change to come, unless the user's environment says otherwise."""
+"""Defaults of the environment: no usage reports to Ray's makers, and no deprecation warning."""
 _TOKEN = secrets.token_hex(32)
-"""Of a cluster of our own, where the user has none: Ray would make one and leave it in ~/.ray. It keeps the first that
-a process has used, so that there is one for all clusters of this one."""
+"""Authentication of our own clusters where the user has no token: Ray would write one to ~/.ray. Ray uses the first of
+a process throughout, so all clusters of this process share it."""
 _LONGEST_PLACE = 40
 """Characters of a folder that Ray can put its sockets into: their names add up to 66, and the system takes 107."""
 _OTHER_PLACE = "/tmp/ray"  # noqa: S108
@@ -71,7 +71,7 @@ class Head:
         self._address, self._futures, self.is_lost = address, set[Future[Any]](), False
 
     def future(self) -> Future[Any]:
-        """A new one, which may fail with SettingsError."""
+        """A new future, which fails with SettingsError where the head is lost."""
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()
         self._futures.add(future)
@@ -84,15 +84,15 @@ class Head:
             raise self._error()
 
     def watch(self, ended: threading.Event) -> None:
-        """Until the end. A head that was never reached this way is not missed."""
-        heard, place = float("inf"), self._address.rpartition(":")
+        """Probe the head until `ended`. One that was never reached this way does not count as lost."""
+        last_contact, place = float("inf"), self._address.rpartition(":")
         wait = os.environ.get(_RAY_WAITS, "")
         patience_s = max(_LOST_S, int(wait) / 2 if wait.isdecimal() else 0)
         while not ended.wait(_LOST_S / 10):
             with suppress(OSError, ValueError):
-                socket.create_connection((place[0].strip("[]"), int(place[2])), _CONNECT_S).close()
-                heard = time.monotonic()
-            self.is_lost = self.is_lost or time.monotonic() - heard > patience_s
+                socket.create_connection((place[0].strip("[]"), int(place[2])), _CONNECT_TIMEOUT_S).close()
+                last_contact = time.monotonic()
+            self.is_lost = self.is_lost or time.monotonic() - last_contact > patience_s
             for future in list(self._futures) if self.is_lost else ():
                 with suppress(InvalidStateError):  # it has just ended
                     future.set_exception(self._error())
@@ -106,7 +106,7 @@ class Head:
 
 @contextmanager
 def watched_head(ray: Any) -> Iterator[Head]:
-    """That of the cluster that this process is connected to."""
+    """The head of the cluster that this process is connected to."""
     head, ended = Head(ray.get_runtime_context().gcs_address), threading.Event()
     watch = threading.Thread(target=head.watch, args=(ended,), daemon=True)
     watch.start()
@@ -125,7 +125,7 @@ def _imported() -> Any:
         import ray._private.worker as session
     except ImportError:
         raise SettingsError("--engine ray needs Ray. Install it: pip install 'vplog[ray]'") from None
-    setattr(session, "_worker_logs_enabled", False)  # noqa: B010 (what machines say would go to our stdout; futures tell)
+    setattr(session, "_worker_logs_enabled", False)  # noqa: B010 (workers' logs would go to our stdout)
     return ray
 
 
@@ -150,7 +150,7 @@ def _has_token() -> bool:
 
 
 def _check_answers(address: str) -> None:
-    """Ray by itself would wait for minutes, and then end this process. Raises SettingsError."""
+    """Raises SettingsError where no cluster answers: Ray would wait for minutes, and then end this process."""
     if address == "auto":
         return
     host, _, port = address.rpartition(":")
@@ -160,8 +160,9 @@ def _check_answers(address: str) -> None:
         )
     command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--skip-version-check"]
     try:
-        socket.create_connection((host, int(port)), _CONNECT_S).close()
-        done = subprocess.run([*command, "--address", address], capture_output=True, timeout=_ANSWER_S, check=False)  # noqa: S603
+        socket.create_connection((host, int(port)), _CONNECT_TIMEOUT_S).close()
+        health = [*command, "--address", address]
+        done = subprocess.run(health, capture_output=True, timeout=_ANSWER_TIMEOUT_S, check=False)  # noqa: S603
         if b"authentication token" in done.stderr.lower():
             raise SettingsError(
                 f"The Ray cluster at {address} wants its token. Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to it, or "

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 _OTHER = "{} has another vplog, or other packages, than the machine of the batch. Install the same there."
 _PROBE_S = 60.0
-"""Until the machines of a cluster have told what they run; a slower one is asked again with each drive."""
+"""Limit of a probe of the machines' versions; a slower machine is checked with each drive."""
 _DRIVE_BYTES = 2**30
 """Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
 _FETCH_S = 5.0
-"""Until it is asked again whether the cluster is there from which a piece is to come."""
+"""Interval at which the cluster is checked while a piece is fetched from it."""
 
 
 @contextmanager
@@ -53,7 +53,7 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
         engine = RayEngine(ray, head, address is None)
         engine.check_nodes()
         if folder is not None:
-            engine.look_for(folder)
+            engine.probe_shared_disk(folder)
         yield engine
 
 
@@ -74,11 +74,11 @@ class RayEngine:
         return max(int(sum(self._of_nodes("CPU"))), 1)
 
     @property
-    def widest(self) -> int:
+    def max_cores(self) -> int:
         """Cores of the largest machine: one drive runs on one."""
         return max(int(max(self._of_nodes("CPU"))), 1)
 
-    def at_once(self, threads: int) -> int:
+    def concurrency(self, threads: int) -> int:
         """Drives with so many threads each that keep it busy."""
         return max(sum(int(cores) // threads for cores in self._of_nodes("CPU")), 1)
 
@@ -89,9 +89,9 @@ class RayEngine:
             self._library = task.library, self._ray.put(packed(task.library))
         memory = min(_DRIVE_BYTES, int(max(self._of_nodes("memory"))))
         drive = self._drive.options(num_cpus=task.threads, memory=memory, name=f"vplog {task.drive}")
-        if self._is_ours:  # nobody else's tasks are there, and the system shares out the cores, the last drive has all
-            task = replace(task, threads=self.widest)
-        parts = self._parts(task) if task.in_parts and self.cores > self.widest else []
+        if self._is_ours:  # no other tasks run there: the system shares the cores, and the last drive has all
+            task = replace(task, threads=self.max_cores)
+        parts = self._parts(task) if task.in_parts and self.cores > self.max_cores else []
         return self.executor.follow(drive.remote(compute_remote_drive, task, self._library[1], parts))
 
     def _parts(self, task: Task) -> list[tuple[Part, Any]]:
@@ -99,29 +99,29 @@ class RayEngine:
         try:
             found = parts_of(located(task.log), task.pipeline, task.topics, task.cache)
         except (VplogError, OSError):
-            return []  # the drive's own task says why
+            return []  # the drive's own task raises it
         missing, wanted = found if task.cache is None else missing_parts(task.cache, found), made_by()
         return [(part, self._part.remote(part, wanted)) for part in missing]
 
-    def take(self, task: Task, outcome: Outcome) -> None:
+    def fetch(self, task: Task, outcome: Outcome) -> None:
         """Write the run folder from its pieces. Raises BrokenExecutor where they are lost, and ResultError."""
         remote = cast("RemoteOutcome", outcome)
         places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
         for folder, files in places:
             for name, parts in files:
-                write_pieces(folder, name, map(self._fetched, parts))
+                write_pieces(folder, name, map(self._get, parts))
 
-    def helpers(self, threads: int) -> Executor | None:
+    def executor_for(self, threads: int) -> Executor | None:
         """Tasks over all machines, if each of them sees the map."""
         if not self._shares_disk or self._head.is_lost:
             return None
-        return RayExecutor(self._ray, self._head, min(threads, self.widest))
+        return RayExecutor(self._ray, self._head, min(threads, self.max_cores))
 
-    def look_for(self, folder: Path) -> None:
+    def probe_shared_disk(self, folder: Path) -> None:
         """Whether all machines see a folder of this one."""
         sign, content = folder / "visible", secrets.token_hex(16)
         sign.write_text(content, encoding="utf-8")
-        answers = self._on_every_node(is_here, str(sign), content)
+        answers = self._on_every_node(sees_file, str(sign), content)
         self._shares_disk = all(self._answer(answer) is True for answer in answers)
         sign.unlink()
 
@@ -161,7 +161,7 @@ class RayEngine:
         except self._ray.exceptions.RayError as error:
             return error
 
-    def _fetched(self, part: Any) -> Any:
+    def _get(self, part: Any) -> Any:
         while True:
             try:
                 return self._ray.get(part, timeout=_FETCH_S)
@@ -227,7 +227,7 @@ class RemoteOutcome(Outcome):
     files: Files = ()
     """Name of every file of the run folder, drive.json last, and its pieces in the object store."""
     cache: Files = ()
-    """Those of the cache of stages, where it is wanted and the batch cannot see it."""
+    """Files of the stage cache, where it is wanted and the batch does not share the disk."""
 
 
 def call(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -240,7 +240,7 @@ def about_node() -> tuple[str, dict[str, Any]]:
     return node_name(), made_by()
 
 
-def is_here(file: str, content: str) -> bool:
+def sees_file(file: str, content: str) -> bool:
     """Whether this machine sees a file that the batch has written."""
     try:
         return Path(file).read_text(encoding="utf-8") == content
@@ -271,11 +271,11 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
     from ray import exceptions
 
     where = node_name()
-    if any(task.about[name] != value for name, value in made_by().items()):
+    if any(task.record[name] != value for name, value in made_by().items()):
         return RemoteOutcome(_OTHER.format(where), worker=where)
     try:
         with scratch("run") as folder:
-            place, made = unpacked(library, f"library-{task.about['library']}"), folder / "run"
+            place, made = unpacked(library, f"library-{task.record['library']}"), folder / "run"
             cache = task.cache or folder / "cache"
             for part, data in parts:
                 with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here
@@ -284,24 +284,24 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
             ended = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
             if outcome.error:
                 return RemoteOutcome(**ended)
-            _name_library(made, task.library)
-            stages = _given_back(cache) if task.keep_cache and task.cache is None else ()
-            return RemoteOutcome(**ended, files=_given_back(made), cache=stages)
+            _set_library_path(made, task.library)
+            stages = _put_files(cache) if task.keep_cache and task.cache is None else ()
+            return RemoteOutcome(**ended, files=_put_files(made), cache=stages)
     except VplogError as error:
         return RemoteOutcome(str(error), worker=where)
     except OSError as error:
         why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
-        return RemoteOutcome(why, may_pass=True, worker=where)
+        return RemoteOutcome(why, retryable=True, worker=where)
 
 
-def _name_library(made: Path, library: Path) -> None:
+def _set_library_path(made: Path, library: Path) -> None:
     """Let run.json of a finished run name the map's library, not this machine's copy."""
     account = run_record.read_run_json(made / "run.json")
     account["library"]["from"] = library_of(library)
     run_record.write_run_json(made / "run.json", account)
 
 
-def _given_back(folder: Path) -> Files:
+def _put_files(folder: Path) -> Files:
     """The files of a folder as pieces in the object store, drive.json last."""
     import ray
 

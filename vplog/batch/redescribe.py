@@ -14,10 +14,10 @@ from vplog.batch.engine import BatchOptions
 from vplog.batch.worker import Drive
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.import_places import ALONE
-from vplog.maps.merge import in_order
+from vplog.maps.import_places import PLACES_ONLY
+from vplog.maps.merge import natural_order
 from vplog.maps.storage import map_store
-from vplog.maps.storage.contents import without_damaged
+from vplog.maps.storage.contents import skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
@@ -47,15 +47,15 @@ def redescribe_map(
         raise SettingsError(f"{root} is given as its own target. Choose another map with -o.")
     with map_store.reading(root) as store:
         head = store.head()
-        drives, topics = without_damaged(store, lambda: _drives_of(store))
+        drives, topics = skip_damaged(store, lambda: _drives_of(store))
         damaged = {drive: Drive(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
         _bring_caches(store.root, target)
-    fate, missing, joined, join_error = [], damaged, None, ""
+    outcomes, missing, joined, join_error = [], damaged, None, ""
     groups: dict[str, list[str]] = {}
-    for drive in in_order(drives):
+    for drive in natural_order(drives):
         log = drives[drive]["log"]
         try:
-            if ALONE in drives[drive]:
+            if PLACES_ONLY in drives[drive]:
                 raise LogError(f"Only its places are known. Add its log to the map first: vplog batch LOG -o {root}")
             stored_log(
                 log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
@@ -73,9 +73,9 @@ def redescribe_map(
             last = replace(options or BatchOptions(), join=number + 1 == len(groups))
             found = run_batch(paths, target, pipeline, folder, choice, execution, last)
             joined, join_error = found["joined"], found["join_error"]
-            fate += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
+            outcomes += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
         digest = read_library_record(folder)["hash"]
-    fate += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
+    outcomes += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
     if missing and groups:  # else there is no map yet
         with map_store.writing(target) as store:
             write_failures(store, {drive: lost for drive, lost in missing.items() if drive not in store.drives()})
@@ -83,8 +83,8 @@ def redescribe_map(
         "map": str(target),
         "from": str(root),
         "library": digest,
-        "failed": sum(one["state"] == "failed" for one in fate),
-        "drives": fate,
+        "failed": sum(one["state"] == "failed" for one in outcomes),
+        "drives": outcomes,
         "joined": joined,
         "join_error": join_error,
     }
@@ -92,7 +92,7 @@ def redescribe_map(
 
 def _drives_of(store: Store) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     """drive.json and the topics of each drive."""
-    _, drives = map_store.one_library(store)
+    _, drives = map_store.common_library(store)
     topics = {}
     for drive in drives:
         record = store.file(drive, "run.json")

@@ -9,15 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vplog.batch.picture_drive import pictures_of, write_pictures
+from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.timing import peak_memory_mb
 from vplog.maps.storage import layout
-from vplog.pipeline import CacheOptions, Pipeline
+from vplog.pipeline import Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.results import run_record
 from vplog.run import provenance
+from vplog.run.run_folder import CacheOptions
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
@@ -32,17 +35,17 @@ class Task:
 
     drive: str
     log: str
-    """Path or URL of the log, with the query that `about` omits."""
+    """Path or URL of the log, with the query that `record` omits."""
     folder: Path
-    """Where the run folder is made; it is the map's when it is renamed in."""
+    """Folder in which the run is made; it is renamed into the map."""
     library: Path
     pipeline: Pipeline
     topics: TopicChoice
     threads: int
-    about: dict[str, Any]
+    record: dict[str, Any]
     """drive.json: what the drive is made from."""
     cache: Path | None = None
-    """Where what an attempt had done stays when it ends before its time; None to keep nothing."""
+    """Stage cache of the drive, for another attempt; None for no cache."""
     keep_cache: bool = False
     """Whether it stays of a drive that is finished, too."""
     in_parts: bool = False
@@ -55,7 +58,7 @@ class Outcome:
 
     error: str = ""
     """One line; none where all went well."""
-    may_pass: bool = False
+    retryable: bool = False
     """Whether the cause of the error may be gone at another attempt."""
     seconds: float = 0.0
     """Wall time in the worker."""
@@ -64,16 +67,16 @@ class Outcome:
     peak_memory_mb: float = 0.0
     """Largest resident memory of the worker, in MB (10^6 bytes); 0 where unknown."""
     keyframes: int = 0
-    """Of the drive."""
+    """Keyframes of the drive."""
     accepted: int = 0
     """Closures within it."""
     warnings: tuple[str, ...] = ()
-    """Those of the run, as losses of its log."""
+    """Warnings of the run."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What became of one log in a batch; `seconds` to `warnings` as in the Outcome of the last attempt."""
+    """State of one log in a batch; `seconds` to `warnings` as in the Outcome of the last attempt."""
 
     drive: str
     log: str
@@ -97,33 +100,42 @@ def made_by() -> dict[str, Any]:
 
 def compute_drive(task: Task) -> Outcome:
     """Make the run folder of a drive, drive.json last; why not, in one line, where that fails."""
-    began, error, may_pass, peak, found = time.perf_counter(), "", False, 0.0, dict[str, Any]()
+    began, error, retryable, peak, found = time.perf_counter(), "", False, 0.0, dict[str, Any]()
     try:
         log = located(task.log)
         with limited(task.threads):
-            done = run_alone(
-                log, task.folder, task.pipeline, task.library, task.topics, Execution(task.threads),
-                CacheOptions(task.cache, use=task.cache is not None),
-            )  # fmt: skip
-        peak = done.record["totals"]["peak_memory_mb"]
-        if any(task.about["inputs"].get(name) != text for name, text in done.record["inputs"].items()):
-            error = f"{task.about['log']} changed while it was read. Run again when it is complete."
+            record, own_name, drive = _compute(task, log)
+        peak = record.get("totals", {}).get("peak_memory_mb", 0.0)
+        if any(task.record["inputs"].get(name) != text for name, text in record["inputs"].items()):
+            error = f"{task.record['log']} changed while it was read. Run again when it is complete."
         else:
-            if done.keyframes.drive != task.drive:
-                layout.name_keyframes(task.folder / "keyframes.parquet", task.drive)
-            run_record.write_run_json(task.folder / "drive.json", task.about)
-            counts = done.record["counts"]
+            if own_name != task.drive:
+                layout.set_drive_id(task.folder / "keyframes.parquet", task.drive)
+            run_record.write_run_json(task.folder / "drive.json", drive)
+            counts = record["counts"]
             found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
-            found["warnings"] = tuple(done.record["warnings"])
+            found["warnings"] = tuple(record["warnings"])
     except VplogError as problem:
         error = str(problem)
     except MemoryError:
-        error, may_pass = "Out of memory. Use fewer --jobs, or a machine with more.", True
+        error, retryable = "Out of memory. Use fewer --jobs, or a machine with more.", True
     except OSError as problem:
         # another attempt may be on another machine, and finds what this one had done
-        error, may_pass = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True
+        error, retryable = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True
     except Exception as problem:  # a fault of ours in one drive must not stop the others
         text = " ".join(str(problem).split())[:200]
         error = f"Internal error: {type(problem).__name__}: {text}. `vplog run LOG --debug` shows where."
     seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
-    return Outcome(error, may_pass, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
+    return Outcome(error, retryable, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
+
+
+def _compute(task: Task, log: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """Make the run folder of a drive: its run.json, the name of the drive in its tables, and its drive.json."""
+    execution = Execution(task.threads)
+    if (pictures := pictures_of(log, task.topics)) is not None:
+        about = {"log": task.record["log"], "inputs": hash_inputs(log), "topics": task.topics.model_dump(mode="json")}
+        record = write_pictures(task.folder, task.drive, pictures, task.library, task.pipeline, about, execution)
+        return record, task.drive, {**task.record, layout.PICTURES: True}
+    options = CacheOptions(task.cache, use=task.cache is not None)
+    done = run_alone(log, task.folder, task.pipeline, task.library, task.topics, execution, options)
+    return done.record, done.keyframes.drive, task.record

@@ -6,10 +6,9 @@ Every method gets the same features, the same reference images and the same trut
 from __future__ import annotations
 
 import os
-import re
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +16,18 @@ import numpy as np
 
 import vplog
 from vplog import logs
+from vplog.benchmark.answers import answers_table, file_stem, write_answers
+from vplog.benchmark.compare_figures import FIGURES, Figures
+from vplog.benchmark.feature_cache import CacheChoice, FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
+from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal
 from vplog.errors import SettingsError, TruthError
-from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
-from vplog.evaluate.retrieval import average_precision, precision_recall, recall_at
+from vplog.evaluate.place_truth import TruthChoice, no_truth, open_truth
 from vplog.execution.execution import Execution, logged_warnings
-from vplog.features.store import FeatureStore
-from vplog.figures.canvas import as_text, drawn
-from vplog.places.library_files import load_references, references_hash
+from vplog.logs import EVERY_IMAGE
+from vplog.places.library_files import check_descriptors, load_references, references_hash
 from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
@@ -34,28 +35,28 @@ from vplog.results.staging import staged
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
+
+    import pyarrow as pa
 
     from vplog.data import Float32s, Ints, Reference
-    from vplog.evaluate.retrieval import Ranks, Reliability
+    from vplog.evaluate.pairs import Pairs
+    from vplog.evaluate.place_truth import PlaceTruth
+    from vplog.evaluate.retrieval import Ranks
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
 
 
-_DEEPEST_RANK = 25
-"""Last rank of the curves, as usual for recall@N in place recognition (Arandjelovic et al., NetVLAD, CVPR 2016)."""
-_LINES = ("-", "--", "-.", ":")
-"""One kind each time the ten colours have gone round, so that forty methods are told apart."""
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Every method's figures, and the ranks they are of."""
+    """Every method's figures, and the ranks and answers they are of."""
 
     record: dict[str, Any]
-    """What compare.json says."""
+    """The content of compare.json."""
     ranks: dict[str, Ranks]
     """By name; a method by sequences has `, L=..` added."""
+    answers: pa.Table
+    """A row for each method and query, as answers.csv has them."""
 
 
 @dataclass(frozen=True)
@@ -71,125 +72,184 @@ class CompareOptions:
     sequence: int | None = None
     """Frames of a sequence, other settings of which are the pipeline's; None for single views only."""
     out: Path | None = None
-    """Folder of compare.json, scores and curves; None writes nothing."""
+    """Folder of compare.json, answers, scores and figures; None writes nothing."""
     topics: logs.TopicChoice | None = None
+    cache: CacheChoice = CacheChoice()
+    """Where features are kept for further calls."""
 
 
 def compare(
     query: Path,
     other: Path | None,
     methods: Iterable[str],
-    truth: TruthChoice,
+    truth: TruthChoice | None,
     pipeline: Pipeline,
     options: CompareOptions = CompareOptions(),
     execution: Execution = Execution(),
 ) -> Comparison:
     """Every method on a query and a map drive; without a map, or with the same one, frames among their own past.
 
-    Raises VplogError with one line where that cannot be.
+    Without a truth there are answers and costs, and no scores. Raises VplogError with one line where that cannot be.
     """
     other = query if other is None else other
-    library, min_gap, out, topics = options.library, options.min_gap, options.out, options.topics
-    recognisers, sequences = read_methods(methods, pipeline), None
+    recognisers, sequences = read_methods(methods, pipeline, answers=True), None
     if options.sequence is not None:
         tree = {**pipeline.sequence.model_dump(), "length": options.sequence}
         sequences = SequenceSettings.read(tree, "--sequence")
-    itself = same_drive(query, other)
-    _check_gap(query, itself, min_gap)
+    _check_gap(query, same_drive(query, other), options.min_gap)
     warnings: list[str] = []
     with ExitStack() as stack:
+        out = options.out
         made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out)))
         stack.enter_context(logged_warnings(warnings))
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
-        query_log = logs.open(query, topics)
-        map_log = query_log if itself else logs.open(other, topics)
-        known = open_truth(truth, query_log, map_log)
-        warnings += check_truth(known, query_log, map_log, min_gap)  # before the long part
-        if library is not None and same_drive(library, other):
-            library = None
-        wanted = LibrarySettings(choose="random", size=options.library_size, seed=options.library_seed)
-
-        def traversal_of(log: Log, role: str, frames: Ints, references: Ints | None = None) -> Traversal:
-            store = stack.enter_context(FeatureStore(scratch / f"{role}.features"))
-            return extract_traversal(log, pipeline.features, store, frames, references, execution)
-
-        source = None
-        if library is not None:
-            source = load_references(library, execution) if _is_saved(library) else logs.open(library, topics)
-        map_traversal, query_traversal, references, notes = _extract_all(
-            query_log, map_log, known, source, wanted, traversal_of
-        )
+        drives = _open(query, other, truth, pipeline, options, scratch, execution)
+        warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
+        map_traversal, query_traversal, references, notes = drives.extract_all()
         warnings += notes
-        stops = candidate_stops(query_traversal.frames, map_traversal.frames, min_gap)
-        pairs = known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
-        account: dict[str, Any] = {
-            "vplog": vplog.__version__,
-            "query": str(query),
-            "map": str(other),
-            "min_gap": min_gap,
-            "library": {
-                "from": str(library or other),
-                "size": len(references),
-                "seed": None if _is_saved(library) else options.library_seed,
-                "hash": references_hash(references, pipeline.features),
-            },
-            "truth": {**known.about, "pairs": pairs.count},
-            "queries": len(query_traversal),
-            "map_frames": len(map_traversal),
-            "positives": int(pairs.positive.sum()),
-            "features": pipeline.features.model_dump(mode="json"),
-            "methods": {},
-        }
+        check_descriptors(references, map_traversal.store[0])
+        stops = candidate_stops(query_traversal.frames, map_traversal.frames, options.min_gap)
+        pairs = drives.known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
+        if sequences is not None:
+            warnings += sequence_warning(pairs, sequences, truth is not None)
         inputs = MethodInputs(references, map_traversal, query_traversal, pairs, stops, sequences, scratch)
+        figures, account = Figures(query_traversal, map_traversal, pairs), drives.account(inputs)
         ranks: dict[str, Ranks] = {}
-        reliable: dict[str, Reliability] = {}
+        tables: list[pa.Table] = []
         for number, (name, settings) in enumerate(recognisers.items(), start=1):
             result = evaluate_method(settings, inputs, execution.within(name))
             account["methods"][name] = result.figures
-            ranks[name] = result.ranks
-            if result.reliability is not None:
-                reliable[name] = result.reliability
+            by_name = {name: result.ranks}
             if result.sequence_ranks is not None:
-                ranks[f"{name}, L={options.sequence}"] = result.sequence_ranks
+                by_name[f"{name}, L={options.sequence}"] = result.sequence_ranks
+            ranks |= by_name
+            tables += [answers_table(one, found, query_traversal, map_traversal) for one, found in by_name.items()]
             if made is not None:
+                figures.add(made, number, name, result)
                 result.figures["scores"] = _write_scores(
                     made, number, name, result.scores, query_traversal, map_traversal
                 )
-        account["warnings"] = list(dict.fromkeys([*query_log.warnings, *map_log.warnings, *warnings]))
+        answers = write_answers(tables, made)
+        account["answers"] = answers.to_pylist() if made is None else "answers.csv"
+        logged = [*drives.query_log.warnings, *drives.map_log.warnings]
+        account["warnings"] = list(dict.fromkeys([*logged, *warnings]))
         if made is not None:
-            draw_curves(ranks, made)
-            if reliable:
-                draw_reliability(reliable, made)
+            figures.draw(ranks, made)
             run_record.write_run_json(made / "compare.json", account)
-    return Comparison(account, ranks)
+    options.cache.trim()
+    return Comparison(account, ranks, answers)
 
 
-def _extract_all(
-    query: Log,
-    other: Log,
-    known: PlaceTruth,
-    library: Log | list[Reference] | None,
-    wanted: LibrarySettings,
-    traversal_of: Callable[..., Traversal],
-) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
-    """Walks of the map and the query, one and the same for a drive against itself, the references, and warnings."""
-    chosen = known.map_frames[choose(other.stamps()[known.map_frames], wanted)] if library is None else None
-    map_traversal = traversal_of(other, "map", known.map_frames, chosen)
-    query_traversal = map_traversal if query is other else traversal_of(query, "query", known.query_frames)
-    warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
-    if isinstance(library, list):
-        return map_traversal, query_traversal, library, warnings
-    references = map_traversal.references
+@dataclass(frozen=True, eq=False)
+class _Drives:
+    """The drives of a comparison, opened, and how their features are made."""
+
+    query: Path
+    other: Path
+    query_log: Log
+    map_log: Log
+    """The object of the query for a drive against itself."""
+    known: PlaceTruth
+    library: Path | None
+    """None for the map."""
+    source: Log | list[Reference] | None
+    """The log or the images of the library folder; None of the map or a saved library."""
+    options: CompareOptions
+    pipeline: Pipeline
+    scratch: Path
+    execution: Execution
+
+    def traversal_of(self, path: Path, log: Log, frames: Ints, references: Ints | None = None) -> Traversal:
+        folder = self.options.cache.open() or self.scratch
+        made = FeatureFolder.of(folder, path, self.options.topics, self.pipeline.features)
+        return extract_traversal(log, self.pipeline.features, made, frames, references, self.execution)
+
+    def extract_all(self) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
+        """Traversals of the map and the query (one object for a drive against itself), the references, and warnings."""
+        source, known = self.source, self.known
+        wanted = LibrarySettings(
+            choose="random", size=self.options.library_size, seed=self.options.library_seed
+        )  # fmt: skip
+        chosen = None
+        if source is None:
+            chosen = known.map_frames[choose(self.map_log.stamps()[known.map_frames], wanted)]
+        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames, chosen)
+        if self.query_log is not self.map_log:
+            query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames)
+        warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
+        if isinstance(source, list):
+            return map_traversal, query_traversal, source, warnings
+        references = map_traversal.references
+        if source is not None and self.library is not None:
+            rows = choose(source.stamps(), wanted)
+            traversal = self.traversal_of(self.library, source, rows, rows)
+            references = traversal.references
+            warnings += traversal.warnings
+        if len(references) < (wanted.size or 0):
+            warnings.append(
+                f"The library has {len(references)} images instead of {wanted.size}: its drive has no more frames."
+            )
+        return map_traversal, query_traversal, references, warnings
+
+    def account(self, inputs: MethodInputs) -> dict[str, Any]:
+        """compare.json, but for methods and warnings."""
+        options, pairs = self.options, inputs.truth
+        return {
+            "vplog": vplog.__version__,
+            "query": str(self.query),
+            "map": str(self.other),
+            "min_gap": options.min_gap,
+            "library": {
+                "from": str(self.library or self.other),
+                "size": len(inputs.references),
+                "seed": None if _is_saved(self.library) else options.library_seed,
+                "hash": references_hash(inputs.references, self.pipeline.features),
+            },
+            "truth": {**self.known.about, "pairs": pairs.count},
+            "protocol": protocol(self.known, pairs, options.min_gap),
+            "queries": len(inputs.query_traversal),
+            "map_frames": len(inputs.map_traversal),
+            "positives": int(pairs.positive.sum()),
+            "features": self.pipeline.features.model_dump(mode="json"),
+            "methods": {},
+        }
+
+
+def _open(
+    query: Path, other: Path, truth: TruthChoice | None, pipeline: Pipeline, options: CompareOptions, scratch: Path,
+    execution: Execution,
+) -> _Drives:  # fmt: skip
+    """The logs, the truth and the library of a comparison."""
+    topics = every_image(options.topics) if truth is not None and truth.kind == "labels" else options.topics
+    options = replace(options, topics=topics)
+    query_log = logs.open(query, topics)
+    map_log = query_log if same_drive(query, other) else logs.open(other, topics)
+    known = no_truth(query_log, map_log) if truth is None else open_truth(truth, query_log, map_log)
+    library, source = options.library, None
+    if library is not None and same_drive(library, other):
+        library = None
     if library is not None:
-        rows = choose(library.stamps(), wanted)
-        traversal = traversal_of(library, "library", rows, rows)
-        references = traversal.references
-        warnings += traversal.warnings
-    if len(references) < (wanted.size or 0):
-        warnings.append(
-            f"The library has {len(references)} images instead of {wanted.size}: its drive has no more frames."
-        )
-    return map_traversal, query_traversal, references, warnings
+        source = load_references(library, execution) if _is_saved(library) else logs.open(library, topics)
+    return _Drives(query, other, query_log, map_log, known, library, source, options, pipeline, scratch, execution)
+
+
+def every_image(topics: logs.TopicChoice | None) -> logs.TopicChoice:
+    """Labels tell the folders of places from those of cameras: all images are read unless some are chosen."""
+    topics = topics or logs.TopicChoice()
+    return topics if topics.image is not None else topics.model_copy(update={"image": EVERY_IMAGE})
+
+
+def protocol(known: PlaceTruth, pairs: Pairs, min_gap: int | None) -> dict[str, Any]:
+    """The rule by which a match is true, with its bounds, and how many queries have one; `text` in a sentence."""
+    bounds = ("source", "same_place", "tolerance", "distance_m", "heading_deg")
+    found = {name: known.about.get(name) for name in bounds} | {"min_gap": min_gap}
+    found |= {"queries": len(pairs), "with_match": int(pairs.positive.sum()), "pairs": pairs.count}
+    gap = "" if min_gap is None else f", at least {min_gap} frames older"
+    text = "no truth was given, so nothing is scored"
+    if known.about["source"] is not None:
+        rule = f"true is {known.about['same_place']} (--truth {known.about['source']}){gap}"
+        text = f"{rule}; {found['with_match']} of {len(pairs)} queries have a match, {pairs.count} pairs"
+    return {**found, "text": text}
 
 
 def _is_saved(library: Path | None) -> bool:
@@ -207,12 +267,15 @@ def _check_gap(query: Path, itself: bool, min_gap: int | None) -> None:
 
 
 def check_truth(known: PlaceTruth, query: Log, other: Log, min_gap: int | None) -> list[str]:
-    """What the truth does not cover, one sentence each. Raises TruthError where no query can find anything."""
+    """The gaps of the truth, one sentence each. Raises TruthError where no query can find anything."""
+    if known.about["source"] is None:
+        return []
     stops = candidate_stops(known.query_frames, known.map_frames, min_gap)
     if not known.pairs(known.query_frames, known.map_frames).below(stops).positive.any():
         gap = "" if min_gap is None else f" at least {min_gap} frames older"
         raise TruthError(
-            f"By --truth {known.about['source']} none of the {len(known.query_frames)} frames of {query.name} shows a "
+            f"By --truth {known.about['source']} ({known.about['same_place']}) none of the {len(known.query_frames)} "
+            f"frames of {query.name} shows a "
             f"place of a frame of {other.name}{gap}, so nothing can be found. Give the truth of these drives, or allow "
             "more with --tolerance, --distance-m or --heading-deg."
         )
@@ -236,69 +299,16 @@ def _comparison_in(out: Path) -> list[str]:
     """The files of a comparison in a folder that a new one replaces. Raises SettingsError where there are others."""
     if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "compare.json").is_file():
         raise SettingsError(f"{out} is a folder with other things in it, not a comparison. Choose another with -o.")
-    return ["compare.json", "scores-[0-9][0-9]-*.npz", *(f"{name}.[ps][nv]g" for name in ("curves", "reliability"))]
+    return ["compare.json", "answers.csv", "scores-[0-9][0-9]-*.npz", *FIGURES]
 
 
 def _write_scores(out: Path, number: int, name: str, scores: Float32s, query: Traversal, other: Traversal) -> str:
-    """Name of the file; the number tells apart what the letters that files may have do not."""
-    file = f"scores-{number:02d}-{re.sub(r'[^A-Za-z0-9.=+-]+', '_', Path(name).name)[:80]}.npz"
+    """Name of the file; the number makes it unique where the allowed letters do not."""
+    file = f"scores-{file_stem(number, name)}.npz"
+    named: Any = {key: np.array(one.names) for key, one in (("query_name", query), ("map_name", other)) if one.names}
     with replacing(out / file) as stream:
         np.savez(
             stream, scores=scores, query_frame=query.frames, query_ns=query.stamp_ns, map_frame=other.frames,
-            map_ns=other.stamp_ns,
+            map_ns=other.stamp_ns, **named,
         )  # fmt: skip
     return file
-
-
-def draw_curves(ranks: dict[str, Ranks], folder: Path) -> None:
-    """Write curves.png and curves.svg. The same ranks give the same bytes."""
-    with drawn(folder, "curves", 10, 4.5) as figure:
-        left, right = figure.subplots(1, 2)
-        for number, (plain_name, found) in enumerate(ranks.items()):
-            name = as_text(plain_name)
-            style = {"color": f"C{number % 10}", "linestyle": _LINES[number // 10 % len(_LINES)]}
-            curve = precision_recall(found)
-            left.step(
-                [0.0, *curve.recall], [*curve.precision[:1], *curve.precision], where="pre",
-                label=f"{name}  AP {average_precision(curve):.3f}", **style,
-            )  # fmt: skip
-            depth = range(1, _DEEPEST_RANK + 1)
-            right.plot(
-                depth, [recall_at(found, k) for k in depth], label=f"{name}  R@1 {recall_at(found, 1):.3f}", **style
-            )
-        left.set(xlabel="recall of the best answers", ylabel="precision", title="Precision over recall")
-        right.set(xlabel="rank N", ylabel="recall@N", title="A true match among the N best", xlim=(1, _DEEPEST_RANK))
-        right.set_xticks([1, *range(5, _DEEPEST_RANK + 1, 5)])
-        left.set_xlim(0, 1.02)
-        for axes in (left, right):
-            axes.set_ylim(0, 1.02)
-            axes.grid(alpha=0.3)
-            axes.legend(loc="lower left" if axes is left else "lower right", fontsize=8)
-
-
-def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
-    """Write reliability.png and reliability.svg: of answers given with a probability, how many are right.
-
-    Guo et al., On calibration of modern neural networks, ICML 2017, Fig. 1. Below the diagonal is over-confident. The
-    bars beneath say how many answers a point is of.
-    """
-    with drawn(folder, "reliability", 5.5, 5.5) as figure:
-        top, below = figure.subplots(2, 1, height_ratios=(4, 1), sharex=True)
-        top.plot([0, 1], [0, 1], color="0.6", linestyle=":", label="calibrated")
-        for number, (plain_name, one) in enumerate(found.items()):
-            filled, colour = one.count > 0, f"C{number % 10}"
-            top.plot(
-                one.confidence[filled], one.accuracy[filled], marker="o", color=colour,
-                label=f"{as_text(plain_name)}  ECE {one.expected_calibration_error:.3f}, "
-                f"over-confident by {one.overconfidence:+.3f}",
-            )  # fmt: skip
-            width = (one.edges[1] - one.edges[0]) / len(found)
-            below.bar(one.edges[:-1] + number * width, one.count, width, align="edge", color=colour)
-        top.set(ylabel="share of answers that are right", title="Reliability of the probabilities of answers")
-        below.set(xlabel="probability of the best answer", ylabel="answers", xlim=(0, 1.02))
-        below.set_yscale("log")  # of loop detection, most answers are improbable and few are certain
-        below.set_ylim(bottom=0.5)
-        top.set_ylim(0, 1.02)
-        for axes in (top, below):
-            axes.grid(alpha=0.3)
-        top.legend(loc="best", fontsize=8)

@@ -1,4 +1,4 @@
-"""One place recogniser on one query traversal and one map: what it finds, what it takes.
+"""One place recogniser on one query traversal and one map: scores and costs.
 
 Times are CPU time of the thread that does the work, so they are those of one thread, however many are busy.
 """
@@ -6,22 +6,26 @@ Times are CPU time of the thread that does the work, so they are those of one th
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from shutil import disk_usage
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
+from vplog.benchmark.published_answers import AnswersSettings, fill_scores
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
+from vplog.evaluate.open_set import score_open_set
 from vplog.evaluate.retrieval import reliability
 from vplog.execution.execution import Execution
+from vplog.places.match_probability import match_probabilities
 from vplog.places.sequence import sequence_rows
-from vplog.stages import ProbableIndex
+from vplog.places.views import views_of
+from vplog.stages import FrameState, ProbableIndex, StoredState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from vplog.benchmark.traversals import Traversal
@@ -33,24 +37,24 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceIndex, PlaceState
 
 RELIABILITY_BINS = 10
-"""Of probability: with the 200 answers of a short traversal a bin holds 20."""
+"""Bins of the probability: with the 200 answers of a short traversal a bin holds 20."""
 ANSWERS = 10
-"""Rows that a timed search returns: what `vplog run` asks for by default, and the deepest recall reported."""
+"""Rows that a timed search returns: what `vplog run` requests by default, and the deepest recall reported."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What one method made of one query traversal and one map."""
+    """The result of one method on one query traversal and one map."""
 
     scores: Float32s
     """(Q, M), NaN for rows that are no candidates."""
     ranks: Ranks
     figures: dict[str, Any]
-    """What compare.json says of the method."""
+    """The entry of the method in compare.json."""
     sequence_ranks: Ranks | None = None
-    """The same by sequences, where these were asked for."""
+    """Ranks by sequences, where these were requested."""
     reliability: Reliability | None = None
-    """Whether its probabilities mean what they say, where it gives any."""
+    """Calibration of its probabilities, where it gives any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ class MethodInputs:
     references: Sequence[Reference]
     map_traversal: Traversal
     query_traversal: Traversal
-    """The same object for a drive against itself, which is described once."""
+    """The object of the map for a drive against itself, which is described once."""
     truth: Pairs
     stops: Ints
     """(Q,) each query's candidates are the map rows below."""
@@ -69,12 +73,16 @@ class MethodInputs:
     """Folder of the files of scores; None keeps them in memory."""
 
 
-def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Execution = Execution()) -> MethodResult:
+def evaluate_method(
+    settings: PlaceSettings | AnswersSettings, inputs: MethodInputs, execution: Execution = Execution()
+) -> MethodResult:
     """Learn the references, describe both traversals, search the map for every query.
 
     The map is rebuilt from what a table would store of it, so the bytes counted are all that is used.
-    Raises TruthError without a true pair, and whatever the method raises.
+    Without a true pair there are no scores among the figures. Raises whatever the method raises.
     """
+    if isinstance(settings, AnswersSettings):
+        return evaluate_answers(settings, inputs)
     map_traversal, query_traversal, truth, stops = (
         inputs.map_traversal,
         inputs.query_traversal,
@@ -89,15 +97,16 @@ def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Ex
     places = state.from_arrow(column)
     index, queries = state.index(places), places
     if query_traversal is not map_traversal:
-        queries, more = describe_traversal(state, query_traversal, "describe queries", execution)
+        queries, more = describe_traversal(state, query_traversal, "describe queries", execution, query=True)
         mining_ms = np.concatenate([mining_ms, more])
     scores = score_table(len(queries), len(index), inputs.scratch, "scores")
     query_ms = search(index, queries, stops, scores, execution)
-    ranks = retrieval.rank_queries(scores, truth, stops)
+    ranks = ranked(scores, truth, stops)
     traversals = [map_traversal] if query_traversal is map_traversal else [map_traversal, query_traversal]
-    feature_ms = float(np.median(np.concatenate([traversal.feature_ms for traversal in traversals])))
+    of_features = not isinstance(state, FrameState | StoredState)
+    feature_ms = of_features * float(np.median(np.concatenate([traversal.feature_ms for traversal in traversals])))
     figures = {
-        **asdict(retrieval.score_retrieval(ranks)),
+        **scores_of(ranks),
         "bytes_per_image": round(stored_bytes(column) / len(column), 1),
         "encode_ms": round(feature_ms + float(np.median(mining_ms)), 3),
         "feature_ms": round(feature_ms, 3),
@@ -109,30 +118,54 @@ def evaluate_method(settings: PlaceSettings, inputs: MethodInputs, execution: Ex
         "settings": settings.model_dump(mode="json"),
     }
     reliable = by_sequence = None
-    if isinstance(index, ProbableIndex):
+    if isinstance(index, ProbableIndex) and truth.positive.any():
         reliable = reliability_of(index, queries, stops, ranks, truth, execution)
     if reliable is not None:
         figures["calibration"] = reliable.as_json()
     if inputs.sequence is not None:
         lines = score_table(len(queries), len(index), inputs.scratch, "sequences")
-        match_lines(scores, inputs.sequence, stops, lines, execution)
-        by_sequence = retrieval.rank_queries(lines, truth, stops)
-        figures["sequence"] = {**inputs.sequence.model_dump(), **asdict(retrieval.score_retrieval(by_sequence))}
+        score_sequences(scores, inputs.sequence, stops, lines, execution)
+        by_sequence = ranked(lines, truth, stops)
+        figures["sequence"] = {**inputs.sequence.model_dump(), **scores_of(by_sequence)}
     return MethodResult(scores, ranks, figures, by_sequence, reliable)
 
 
+def ranked(scores: Float32s, truth: Pairs, stops: Ints) -> Ranks:
+    """Ranks of the true rows, with the probability of each answer where that can be learned on the scores."""
+    ranks = retrieval.rank_queries(scores, truth, stops)
+    return replace(ranks, p_match=match_probabilities(scores, stops))
+
+
+def scores_of(ranks: Ranks) -> dict[str, Any]:
+    """Figures of the ranks; none where no query has a true match."""
+    if not ranks.positive.any():
+        return {}
+    return {**asdict(retrieval.score_retrieval(ranks)), "open_set": score_open_set(ranks)}
+
+
+def evaluate_answers(settings: AnswersSettings, inputs: MethodInputs) -> MethodResult:
+    """The answers of a file, judged as those of a method; they have no costs."""
+    query, other = inputs.query_traversal, inputs.map_traversal
+    scores = score_table(len(query), len(other), inputs.scratch, "scores")
+    count = fill_scores(settings, query, other, scores)
+    ranks = ranked(scores, inputs.truth, inputs.stops)
+    figures = {"answers": count, "settings": settings.model_dump(mode="json")}
+    return MethodResult(scores, ranks, {**scores_of(ranks), **figures})
+
+
 def describe_traversal(
-    state: PlaceState, traversal: Traversal, stage: str, execution: Execution
+    state: PlaceState, traversal: Traversal, stage: str, execution: Execution, query: bool | None = False
 ) -> tuple[list[Any], Floats]:
     """A descriptor for every row, and the CPU ms (N,) each took."""
+    views = views_of(state, traversal.log, traversal.stamp_ns, traversal.store.__getitem__, query)
 
-    def work(row: int) -> tuple[Any, float]:
-        features = traversal.store[row]
+    def work(item: Any) -> tuple[Any, float]:
+        loaded = views.load(item)
         began = time.thread_time()
-        place = state.describe(features)
+        place = views.describe(loaded)
         return place, 1e3 * (time.thread_time() - began)
 
-    return _timed_map(work, len(traversal), stage, execution)
+    return _timed_map(work, views.items, len(traversal), stage, execution)
 
 
 def search(
@@ -150,7 +183,7 @@ def search(
         scores[row, stop:] = np.nan
         return None, 1e3 * spent
 
-    return _timed_map(work, len(queries), "search", execution)[1]
+    return _timed_map(work, range(len(queries)), len(queries), "search", execution)[1]
 
 
 def reliability_of(
@@ -161,12 +194,12 @@ def reliability_of(
     A drive's neighbouring frames show one place, among which its probability is divided. An answer is right where a
     true row is near, so what is near counts for it: as many rows around it as a true run has, by their median.
     """
-    beside = int(np.median(truth.stop - truth.first)) // 2 if len(truth.first) else 0
+    radius = int(np.median(truth.stop - truth.first)) // 2 if len(truth.first) else 0
 
     def work(row: int) -> float:
         best = int(ranks.top_row[row])
         probability = index.posterior(queries[row], int(stops[row]))[0]
-        return min(float(probability[max(best - beside, 0) : best + beside + 1].sum()), 1.0)
+        return min(float(probability[max(best - radius, 0) : best + radius + 1].sum()), 1.0)
 
     answered = np.flatnonzero(ranks.top_row >= 0)
     if not len(answered):
@@ -175,7 +208,7 @@ def reliability_of(
     return reliability(probabilities, ranks.top_true[answered] > 0.5, RELIABILITY_BINS)
 
 
-def match_lines(
+def score_sequences(
     scores: Float32s, settings: SequenceSettings, stops: Ints, lines: Float32s, execution: Execution
 ) -> None:
     """Fill `lines` (Q, M) with the scores of sequences, NaN beyond each query's stop; a few rows at a time."""
@@ -186,9 +219,9 @@ def match_lines(
 
 
 def _timed_map(
-    work: Callable[[int], tuple[Any, float]], count: int, stage: str, execution: Execution
+    work: Callable[[Any], tuple[Any, float]], items: Iterable[Any], count: int, stage: str, execution: Execution
 ) -> tuple[list[Any], Floats]:
-    found = list(execution.counted(stage, execution.map(work, range(count)), count))
+    found = list(execution.counted(stage, execution.map(work, items, ahead=2), count))
     return [result for result, _ in found], np.array([ms for _, ms in found])
 
 
@@ -197,7 +230,7 @@ def score_table(queries: int, rows: int, scratch: Path | None, name: str) -> Flo
     if scratch is None:
         return np.empty((queries, rows), np.float32)
     needed, free = 4 * queries * rows, disk_usage(scratch).free
-    if needed > free:  # a full disk below a mapped file ends the process, so it is asked for first
+    if needed > free:  # a full disk below a mapped file ends the process, so the room is checked first
         raise ResultError(
             f"The scores of {queries} queries against {rows} frames need {needed / 1e9:.1f} GB, and {scratch} has "
             f"{free / 1e9:.1f} GB free. Free space, or compare shorter drives."

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
-import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vplog.benchmark.published_answers import AnswersSettings
 from vplog.errors import SettingsError, nearest
 from vplog.pipeline import load_pipeline
-from vplog.places import PlaceSettings
+from vplog.places import KINDS
+from vplog.places.plugin import PluginSettings, plugin_names
 from vplog.settings import override
 
 if TYPE_CHECKING:
@@ -18,36 +20,39 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
 
-def known_methods() -> dict[str, Any]:
-    """The recognisers by kind: the members of the union in vplog/places."""
-    union = typing.get_args(PlaceSettings)[0]
-    members = typing.get_args(union) or (union,)
-    return {member.model_fields["kind"].default: member for member in members}
-
-
 def split_methods(text: str) -> list[str]:
     """`a,b:c=[1,2]` as `a` and `b:c=[1,2]`: commas inside brackets belong to a value."""
     return [name.strip() for name in re.split(r",(?![^\[{]*[\]}])", text)]
 
 
 def read_method(text: str, pipeline: Pipeline) -> Any:
-    """The recogniser of `kind`, `pipeline` or `file.yaml`, each with `:setting=value` as often as wanted.
+    """The recogniser of `kind`, `kind:FILE`, `pipeline` or `file.yaml`, each with `:setting=value` as often as wanted.
 
     A kind has its default settings, or the pipeline's where it is the pipeline's own. Raises SettingsError.
     """
     name, *assignments = text.split(":")
-    known = known_methods()
-    if name in known:
+    known = KINDS
+    location = next(iter(known[name].LOCATIONS), "") if name in known else ""
+    if location and assignments and "=" not in assignments[0]:  # a path may hold colons
+        cut = next((i for i, one in enumerate(assignments) if re.match(r"[a-z_0-9.]+=", one)), len(assignments))
+        assignments = [f"{location}={json.dumps(':'.join(assignments[:cut]))}", *assignments[cut:]]
+        chosen = known[name]()  # what a file says of itself is read from it
+    elif name in known:
         chosen = pipeline.places if pipeline.places.kind == name else known[name]()
+    elif name in plugin_names():
+        own = isinstance(pipeline.places, PluginSettings) and pipeline.places.name == name
+        chosen = pipeline.places if own else PluginSettings(name=name)
     else:
         try:
             chosen = load_pipeline(name).places
         except SettingsError as error:
             if Path(name).suffix in (".yaml", ".yml"):
                 raise
-            methods = f"Methods: {', '.join(sorted(known))}."
+            methods = f"Methods: {', '.join(sorted({*known, *plugin_names()} - {'plugin'}))}."
             raise SettingsError(f"No method {name!r}.{nearest(name, known)} {methods} {error}") from None
-    tree = chosen.model_dump(mode="json")
+    if isinstance(chosen, PluginSettings) and chosen.name:
+        chosen = chosen.recogniser()
+    tree = {"kind": chosen.kind, **chosen.model_dump(mode="json", exclude_unset=True)}
     for assignment in assignments:
         try:
             tree = override(tree, assignment)
@@ -55,12 +60,21 @@ def read_method(text: str, pipeline: Pipeline) -> Any:
             raise SettingsError(
                 f"Method {text}: {assignment!r} is not a setting with a value. Write it as {name}:setting=value."
             ) from None
-    return type(chosen).read(tree, f"method {text}")
+    try:
+        return type(chosen).read(tree, f"method {text}")
+    except SettingsError as error:
+        what, _, _ = str(error).rpartition(" `vplog config`")
+        raise SettingsError(f"{what} `vplog config --set places.kind={chosen.kind}` prints them all.") from None
 
 
-def read_methods(methods: Iterable[str], pipeline: Pipeline) -> dict[str, Any]:
+def read_methods(methods: Iterable[str], pipeline: Pipeline, answers: bool = False) -> dict[str, Any]:
+    """The recognisers of several names, with `answers` also files of answers: `answers:FILE.csv`."""
     names = list(methods)
-    recognisers = {name: read_method(name, pipeline) for name in names}
+    recognisers: dict[str, Any] = {}
+    for name in names:
+        kind, _, file = name.partition(":")
+        is_file = answers and kind == "answers"
+        recognisers[name] = AnswersSettings(file=file) if is_file else read_method(name, pipeline)
     if not names or len(recognisers) < len(names):
         raise SettingsError(f"--methods {','.join(names)}: name each method once, and one at least.")
     return recognisers

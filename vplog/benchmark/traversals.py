@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,11 +10,11 @@ import numpy as np
 from vplog.data import Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
-from vplog.features.extraction import extract_frames
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Features, Float32s, Floats, Ints
-    from vplog.features.store import FeatureStore
+    from vplog.benchmark.feature_cache import FeatureFolder
+    from vplog.cache.feature_shards import Extracted
+    from vplog.data import Bytes, Floats, Ints
     from vplog.stages import Extractor, Log
 
 
@@ -23,65 +22,72 @@ if TYPE_CHECKING:
 class Traversal:
     """The frames of a drive as features, on disk."""
 
-    name: str
-    store: FeatureStore
-    """Features of row i at i."""
+    log: Log
+    store: Extracted
+    """Features and a small picture of row i at i."""
     frames: Ints
     """(N,) numbers of the frames in the drive, increasing."""
     stamp_ns: Ints
     """(N,)."""
+    names: list[str] | None
+    """File of each frame; None of a recording."""
     references: list[Reference]
-    """The frames asked for as reference images."""
+    """The frames requested as reference images."""
     feature_ms: Floats
-    """(N,) CPU ms that the features of each frame took, decoding not included; as they were done, in no other order."""
+    """CPU ms that the features of each frame took, decoding not included; in no order."""
     warnings: list[str]
+
+    @property
+    def name(self) -> str:
+        return self.log.name
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def name_of(self, row: int) -> str:
+        """File of a row, or its number in the drive."""
+        return str(self.frames[row]) if self.names is None else self.names[row]
 
 
 def extract_traversal(
     log: Log,
     extractor: Extractor,
-    store: FeatureStore,
+    folder: FeatureFolder,
     frames: Ints | None = None,
     chosen: Ints | None = None,
     execution: Execution = Execution(),
 ) -> Traversal:
-    """Features of the frames with these numbers (all where None), streamed into an empty store.
+    """Features of the frames with these numbers (all where None), in files of the folder.
 
     The images of `chosen`, numbers among them, are kept as references. Frames that cannot be decoded are left out,
     with a warning. Raises LogError where none is left.
     """
-    stamps = log.stamps()
+    stamps, names = log.stamps(), log.file_names()
     frames = np.arange(len(stamps)) if frames is None else frames
-    wanted = set() if chosen is None else set(chosen.tolist())
-    numbers, spent, references, lost = [], [], [], []
-
-    def timed(image: Bytes, depth_m: Float32s | None = None) -> Features:
-        began = time.thread_time()
-        features = extractor(image, depth_m)
-        spent.append(1e3 * (time.thread_time() - began))
-        return features
-
-    found = extract_frames(log.frames(stamps[frames]), timed, execution)
-    for stamp_ns, frame, features, why in execution.counted(f"extract {log.name}", found, len(frames)):
-        if frame is None or features is None:
-            lost.append(why)
-            continue
-        number = int(np.searchsorted(stamps, stamp_ns))
-        store.append(features)
-        numbers.append(number)
-        if number in wanted:
-            references.append(Reference(frame.image, features, log.name, stamp_ns))
-    if not numbers:
-        why = f" The first: {lost[0]}" if lost else " `vplog info` shows what is in it."
+    store = folder.extract(log, stamps[frames], extractor, execution)
+    if not len(store):
+        why = f" The first: {store.lost[0]}" if store.lost else " `vplog info` shows what is in it."
         raise LogError(f"{log.name}: none of {len(frames)} frames could be decoded.{why}")
     warnings = []
-    if lost:
+    if lost := store.lost:
         warnings.append(f"{log.name}: {len(lost)} of {len(frames)} frames could not be decoded. First: {lost[0]}")
-    rows = np.array(numbers, np.int64)
-    return Traversal(log.name, store, rows, stamps[rows], references, np.array(spent), warnings)
+    stamp_ns = np.array(store.stamp_ns, np.int64)
+    numbers = np.searchsorted(stamps, stamp_ns)
+    rows = np.flatnonzero(np.isin(numbers, [] if chosen is None else chosen))
+    references = [
+        Reference(image, store[row], log.name, int(stamp_ns[row]))
+        for row, image in zip(rows.tolist(), images_at(log, stamp_ns[rows]), strict=True)
+    ]
+    named = None if names is None else [names[number] for number in numbers.tolist()]
+    return Traversal(log, store, numbers, stamp_ns, named, references, np.array(store.cpu_ms), warnings)
+
+
+def images_at(log: Log, stamp_ns: Ints) -> list[Bytes]:
+    """The grey images of the frames with these stamps (K,), increasing. Raises LogError where one is gone."""
+    images = [frame.decode().image for frame in log.frames(stamp_ns)] if len(stamp_ns) else []
+    if len(images) < len(stamp_ns):
+        raise LogError(f"{log.name}: a frame that was read before cannot be read again. Leave the log unchanged.")
+    return images
 
 
 def candidate_stops(query_frames: Ints, map_frames: Ints, min_gap: int | None) -> Ints:

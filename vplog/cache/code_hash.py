@@ -1,4 +1,4 @@
-"""What code a result depends on: a hash over the files its modules import, and the versions of the packages they use.
+"""Code that a result depends on: a hash over the files its modules import, and the versions of the packages they use.
 
 Found from the imports themselves, so that no list can forget one.
 """
@@ -18,7 +18,7 @@ import vplog
 
 _PACKAGE = Path(vplog.__file__).parent
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
-"""Packages whose name on PyPI is not the one they are imported by; others are looked for, which takes half a second."""
+"""Packages whose name on PyPI is not the one they are imported by; a search for others takes half a second."""
 
 
 @cache
@@ -29,7 +29,11 @@ def code_of(*modules: str) -> dict[str, str]:
     What is imported for type checkers alone does not count, as it does not run. A package that is entered on the way
     to one of its modules counts by its own file, not by all that it imports besides.
     """
-    files, packages = imported(modules)
+    own = tuple(module for module in modules if module.partition(".")[0] == "vplog")
+    files, packages = imported(own)
+    for module in {*modules} - {*own}:  # a plug-in: its own file, and the version of its package
+        files[module] = Path(str(sys.modules[module].__file__))
+        packages.add(module.partition(".")[0])
     digest = hashlib.sha256()
     for name in sorted(files):
         digest.update(f"{name} {hashlib.sha256(files[name].read_bytes()).hexdigest()}\n".encode())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 from vplog.errors import ResultError
-from vplog.features.store import features_from, features_to, size_of
+from vplog.features.store import SIFT_BYTES, features_from, features_to, size_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -21,7 +21,7 @@ _LENGTH = struct.Struct("<I")
 
 
 class _Row(NamedTuple):
-    """Where a keyframe's features and picture lie in the file of its part."""
+    """Position of a keyframe's features and picture in the file of its part."""
 
     stamp_ns: int
     offset: int
@@ -33,11 +33,13 @@ class _Row(NamedTuple):
     """1 where there is one."""
     picture: int
     """Bytes of the picture, which follows the features; 0 for none."""
+    values: int = SIFT_BYTES
+    """Bytes of a descriptor."""
 
     @property
     def size(self) -> int:
         """Bytes of the features."""
-        return size_of(self.features, bool(self.thumbnail))
+        return size_of(self.features, bool(self.thumbnail), self.values)
 
     @property
     def end(self) -> int:
@@ -54,6 +56,8 @@ class Extracted:
         """Why each of the others was not."""
         self.undecodable: list[tuple[str, int]] = []
         """Topic and stamp of each message whose image does not decode, those beside a sound one among them."""
+        self.cpu_ms: list[float] = []
+        """CPU time of features, where the parts say it."""
         self.files: list[str] = []
         self._rows: list[tuple[Path, int, _Row]] = []
 
@@ -70,6 +74,7 @@ class Extracted:
             rows = [_Row(*map(int, row)) for row in head["rows"]]
             lost = [str(why) for why in head["lost"]]
             undecodable = [(str(topic), int(stamp_ns)) for topic, stamp_ns in head["undecodable"]]
+            cpu_ms = list(map(float, head.get("cpu_ms", ())))
         except FileNotFoundError:
             raise AbsentError from None
         except (OSError, ValueError, TypeError, KeyError, RecursionError, struct.error) as error:
@@ -80,6 +85,7 @@ class Extracted:
         self.stamp_ns += [row.stamp_ns for row in rows]
         self.lost += lost
         self.undecodable += undecodable
+        self.cpu_ms += cpu_ms
         self.files.append(path.name)
         self._rows += [(path, begin, row) for row in rows]
 
@@ -95,7 +101,7 @@ class Extracted:
         """The features of keyframe `at`. Raises ResultError where its file is gone."""
         path, begin, row = self._rows[at]
         data = _bytes_at(path, begin + row.offset, row.size)
-        return features_from(data, row.features, row.width, row.height, bool(row.thumbnail))
+        return features_from(data, row.features, row.width, row.height, bool(row.thumbnail), row.values)
 
     @property
     def has_pictures(self) -> bool:
@@ -120,14 +126,18 @@ def _bytes_at(path: Path, offset: int, length: int) -> bytes:
 
 
 def packed(
-    decoded: Iterable[tuple[int, Features, bytes]], lost: Sequence[str], undecodable: Sequence[tuple[str, int]]
-) -> bytes:
-    """What the file of a part holds: stamp, features and picture of its keyframes, and what was lost of others."""
+    decoded: Iterable[tuple[int, Features, bytes]], lost: Sequence[str], undecodable: Sequence[tuple[str, int]],
+    cpu_ms: Sequence[float] = (),
+) -> bytes:  # fmt: skip
+    """Content of the file of a part: stamp, features and picture of its keyframes, and why others were lost. `cpu_ms`
+    is for comparisons; the same input gives other times, and a run's parts have none."""
     rows, chunks, at = [], [], 0
     for stamp_ns, features, picture in decoded:
         data, small = features_to(features), int(features.thumbnail is not None)
-        rows.append(_Row(stamp_ns, at, len(features), features.width, features.height, small, len(picture)))
+        size, values = (features.width, features.height), features.descriptors.shape[1]
+        rows.append(_Row(stamp_ns, at, len(features), *size, small, len(picture), values))
         chunks += [data, picture]
         at += len(data) + len(picture)
-    head = json.dumps({"rows": rows, "lost": lost, "undecodable": undecodable}).encode()
+    tree = {"rows": rows, "lost": lost, "undecodable": undecodable, **({"cpu_ms": cpu_ms} if cpu_ms else {})}
+    head = json.dumps(tree).encode()
     return b"".join([_LENGTH.pack(len(head)), head, *chunks])

@@ -47,19 +47,19 @@ def bytes_of(drive: Path | Sequence[Path]) -> int:
     return sum(file.stat().st_size for _, file in _named(drive) if not isinstance(file, RemotePath))
 
 
-def look_of(drive: Path | Sequence[Path]) -> dict[str, str]:
-    """What changes with every file of a log, by its full path, without reading one: length and times.
+def stat_signature(drive: Path | Sequence[Path]) -> dict[str, str]:
+    """Length and times of every file of a log, by its full path, which change with the file.
 
     The time of the last change of any kind counts too: a copy may bring its source's time of writing along.
     """
-    look = {}
+    signature = {}
     for _, file in _named(drive):
         if isinstance(file, RemotePath):
-            look[str(file) if str(file) not in look else f"{file} ({len(look) + 1})"] = file.version()
+            signature[str(file) if str(file) not in signature else f"{file} ({len(signature) + 1})"] = file.version()
         else:
             stat = file.stat()
-            look[str(file.resolve())] = f"length {stat.st_size}, times {stat.st_mtime_ns} {stat.st_ctime_ns}"
-    return look
+            signature[str(file.resolve())] = f"length {stat.st_size}, times {stat.st_mtime_ns} {stat.st_ctime_ns}"
+    return signature
 
 
 def changed_s(drive: Path | Sequence[Path]) -> float:

@@ -1,4 +1,4 @@
-"""What the stages of a run came to, kept beside it: each result a file, found again by all that it was made from.
+"""Cache of a run's stages: each result is a file, found again by the hash of all that it was made from.
 
 A file is named by its stage and the sha256 over what it depends on: the results and settings that went in, the code
 that made it and the packages which that uses. It is written beside and renamed, and holds length and checksum of its
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 
 import numpy as np
 
-from vplog.cache.input_hashes import hash_inputs, look_of
+from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import ResultError
 from vplog.results.run_record import canonical_json, read_run_json, write_run_json
 from vplog.settings import Settings
@@ -45,13 +45,13 @@ CACHE_FILES = (f"*{ENDING}", ".*.part", INPUTS)
 _BLOCK_BYTES = 2**20
 """Read at once of a file that is only checked."""
 CONTENT_AT = _HEAD.size
-"""Where the content of a file begins."""
+"""Offset of the content of a file."""
 _INPUTS_BYTES = 2**26
 """Longest inputs.json that is read: a folder of 400,000 images has one of 60 MB."""
 
 
 class DamagedError(Exception):
-    """A file of the cache is not what its name says. Never leaves the cache."""
+    """A file of the cache does not have the content that its name stands for. Never leaves the cache."""
 
 
 class AbsentError(Exception):
@@ -59,12 +59,12 @@ class AbsentError(Exception):
 
 
 def file_name(stage: str, key: str) -> str:
-    """The first 128 bits of the key tell files apart; the whole key is in the file."""
+    """Name of a file of the cache: the first 128 bits of the key are unique; the whole key is in the file."""
     return f"{stage}-{key[:32]}{ENDING}"
 
 
 def sealed(key: str, content: bytes) -> bytes:
-    """A file of the cache: the content with what tells whether it is whole."""
+    """A file of the cache: header with key, length and checksum, then the content."""
     return _HEAD.pack(_MAGIC, bytes.fromhex(key), len(content), zlib.crc32(content)) + content
 
 
@@ -107,7 +107,7 @@ def _check(stream: BinaryIO, length: int, key: str | None) -> None:
 class Inputs:
     """Which files a drive is."""
 
-    look: dict[str, str]
+    signature: dict[str, str]
     """Lengths and times, by full path."""
     token: str
     """Stands for the content in the keys of all that is made from it."""
@@ -117,7 +117,7 @@ class Inputs:
     @property
     def lengths(self) -> str:
         """sha256 over the lengths of the files: copies on other machines have other times."""
-        return key_of(_lengths(self.look))
+        return key_of(_lengths(self.signature))
 
 
 def key_of(made_from: Any) -> str:
@@ -148,22 +148,22 @@ def inputs_of(drive: Path | Sequence[Path], cache: Path | None) -> Inputs:
 
     It does where length and times are the same, and where they are not but the sha256 is: then the files are read.
     """
-    look = look_of(drive)
-    known = {} if cache is None else _known_inputs(cache)
+    signature = stat_signature(drive)
+    known = {} if cache is None else _read_inputs(cache)
     hashes = known.get("hashes")
-    if known.get("look") == look:
-        return Inputs(look, known["token"], hashes)
-    if hashes and _lengths(known["look"]) == _lengths(look):
+    if known.get("look") == signature:
+        return Inputs(signature, known["token"], hashes)
+    if hashes and _lengths(known["look"]) == _lengths(signature):
         found = hash_inputs(drive)
-        return Inputs(look, known["token"] if found == hashes else key_of(look), found)
-    return Inputs(look, key_of(look), None)
+        return Inputs(signature, known["token"] if found == hashes else key_of(signature), found)
+    return Inputs(signature, key_of(signature), None)
 
 
-def _lengths(look: dict[str, str]) -> list[str]:
-    return sorted(text.partition(",")[0] for text in look.values())
+def _lengths(signature: dict[str, str]) -> list[str]:
+    return sorted(text.partition(",")[0] for text in signature.values())
 
 
-def _known_inputs(cache: Path) -> dict[str, Any]:
+def _read_inputs(cache: Path) -> dict[str, Any]:
     """inputs.json of a cache; empty where there is none, or another thing."""
     path = cache / INPUTS
     try:
@@ -188,7 +188,7 @@ class StageCache:
         what has to be written is gone when the block ends. Raises ResultError where the folder cannot be made.
         """
         self.folder, self.keep, self.drive = folder, keep, drive
-        self._warnings, self._used, self._full = warnings, set[str](), False
+        self._warnings, self._used, self._disk_full = warnings, set[str](), False
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -200,7 +200,7 @@ class StageCache:
         """Begin to read the drive's files for their hashes, beside the stages."""
         self.inputs = inputs_of(self.drive, self.folder)
         self._aside = ThreadPoolExecutor(1)
-        self._hashes = self._aside.submit(self._know_inputs)
+        self._hashes = self._aside.submit(self._hash_inputs)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -233,12 +233,12 @@ class StageCache:
 
     def store(self, name: str, key: str, warnings: list[str], content: bytes) -> None:
         """Write a result with the warnings that came with it, as long as the disk takes it."""
-        if not self.keep or self._full:
+        if not self.keep or self._disk_full:
             return
         try:
             self.put(file_name(name, key), sealed(key, json.dumps(warnings).encode() + b"\n" + content))
         except ResultError as error:
-            self._full = True
+            self._disk_full = True
             self._warnings.append(f"The results of the stages are not cached for another run. {error}")
 
     def put(self, name: str, data: bytes) -> Path:
@@ -257,28 +257,33 @@ class StageCache:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         self._warnings.append(f"{path.name} in {self.folder} is not used, its stage runs again: {reason}.")
 
-    def _know_inputs(self) -> dict[str, str]:
+    def _hash_inputs(self) -> dict[str, str]:
         """sha256 of the files of the drive, which are read unless it is known; a later run then knows it.
 
         Not if they change meanwhile: what is made from them may be of what they were before.
         """
         inputs = self.inputs
         hashes = hash_inputs(self.drive) if inputs.hashes is None else inputs.hashes
-        if self.keep and look_of(self.drive) == inputs.look:
-            known = _known_inputs(self.folder)
+        if self.keep and stat_signature(self.drive) == inputs.signature:
+            known = _read_inputs(self.folder)
             known = known if known.get("token") == inputs.token else {}
-            self._write_inputs({**known, "look": inputs.look, "token": inputs.token, "hashes": hashes})
+            self._write_inputs({**known, "look": inputs.signature, "token": inputs.token, "hashes": hashes})
         return hashes
 
     def finish(self, parts: Sequence[str]) -> None:
         """The run is done: remove what it did not use. `parts` are the files of its features, in order."""
         self.hashes()
-        inputs, changed = self.inputs, look_of(self.drive) != self.inputs.look
+        inputs, changed = self.inputs, stat_signature(self.drive) != self.inputs.signature
         if changed:
             self._warnings.append("The log changed while it was read, so nothing is cached for another run.")
             self._remove(set())
         if self.keep and not changed:
-            known = {"look": inputs.look, "token": inputs.token, "hashes": inputs.hashes, **_known_inputs(self.folder)}
+            known = {
+                "look": inputs.signature,
+                "token": inputs.token,
+                "hashes": inputs.hashes,
+                **_read_inputs(self.folder),
+            }
             self._write_inputs({**known, "parts": list(parts)})
             self._remove({*self._used, INPUTS})
 
@@ -291,17 +296,17 @@ class StageCache:
     def _write_inputs(self, known: dict[str, Any]) -> None:
         try:
             write_run_json(self.folder / INPUTS, known)
-        except ResultError:  # it only spares work; the result's own files say that the disk is full
-            self._full = True
+        except ResultError:  # it only spares work; that the disk is full is raised with the result's own files
+            self._disk_full = True
 
-    def _remove(self, kept: set[str]) -> None:
+    def _remove(self, retained: set[str]) -> None:
         """Remove the cache's own files but these."""
         for file in [file for pattern in CACHE_FILES for file in self.folder.glob(pattern)]:
-            if file.name not in kept:
+            if file.name not in retained:
                 file.unlink(missing_ok=True)
 
 
 def finished_parts(cache: Path) -> list[str]:
     """Names of the files of a finished run's features, in order; none where no run was finished."""
-    parts = _known_inputs(cache).get("parts")
+    parts = _read_inputs(cache).get("parts")
     return [str(name) for name in parts if "/" not in str(name)] if isinstance(parts, list) else []

@@ -6,7 +6,7 @@
     descriptors = do(describe, state, features)    # `do` is the Steps of the run
 
 A result is found again by its inputs, settings among them, and the code of the step. `execution` and `steps` are given
-to functions that take them, and change nothing that comes of them.
+to functions that take them, and do not change a result.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vplog.cache.code_hash import code_of
 from vplog.cache.stage_cache import AbsentError, StageCache, digest_of, key_of
 from vplog.execution.cores import limited
 from vplog.execution.execution import logged_warnings
-from vplog.execution.timing import Watch
+from vplog.execution.timing import StageTimer
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -41,13 +41,13 @@ class Step(Generic[T]):
 
     function: Callable[..., T]
     name: str
-    """In run.json and in the stage cache."""
+    """Name in run.json and in the stage cache."""
     codec: Callable[..., Codec[T]] | None
     """Makes the codec of the result from the inputs; None where nothing is cached."""
     items: Callable[..., int] | None
     """Number of items worked off, from the inputs."""
     without: frozenset[str]
-    """Inputs that the result does not depend on beyond what the others say."""
+    """Inputs that the key omits, as others stand for them."""
 
     @property
     def parameters(self) -> Iterable[str]:
@@ -78,7 +78,7 @@ class Steps:
         self.warnings: list[str] = []
         """Warnings of the run so far. What a cached step warned of is repeated when its result is found."""
         self.cache = StageCache(folder, drive, self.warnings, use_cache)
-        self._execution, self._watch = execution, Watch()
+        self._execution, self._watch = execution, StageTimer()
         self._results: dict[str, dict[str, Any]] = {}
         self._stack = ExitStack()
 
@@ -117,7 +117,7 @@ class Steps:
         result = "computed" if not reused else "reused" if reused == parts else "partly reused"
         self._results[name] = {"result": result, "parts": parts, "parts_reused": reused}
 
-    def account(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """Stages and totals as run.json has them."""
         stages = {
             name: {**self._results.get(name, {"result": "computed"}), **it} for name, it in self._watch.stages.items()

@@ -1,4 +1,4 @@
-"""The verbs that weigh recognisers against each other: each a plain function of its arguments."""
+"""The verbs that compare recognisers: each a plain function of its arguments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from vplog import api
-from vplog.cli.parser import at_least, at_least_one, local, option, pipeline_of, place, positive, topics_of
+from vplog.cli.parser import (
+    at_least,
+    at_least_one,
+    cache_options,
+    local,
+    option,
+    pipeline_of,
+    place,
+    positive,
+    topics_of,
+)
 from vplog.cli.printing import Progress, print_comparison, print_result, print_study
 from vplog.execution.execution import Execution
 
@@ -23,13 +33,15 @@ def compare(arguments: argparse.Namespace) -> None:
             tolerance=arguments.tolerance, distance_m=arguments.distance_m, heading_deg=arguments.heading_deg,
             pipeline=arguments.pipeline, settings=arguments.set, topics=topics_of(arguments), library=arguments.library,
             library_size=arguments.library_size, library_seed=arguments.library_seed, min_gap=arguments.min_gap,
-            sequence=arguments.sequence, out=arguments.output, threads=arguments.threads, progress=progress,
+            sequence=arguments.sequence, out=arguments.output, cache=arguments.cache, cache_gb=arguments.cache_gb,
+            threads=arguments.threads, progress=progress,
         )  # fmt: skip
     print_result(arguments, done.record, print_comparison)
 
 
 def study(arguments: argparse.Namespace) -> None:
     """Run the paper's experiments on two or more drives of one route, or on one that revisits places."""
+    from vplog.benchmark.feature_cache import CacheChoice
     from vplog.benchmark.recogniser_specs import split_methods
     from vplog.benchmark.study.experiments import METHODS, StudyOptions
     from vplog.benchmark.study.study import study as run_study
@@ -39,6 +51,7 @@ def study(arguments: argparse.Namespace) -> None:
     options = StudyOptions(
         METHODS if arguments.methods is None else split_methods(arguments.methods), arguments.sizes, arguments.seeds,
         arguments.library_size, arguments.min_gap, arguments.only, topics_of(arguments),
+        CacheChoice(arguments.cache, arguments.cache_gb),
     )  # fmt: skip
     with Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)
@@ -47,20 +60,26 @@ def study(arguments: argparse.Namespace) -> None:
 
 
 def add_studies(add: Callable[..., argparse.ArgumentParser], *parents: argparse.ArgumentParser) -> None:
-    truth = _truth_options()
-    _add_comparison(add("compare", compare, *parents, truth))
-    _add_study(add("study", study, *parents, truth))
+    _add_comparison(add("compare", compare, *parents, _truth_options(required=False)))
+    _add_study(add("study", study, *parents, _truth_options(required=True)))
 
 
-def _truth_options() -> argparse.ArgumentParser:
+def _truth_options(required: bool) -> argparse.ArgumentParser:
     sub = argparse.ArgumentParser(add_help=False)
-    text = "pairs `query,match`, frame i is frame i, poses in one frame, the odometry of the drives, or their GPS"
-    option(sub, "--truth", str, "FILE.csv|index|FILE.tum[,MAPFILE.tum]|poses|gps", text, required=True)
-    option(sub, "--tolerance", at_least(0), "N", "index: frames either side (default: 0)")
-    option(sub, "--distance-m", positive, "M", "poses, gps: same place within (default: 6)")
-    option(sub, "--heading-deg", positive, "DEG", "poses: and turned by at most (default: 45)")
+    text = (
+        "equal numbers in file names or frames, a table `query,match` or `image,label`, VPR-Bench's array, folders as "
+        "labels, positions in file names, poses in one frame, the odometry of the drives, or their GPS"
+    )
+    if not required:
+        text += " (default: none, so answers and no scores)"
+    kinds = "index|FILE.csv|FILE.npy|labels|utm|FILE.tum[,MAPFILE.tum]|poses|gps"
+    option(sub, "--truth", str, kinds, text, required=required)
+    option(sub, "--tolerance", at_least(0), "N", "index: numbers either side (default: 0)")
+    option(sub, "--distance-m", positive, "M", "poses, utm, gps: same place within (default: 6; utm: 25)")
+    option(sub, "--heading-deg", positive, "DEG", "poses, utm: and turned by at most (default: 45; utm: any)")
     option(sub, "--min-gap", at_least_one, "N", "a drive against itself: matches are N frames older or more")
     option(sub, "--library-size", at_least_one, "L", "its images (default: 100)", default=100)
+    cache_options(sub, "features are kept between calls")
     return sub
 
 
@@ -72,7 +91,7 @@ def _add_comparison(sub: argparse.ArgumentParser) -> None:
     option(sub, "--sequence", at_least_one, "L", "also match sequences of L frames")
     option(sub, "--library", place, "LOG|LIB", "reference images for all methods (default: MAP)")
     option(sub, "--library-seed", at_least(0), "S", "of that choice (default: 0)", default=0)
-    option(sub, "-o --output", local, "OUT", "folder for compare.json, scores and curves")
+    option(sub, "-o --output", local, "OUT", "folder for compare.json, answers.csv, scores and figures")
 
 
 def _add_study(sub: argparse.ArgumentParser) -> None:

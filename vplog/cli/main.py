@@ -28,10 +28,11 @@ from vplog.cli.parser import (
     pipeline_of,
     place,
     settings_options,
+    share,
     topic_options,
     topics_of,
 )
-from vplog.cli.printing import Progress, print_json, print_result, say
+from vplog.cli.printing import Progress, print_json, print_result, print_status
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, was_interrupted
 from vplog.execution.cores import available, limited
@@ -62,7 +63,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     arguments = _parser().parse_args(sys.argv[1:] if argv is None else argv)
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     try:
-        with _ended_by(signal.SIGTERM), _at_hand(arguments), limited(getattr(arguments, "threads", None)):
+        with _interrupted_by(signal.SIGTERM), _local_copies(arguments), limited(getattr(arguments, "threads", None)):
             arguments.verb(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
@@ -84,7 +85,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
 
 
 @contextmanager
-def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
+def _local_copies(arguments: argparse.Namespace) -> Iterator[None]:
     """Run folders and libraries named by URL are copied for the verb; what it writes to one is sent when it is done."""
     places = {name: getattr(arguments, name, None) for name in ("run", "runs", "library", "output")}
     if not any("://" in str(place) for place in places.values()):
@@ -104,8 +105,8 @@ def _at_hand(arguments: argparse.Namespace) -> Iterator[None]:
 
 
 @contextmanager
-def _ended_by(number: signal.Signals) -> Iterator[None]:
-    """What asks a process to end, as schedulers and containers do, ends it as Ctrl-C: workers and scratch files go."""
+def _interrupted_by(number: signal.Signals) -> Iterator[None]:
+    """SIGTERM, as schedulers and containers send it, ends the verb as Ctrl-C: workers and scratch files are removed."""
 
     def end(*_: object) -> NoReturn:
         _ended.append(number)
@@ -138,7 +139,7 @@ def _flush() -> None:
 
 def _interrupted(error: BaseException) -> NoReturn:
     known = getattr(error, "__notes__", ["what was finished in the output folder stays"])
-    say(f"interrupted; {known[-1]}")
+    print_status(f"interrupted; {known[-1]}")
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
 
@@ -146,7 +147,7 @@ def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
         raise  # noqa: PLE0704 (called from an except block)
     _flush()
-    say(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))
+    print_status(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))
     sys.exit(1)
 
 
@@ -219,19 +220,24 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
             arguments.refuse("the following arguments are required: LOG")
         if arguments.gps:
             arguments.set.append("gps.use=true")
+        if arguments.false_rate is not None:
+            arguments.set.append(f"false_rate.rate={arguments.false_rate!r}")
         return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
     from vplog.verbs.resume import resume_request
 
     if "://" in str(arguments.shown):
         arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
-    fixed = ("pipeline", "set", "library", "gps")
+    fixed = ("pipeline", "set", "library", "gps", "false_rate")
     names = [name for name in vars(arguments) if name in fixed or name.endswith(("_topic", "_file"))]
     given = [name for name in names if getattr(arguments, name) not in (None, [], False, "default")]
     if given or not arguments.cache:
         name = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{name}")
     request = resume_request(arguments.output, arguments.logs)
-    arguments.one_drive, arguments.force = not request.several, True  # what it replaces, it was asked when it began
+    arguments.one_drive, arguments.force = (
+        not request.several,
+        True,
+    )  # whether it may replace results was settled when it began
     return request.logs, request.pipeline, request.library, request.topics
 
 
@@ -346,6 +352,7 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     option(sub, "--library", place, "LIB", "reference library (default: made from the drive)")
     flag(sub, "--one-drive", "the logs are the parts of one recording")
     flag(sub, "--gps", "use the log's satellite fixes as constraints")
+    option(sub, "--false-rate", share, "R", "share of false closures to allow, as 0.01 (default: all verified ones)")
     flag(sub, "--resume", "continue the interrupted run in OUT; needs no LOG")
     _add_force(sub)
     flag(sub, "--no-cache", "do not cache results of stages in OUT for later runs", "cache")

@@ -11,10 +11,9 @@ from vplog.cli import printing
 from vplog.cli.parser import (
     at_least,
     at_least_one,
+    cache_options,
     flag,
-    local,
     local_file,
-    not_negative,
     option,
     place,
     settings_options,
@@ -85,16 +84,16 @@ def batch(arguments: argparse.Namespace) -> None:
             arguments.logs, arguments.map, arguments.pipeline, settings=arguments.set, topics=topics_of(arguments),
             library=arguments.library, jobs=arguments.jobs, threads=arguments.threads, engine=arguments.engine,
             address=arguments.address, retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
-            progress=progress, tell=progress.tell_drive,
+            progress=progress, on_drive=progress.print_drive,
         )  # fmt: skip
-    wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json says why."
+    wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
 
 
 def _end(
     arguments: argparse.Namespace, found: dict[str, Any], shown: Callable[[dict[str, Any]], None], wrong: str
 ) -> None:
-    """Print what became of a batch. Raises ResultError where it is not all well, whether anyone reads that or not."""
+    """Print the result of a batch. Raises ResultError where drives failed, even where stdout is closed."""
     from vplog.errors import ResultError
 
     try:
@@ -131,6 +130,16 @@ def query_map(arguments: argparse.Namespace) -> None:
     print_result(arguments, found.record, printing.print_answers)
 
 
+def localize(arguments: argparse.Namespace) -> None:
+    """Find the pose of pictures, or of the frames of a log, in a run or a map, with covariance and verdict."""
+    with Progress(arguments) as progress:
+        found = api.localize(
+            arguments.map, arguments.pictures, topics=topics_of(arguments), out=arguments.output, top=arguments.top,
+            threads=arguments.threads, progress=progress,
+        )  # fmt: skip
+    print_result(arguments, found, printing.print_localized)
+
+
 def index_map(arguments: argparse.Namespace) -> None:
     """Bring the index that queries search up to date with the drives of a map, as the next query would."""
     from vplog.maps.search.query import index_map as update
@@ -146,8 +155,13 @@ def add_maps(
     add: Callable[..., argparse.ArgumentParser], group: Callable[..., argparse.ArgumentParser],
     common: argparse.ArgumentParser, topics: argparse.ArgumentParser, threads: argparse.ArgumentParser,
 ) -> None:  # fmt: skip
-    """The verb `batch`, and the verb `map` with its own verbs."""
+    """The verbs `batch` and `localize`, and the verb `map` with its own verbs."""
     _add_batch(add("batch", batch, topics, threads, settings_options(None, "that of the map, else default")))
+    sub = add("localize", localize, topics, threads)
+    option(sub, "map", place, "MAP|RUN")
+    option(sub, "pictures", place, "IMAGE|LOG", "images, a folder of them, or one log", nargs="+")
+    option(sub, "--top", at_least_one, "K", "places that each picture is verified against (default: 10)", default=10)
+    option(sub, "-o --output", local_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
     text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
 
@@ -161,7 +175,8 @@ def add_maps(
     sub = verb("info", info_map, "what a map holds")
     flag(sub, "--check", "check every file against its sha256; a line for each damaged one, and exit status 1")
     _add_query(verb("query", query_map, "find where a log's views are in a map", topics, threads))
-    _add_cache(verb("index", index_map, "build the index that queries search", threads))
+    sub = verb("index", index_map, "build the index that queries search", threads)
+    cache_options(sub, "what is read of a map by URL is kept")
     _add_export(verb("export", export_map, "the places of a map or of runs, in one file", of_map=False))
     sub = verb("merge", merge_maps, "copy drives of maps into another map", of_map=False)
     option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
@@ -184,14 +199,7 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
-    _add_cache(sub)
-
-
-def _add_cache(sub: argparse.ArgumentParser) -> None:
-    text = "folder that caches what is read of a map by URL (default: $VPLOG_CACHE, else ~/.cache/vplog)"
-    option(sub, "--cache", local, "DIR", text)
-    text = "largest size of the cache in GB; least recently used files go first, 0 keeps none (default: 20)"
-    option(sub, "--cache-gb", not_negative, "GB", text)
+    cache_options(sub, "what is read of a map by URL is kept")
 
 
 def _add_export(sub: argparse.ArgumentParser) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps")
+_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu")
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -179,16 +179,23 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
     from vplog.logs import TopicChoice
 
     chosen = {role.replace("-", "_"): getattr(arguments, f"{role.replace('-', '_')}_topic") for role in _ROLES}
-    return TopicChoice(**chosen, odometry_file=arguments.odometry_file, calibration_file=arguments.calibration_file)
+    others = ("odometry_file", "calibration_file", "start_s", "stop_s", "wheelbase_m", "track_m", "wheel_radius_m")
+    return TopicChoice(**chosen, **{name: getattr(arguments, name) for name in others})
 
 
 def topic_options() -> argparse.ArgumentParser:
     topics = argparse.ArgumentParser(add_help=False)
     for role in _ROLES:
-        option(topics, f"--{role}-topic", str, "TOPIC", f"use this {role} topic")
+        names = "--odometry --odometry-topic" if role == "odometry" else f"--{role}-topic"
+        what = f"use this {role} topic" + (", or a source: twist, gps, visual, truth" if role == "odometry" else "")
+        option(topics, names, str, "TOPIC", what, dest=f"{role.replace('-', '_')}_topic")
+    for name, what in (("wheelbase", "axles"), ("track", "left and right wheels"), ("wheel-radius", "hub and road")):
+        option(topics, f"--{name}-m", positive, "M", f"metres between {what}, for odometry of wheels")
+    option(topics, "--start", not_negative, "S", "leave out images before S seconds of the log", dest="start_s")
+    option(topics, "--stop", not_negative, "S", "leave out images from S seconds of the log on", dest="stop_s")
     option(topics, "--odometry-file", resolved, "FILE.tum", "use these poses as the odometry")
-    text = "camera_info YAML, Kalibr camchain or EuRoC sensor.yaml"
-    option(topics, "--calibration", resolved, "FILE.yaml", text, dest="calibration_file")
+    text = "YAML of ROS, OpenCV, Kalibr, EuRoC, VSLAM-LAB or ORB-SLAM, KITTI's calib.txt, COLMAP's cameras"
+    option(topics, "--calibration", resolved, "FILE", text, dest="calibration_file")
     return topics
 
 
@@ -198,6 +205,13 @@ def settings_options(unless_given: str | None, called: str) -> argparse.Argument
     option(settings, "--pipeline", str, "P", f"shipped name or .yaml file (default: {called})", default=unless_given)
     option(settings, "--set", str, "A.B=C", "change one setting; repeatable", action="append", default=[])
     return settings
+
+
+def cache_options(sub: argparse.ArgumentParser, what: str) -> None:
+    text = f"folder in which {what} (default: $VPLOG_CACHE, else ~/.cache/vplog)"
+    option(sub, "--cache", local, "DIR", text)
+    text = "largest size of the cache in GB; least recently used files go first, 0 keeps none (default: 20)"
+    option(sub, "--cache-gb", not_negative, "GB", text)
 
 
 def resolved(text: str) -> Path:
@@ -236,3 +250,4 @@ def _number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]
 
 not_negative = _number(lambda value: 0 <= value < math.inf, "of 0 or more")
 positive = _number(lambda value: 0 < value < math.inf, "above 0")
+share = _number(lambda value: 0 < value < 1, "between 0 and 1")

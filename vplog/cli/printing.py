@@ -28,15 +28,15 @@ _UNMOVED_M = 1e-3
 """m: less is what rounding and the solver's last digits come to."""
 
 
-def say(message: str) -> None:
-    """A line on stderr, wrapped as those of results. Where that is closed or full, no work is lost for it."""
+def print_status(message: str) -> None:
+    """A line on stderr, wrapped as those of results; a closed or full stderr is ignored."""
     with suppress(OSError):
         print(_wrapped(f"vplog: {without_secrets(message)}", terminal_width(sys.stderr)), file=sys.stderr)
 
 
 def warn(warnings: Iterable[str]) -> None:
     for warning in warnings:
-        say(f"warning: {warning}")
+        print_status(f"warning: {warning}")
 
 
 def terminal_width(stream: TextIO) -> int | None:
@@ -88,14 +88,14 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_next(look: str, *commands: str) -> None:
-    """Where to look at what came of it, and the commands that go on from there, each on a line to be copied."""
+    """Where the results are, and the next commands, each on a line to be copied."""
     print_line("look at", look)
     for command in commands:
         print(f"{'next':10}{command}")
 
 
 def print_info(found: dict[str, Any]) -> None:
-    from vplog.verbs.info import in_words
+    from vplog.verbs.info import preflight_lines
 
     seconds = max(found["end_ns"] - found["start_ns"], 0) / 1e9
     print(f"log       {found['path']}")
@@ -106,7 +106,7 @@ def print_info(found: dict[str, Any]) -> None:
         used = "yes" if topic["used"] else ""
         rows.append((topic["name"], topic["type"], str(topic["count"]), rate, topic["role"], used, topic["why"]))
     print_table(("topic", "type", "count", "Hz", "role", "used", "why"), rows)
-    for name, text in in_words(found):
+    for name, text in preflight_lines(found):
         print_line(name, text)
     for gap in found["gaps"]:
         print_line("gap", f"{gap['seconds']:.1f} s without {gap['what']}, {gap['after_s']:.1f} s after the start")
@@ -122,7 +122,7 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
     from vplog.data import Verdict
 
     counts, totals, named = record["counts"], record["totals"], shlex.quote(str(out))
-    print_line(f"{out}:", _came_of(outcome, record))
+    print_line(f"{out}:", _outcome_text(outcome, record))
     print_line("", f"{counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates:")
     for name, count in counts["verdicts"].items():
         print_line(f"{count:9d}", f"{name}: {Verdict(name).sentence}")
@@ -134,7 +134,7 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
     print_next(f"{out}/report.html in a browser, {out}/result.mcap in Foxglove", *commands)
 
 
-def _came_of(outcome: Outcome, record: dict[str, Any]) -> str:
+def _outcome_text(outcome: Outcome, record: dict[str, Any]) -> str:
     if outcome.moved_m < _UNMOVED_M:  # the reason is what the user needs, whatever its words
         return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
     closures = f"{outcome.closures} closure{'' if outcome.closures == 1 else 's'}"
@@ -162,7 +162,7 @@ def print_joint(out: Path, record: dict[str, Any]) -> None:
 
 
 def print_evaluation(found: dict[str, Any]) -> None:
-    from vplog.evaluate.closures import in_words
+    from vplog.evaluate.closures import closure_sentences
 
     for number, one in enumerate(found.get("maps", [])):
         ate = one["ate_after"]
@@ -170,17 +170,17 @@ def print_evaluation(found: dict[str, Any]) -> None:
         for drive in one["drives"]:
             before, after = drive["ate_before"]["rmse_m"], drive["ate_after"]["rmse_m"]
             print_line(f"  {drive['drive']}:", f"ATE rmse {before:.6f} m before, {after:.6f} m after, by itself")
-            _print_lines("  closures", in_words(drive["closures"]))
+            _print_lines("  closures", closure_sentences(drive["closures"]))
     for pair in found.get("joins", []):
         if pair["accepted"] or pair["not_judged"]:
-            _print_lines(f"  {pair['query_drive']} to {pair['match_drive']}:", in_words(pair))
+            _print_lines(f"  {pair['query_drive']} to {pair['match_drive']}:", closure_sentences(pair))
     for drive, why in found.get("uncovered", {}).items():
-        say(f"warning: {drive} is left out: {why}")
+        print_status(f"warning: {drive} is left out: {why}")
     if "maps" in found:
         return
     warn(_truth_notes(found))
     if found.get("closures"):
-        _print_lines("closures", in_words(found["closures"]))
+        _print_lines("closures", closure_sentences(found["closures"]))
     residuals = found.get("residuals")
     if residuals and residuals["to_truth"] is not None:
         near = "" if residuals["to_neighbours"] is None else f", {residuals['to_neighbours']:.2f} to its neighbours"
@@ -211,6 +211,8 @@ def _truth_notes(found: dict[str, Any]) -> list[str]:
     if truth is not None and truth["frame"] != "body":
         what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
         notes.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
+    if truth is not None and truth["odometry"]:
+        notes.append("The odometry of this run is the truth itself: ATE, RPE and drift say nothing, closures do.")
     if truth is not None and not truth["oriented"]:
         notes.append(
             "The truth has no orientations, so closures are judged by place, without heading. To judge their "
@@ -238,7 +240,7 @@ def print_explanation(found: dict[str, Any]) -> None:
 def print_optimised(found: dict[str, Any]) -> None:
     print(
         f"{found['output']}: {found['poses']} poses, {found['edges']} edges; of {found['loops']} closures "
-        f"{found['kept']} were kept, {found['rejected']} rejected"
+        f"{found['kept']} were accepted, {found['rejected']} rejected"
     )
     print(f"  error {found['error_before']:.6g} before, {found['error_after']:.6g} after (half the chi-square)")
     print(f"  {found['reason']}")
@@ -249,7 +251,7 @@ def print_optimised(found: dict[str, Any]) -> None:
 
 
 _BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
-"""What the table of a batch tells of each drive, with its decimals."""
+"""Cost columns of the table of a batch, with their decimals."""
 
 
 def print_batch(found: dict[str, Any]) -> None:
@@ -271,7 +273,7 @@ def print_batch(found: dict[str, Any]) -> None:
         print_line("together", ", ".join(component["drives"]))
     for drive in found["drives"]:
         for warning in drive["warnings"]:
-            say(f"warning: {drive['drive']}: {warning}")
+            print_status(f"warning: {drive['drive']}: {warning}")
     warn(found["warnings"] + (found["joined"] or {}).get("warnings", []))
     named = shlex.quote(str(found["map"]))
     look = f"{found['map']}/runs/drive=ID/report.html of each drive"
@@ -301,15 +303,17 @@ def print_map(found: dict[str, Any]) -> None:
         rows.append((drive["drive"], *counts, *costs))
     print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"), rows)
     for drive, failure in found["failures"].items():
-        say(f"failed: {drive}: {failure['error']}")
+        print_status(f"failed: {drive}: {failure['error']}")
     warn(found["problems"])
     for line in found["damaged_files"]:
-        say(f"damaged: {line}")
+        print_status(f"damaged: {line}")
 
 
 def print_export(found: dict[str, Any]) -> None:
     for drive in found.get("left_out", ()):
-        say(f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes.")
+        print_status(
+            f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes."
+        )
     warn(found.get("warnings", ()))
     print(f"{found['written']}: {found['places']} places of {len(found['drives'])} drives")
 
@@ -362,7 +366,13 @@ def print_redescribed(found: dict[str, Any]) -> None:
 def print_answers(found: dict[str, Any]) -> None:
     """The best place of every view; all of them are in the file and in the JSON."""
     rows = [
-        (str(one["query"]), one["drive"], str(one["keyframe"]), f"{one['score']:.3f}", str(one["support"]))
+        (
+            one.get("query_name", str(one["query"])),
+            one["drive"],
+            one.get("match_name", str(one["keyframe"])),
+            f"{one['score']:.3f}",
+            str(one["support"]),
+        )
         for one in found["answers"]
         if one["rank"] == 0
     ]
@@ -373,24 +383,79 @@ def print_answers(found: dict[str, Any]) -> None:
         print(f"written   {found['written']}")
 
 
+def print_localized(found: dict[str, Any]) -> None:
+    """The pose of every picture that has one, and why the others have none."""
+    rows = [
+        (
+            one["picture"], *(f"{one[name]:.3f}" for name in ("tx", "ty", "tz")), f"{one['sigma_m']:.2g}",
+            f"{one['sigma_deg']:.2g}", str(one["inliers"]), f"{one['drive']}:{one['keyframe']}",
+        )
+        for one in found["answers"]
+        if one["localized"]
+    ]  # fmt: skip
+    if rows:
+        print_table(("picture", "x\nm", "y\nm", "z\nm", "sigma\nm", "sigma\ndeg", "inliers", "at"), rows)
+    for one in found["answers"]:
+        if not one["localized"]:
+            print_line(f"{one['picture']}:", one["sentence"])
+    warn(found["warnings"])
+    print(f"{found['localized']} of {found['pictures']} pictures are localised in {found['map']}")
+    if found["written"]:
+        print(f"written   {found['written']}")
+
+
 def print_comparison(found: dict[str, Any]) -> None:
+    truth = f", {found['positives']} with a true match," if found["truth"]["source"] is not None else ""
     print_line(
         f"{found['queries']}",
-        f"queries, {found['positives']} with a true match, against {found['map_frames']} frames; library of "
-        f"{found['library']['size']} images",
+        f"queries{truth} against {found['map_frames']} frames; library of {found['library']['size']} images",
     )
-    shares = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1")
+    shares = {
+        "r_at_1": "R@1", "r_at_5": "R@5", "r_at_10": "R@10", "anr": "ANR\n%", "ap": "AP", "recall_at_p100": "R@\nP100",
+        "f1": "F1",
+    }  # fmt: skip
+    if not truth:
+        shares = {}
+        _print_best_answers(found["answers"])
+    nowhere = found["queries"] > found["positives"]
+    titles = [*shares.values(), *(("AUROC", "R@1%\nalarms") if truth and nowhere else ()), "bytes"]
     rows: list[Sequence[str]] = []
     for name, method in found["methods"].items():
-        costs = [f"{method['bytes_per_image']:g}"]
-        costs += [f"{method[cost]:.2f}" for cost in ("encode_ms", "query_ms")]
-        rows.append((name, *(f"{method[share]:.3f}" for share in shares), *costs))
-        if "sequence" in method:
+        costs = [""] * 3  # of answers from a file
+        if "bytes_per_image" in method:
+            costs = [f"{method['bytes_per_image']:g}", f"{method['encode_ms']:.2f}", f"{method['query_ms']:.2f}"]
+        rows.append((name, *_shares(method, shares, nowhere), *costs))
+        if "sequence" in method and shares:
             scores = method["sequence"]
-            rows.append((f"  L={scores['length']}", *(f"{scores[share]:.3f}" for share in shares), "", "", ""))
-    titles = ("method", "R@1", "R@5", "R@10", "ANR\n%", "AP", "R@\nP100", "F1", "bytes", "encode\nms", "query\nms")
-    print_table(titles, rows)
+            rows.append((f"  L={scores['length']}", *_shares(scores, shares, nowhere), "", "", ""))
+    print_table(("method", *titles, "encode\nms", "query\nms"), rows)
+    print_protocol(found["protocol"])
     warn(found["warnings"])
+
+
+def _shares(scores: dict[str, Any], names: Iterable[str], nowhere: bool) -> list[str]:
+    """Figures of a method, those of queries without a match last."""
+    found = [scores[name] for name in names]
+    if found and nowhere:
+        found += [scores["open_set"][name] for name in ("auroc", "recall_at_1_percent_false_alarms")]
+    return [f"{value:.3f}" for value in found]
+
+
+def print_protocol(protocol: dict[str, Any]) -> None:
+    print_line("protocol", protocol["text"])
+
+
+def _print_best_answers(answers: list[dict[str, Any]] | str) -> None:
+    """The best answer to every query, a column for each method; where they were written, where."""
+    if isinstance(answers, str):
+        print_line("answers", answers)
+        return
+    by_query: dict[int, dict[str, str]] = {}
+    for one in answers:
+        row = by_query.setdefault(one["query"], {"query": one["query_name"] or str(one["query"])})
+        row[one["method"]] = "" if one["match"] is None else one["match_name"] or str(one["match"])
+    titles = list(dict.fromkeys(title for row in by_query.values() for title in row))
+    print_table(titles, [[row.get(title, "") for title in titles] for row in by_query.values()])
 
 
 def print_study(out: Path, found: dict[str, Any]) -> None:
@@ -416,6 +481,8 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
         rows = done["ablations"]["rows"]
         table = [(row["name"], row["setting"], *(f"{row[f'{score}_change']:+.3f}" for score in scores)) for row in rows]
         print_table(("bobb without", "setting", *titles), table)
+    for protocol in {one["text"]: one for one in found["protocol"]}.values():
+        print_protocol(protocol)
     warn(found["warnings"])
     figures = sum(len(one["figures"]) for one in done.values()) // 2
     print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")
@@ -449,17 +516,19 @@ class Progress:
             self._tasks[stage] = self._bars.add_task(stage, total=total)
         self._bars.update(self._tasks[stage], completed=done, total=total)
 
-    def tell_drive(self, drive: Drive) -> None:
+    def print_drive(self, drive: Drive) -> None:
         """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
         if self._line_by_line:
-            say(f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}")
+            print_status(
+                f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}"
+            )
 
 
 def print_result(
-    arguments: argparse.Namespace, found: dict[str, Any], in_words: Callable[[dict[str, Any]], None]
+    arguments: argparse.Namespace, found: dict[str, Any], print_text: Callable[[dict[str, Any]], None]
 ) -> None:
     """One JSON object with --json, else in words."""
-    (print_json if arguments.json else in_words)(found)
+    (print_json if arguments.json else print_text)(found)
 
 
 def print_json(tree: dict[str, Any]) -> None:

@@ -9,7 +9,14 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vplog.cli.parser import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
-from vplog.cli.printing import print_evaluation, print_explanation, print_json, print_optimised, print_result
+from vplog.cli.printing import (
+    Progress,
+    print_evaluation,
+    print_explanation,
+    print_json,
+    print_optimised,
+    print_result,
+)
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
@@ -18,13 +25,15 @@ if TYPE_CHECKING:
 
     from vplog.verbs.evaluate_run import TruthOptions
 
+_TRUTH = "TUM file, the log's own GPS, or the truth that comes with it"
 _SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
 """The kinds of graph/solve.py, here too since that imports numpy."""
 _ALIGNMENTS = ("se3", "sim3", "origin")
 """Those of evaluate/trajectory.py, here too since that imports numpy."""
 _MOST_OFFSET_S = 1e9
 """s; thirty years, from any clock that starts at zero to one of today."""
-_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+_FOLDERS = ("colmap", "nerfstudio")
+_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
 """Those of export.py, here too since that imports numpy."""
 _BINARY = ("geoparquet", "rrd")
 
@@ -70,8 +79,13 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a finished run in the format of another tool."""
     from vplog.verbs.export import export as export_run
 
-    with _file_or_stdout(arguments, arguments.format in _BINARY) as path:
-        found = export_run(arguments.run, arguments.format, path)
+    if arguments.output is STDOUT and arguments.format in _FOLDERS:
+        from vplog.errors import SettingsError
+
+        raise SettingsError(f"{arguments.format} is a folder, which stdout does not take. Name one with -o.")
+    with _file_or_stdout(arguments, arguments.format in _BINARY) as path, Progress(arguments) as progress:
+        execution = Execution(arguments.threads, progress)
+        found = export_run(arguments.run, arguments.format, path, arguments.log, execution)
     if arguments.json:
         print_json(found)
     elif path == arguments.output:
@@ -116,24 +130,25 @@ def add_results(
 ) -> None:
     sub = add("evaluate", evaluate, topics)
     option(sub, "run", place, "RUN")
-    option(sub, "--truth", str, "FILE.tum|gps", "TUM file, or the log's own GPS", required=True)
+    option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH, required=True)
     _add_truth_options(sub)
     _add_explain(add("explain", explain))
     sub = add("report", report, topics, threads)
     option(sub, "run", place, "RUN")
-    option(sub, "--truth", str, "FILE.tum|gps", "TUM file, or the log's own GPS")
+    option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
     option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
     option(sub, "-o --output", local_file, "FILE.html", "page (default: RUN/report.html)")
-    sub = add("export", export)
+    sub = add("export", export, threads)
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    option(sub, "-o --output", local_file_or_stdout, "FILE", "file to write; - is stdout", required=True)
+    option(sub, "-o --output", local_file_or_stdout, "FILE|FOLDER", "what to write; - is stdout", required=True)
+    option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)
     option(sub, "graph", local_file, "GRAPH.g2o")
     option(sub, "-o --output", place, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
-    text = "say whether the solution is the global optimum of the edges kept, and look for a better one if not"
+    text = "report whether the solution is the global optimum of the accepted edges, and look for a better one if not"
     sub.add_argument("--certify", action="store_true", help=text)
 
 

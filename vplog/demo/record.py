@@ -53,7 +53,7 @@ _DELAY_NS = (2_000_000, 30_000_000)
 _CHUNK_BYTES = 1 << 20
 """Uncompressed size of a chunk; about ten frames."""
 _MARKED_BYTES = 100
-"""A demo's file says within so much that it is one: the log behind 8 bytes of magic, 17 of a header, and `ros2`."""
+"""Bytes in which a demo's file has its mark: in the log behind 8 bytes of magic, 17 of a header, and `ros2`."""
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 
@@ -87,7 +87,7 @@ def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Ex
 
 
 def _check_own(path: Path, mark: bytes) -> None:
-    """Raises ResultError where a file is there that no demo has written, told by what one begins with."""
+    """Raises ResultError where a file exists that no demo has written, by its first bytes."""
     if path.exists():
         with path.open("rb") as stream:
             begins = stream.read(_MARKED_BYTES)
@@ -173,7 +173,7 @@ def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
 
 
 def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]]:
-    """Image, calibration and, if asked for, depth and the right image of every frame."""
+    """Image, calibration and, if enabled, depth and the right image of every frame."""
     settings, baseline_m = scene.settings, scene.settings.stereo_baseline_m
 
     def jpeg(image: Bytes) -> Bytes:

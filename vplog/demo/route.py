@@ -1,4 +1,4 @@
-"""Where the car is at any time, and what its odometry and satellite receiver make of that.
+"""Where the car is at any time, and the measurements of its odometry and satellite receiver.
 
 The world is flat, x east, y north, z up, its origin the centre of the block. Distance is metres along the axis of
 the street, counter-clockwise from the middle of the southern side; lateral is metres left of that axis.
@@ -77,7 +77,7 @@ def world_from_body(settings: DemoSettings, stamp_ns: Ints) -> Floats:
     """(T, 4, 4) truth: along the street at constant speed, with the small sway of a car on its springs."""
     time_s: Floats = (stamp_ns - START_NS).astype(np.float64) * 1e-9
     distance_m = settings.speed_m_s * time_s
-    step_m = 0.05  # short against every bend, long against rounding
+    step_m = 0.05  # short against every curve, long against rounding
     forward = track_point(settings, distance_m + step_m) - track_point(settings, distance_m - step_m)
     yaw = np.arctan2(forward[:, 1], forward[:, 0])[:, None] * [0, 0, 1]
     # Sway: 0.4 and 0.3 degrees, 1.5 cm, at periods of the order of a second that share no multiple.

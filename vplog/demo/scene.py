@@ -1,4 +1,4 @@
-"""Everything there is to know about a drive before it is recorded, and the picture of any frame of it.
+"""The scene of a drive before it is recorded, and the renderer of its frames.
 
 Textured parallelograms before a pinhole camera: z-buffer, anisotropic texture filter, sun light. Every quad's image is
 a homography of its texture, so a pixel costs one 3x3 product.
@@ -27,7 +27,7 @@ BODY_FRAME = "base_link"
 _FIELD_OF_VIEW_DEG, _IMAGE_NOISE = 80.0, 1.5
 """Horizontal field of view; standard deviation of the sensor noise in grey levels."""
 _MOUNT_M = (0.3, 0.0, 1.5)
-"""Of the camera ahead of, left of and above the body's origin on the ground: behind the windscreen."""
+"""The camera's position ahead of, left of and above the body's origin on the ground: behind the windscreen."""
 _MOUNT_PITCH_RAD = 0.035
 """2 degrees down, so that nothing works that takes the camera for level."""
 NEAR_M = 0.2
@@ -134,7 +134,7 @@ def render(
         boxes[order],
         quads.texture[order],
         lit[order],
-        *world.textures,
+        world.textures,
         image,
         nearness,
     )
@@ -160,8 +160,9 @@ def _boxes(camera: Camera, corners: Floats) -> Int32s:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(quad_from_image, boxes, texture, lit, pixels, levels, image, nearness):
+def _draw(quad_from_image, boxes, texture, lit, textures, image, nearness):
     """Lay quads, near ones first, over an image (H, W) of grey 0..255 in full light and its 1 / depth (H, W)."""
+    pixels, levels = textures
     for q in range(len(boxes)):
         h = quad_from_image[q]
         for y in range(boxes[q, 1], boxes[q, 3]):

@@ -37,7 +37,7 @@ class DemoSettings(Settings):
     odometry_rate_hz: float = Field(default=20.0, gt=1, le=1000)
     """Odometry samples per second."""
     odometry_scale_error: float = Field(default=0.01, ge=-0.5, le=0.5)
-    """Relative error of every odometry step's length: wheels that are larger than the software believes."""
+    """Relative error of every odometry step's length: wheels that are larger than the software assumes."""
     odometry_yaw_bias_rad_s: float = Field(default=0.011, ge=-1, le=1)
     """Constant error of the yaw rate: an uncalibrated gyroscope."""
     odometry_step_noise_m: float = Field(default=0.004, ge=0, le=1)

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from vplog.demo.settings import DemoSettings
 
 PX_PER_M = 48
-"""Of walls and objects: at the default 640 px and 80 degrees a wall 8 m away is seen at this scale."""
+"""Scale of walls and objects: at the default 640 px and 80 degrees a wall 8 m away is seen at this scale."""
 GROUND_PX_PER_M = 32
-"""Of the ground, which is seen more obliquely and is far larger."""
+"""Scale of the ground, which is viewed more obliquely and is far larger."""
 _LETTERS = list(string.ascii_uppercase + string.digits)
-HALF_STREET_M = 5.0
+HOUSE_LINE_M = 5.0
 """From the axis to the houses of either side, which stand up to 0.5 m before or behind that line."""
 _ROAD_M = 7.4
 """Between the kerbs."""
@@ -34,7 +34,7 @@ _HOUSE_DEPTH_M = 10.0
 _MARGIN_M = 24.0
 """The ground reaches this far beyond the axis."""
 _LEVELS = 9
-"""Of every texture's pyramid: the last halves 480 px to 2 px."""
+"""Levels of every texture pyramid: the last has 2 px of 480."""
 _POSTERS = 24
 """Pictures that cars and people are made of."""
 
@@ -193,16 +193,16 @@ def _boxes(foot: Floats, heading: Floats, size: Floats, side: Ints, end: Ints) -
 def build_world(settings: DemoSettings) -> World:
     """Houses along both sides of the street around the block, and the ground. Everything follows from the seed."""
     rng = np.random.default_rng([settings.seed, 1])
-    half = np.array([settings.block_length_m, settings.block_width_m]) / 2
-    upper_left, size = (half + _MARGIN_M) * (-1, 1), 2 * (half + _MARGIN_M)
+    extent = np.array([settings.block_length_m, settings.block_width_m]) / 2
+    upper_left, size = (extent + _MARGIN_M) * (-1, 1), 2 * (extent + _MARGIN_M)
     axis, _ = axis_point(settings, np.arange(0, lap_length(settings), 0.1))
     pictures = [ground(rng, (axis - upper_left) * (1, -1), size, _ROAD_M)]
     pictures += [poster(rng, 2.0, 1.0) for _ in range(_POSTERS)]
     placed: list[tuple[float, ...]] = [(0, 0, -0.01, 0, *size, 0.01, 0, 0)]  # the ground is a flat box
     for turn, left in product(range(4), (-1, 1)):  # the straight sides as the car drives, the block on its left
-        heading, (ahead_m, across_m) = turn * np.pi / 2, half[:: 1 - 2 * (turn % 2)].tolist()
+        heading, (ahead_m, across_m) = turn * np.pi / 2, extent[:: 1 - 2 * (turn % 2)].tolist()
         c, s = np.cos(heading), np.sin(heading)
-        for x, y, bottom, *box in _row_of_houses(rng, pictures, ahead_m - left * HALF_STREET_M, half.min(), left):
+        for x, y, bottom, *box in _row_of_houses(rng, pictures, ahead_m - left * HOUSE_LINE_M, extent.min(), left):
             y -= across_m  # noqa: PLW2901
             placed.append((c * x - s * y, s * x + c * y, bottom, heading, *box))
     table = np.array(placed)
@@ -221,9 +221,9 @@ def _row_of_houses(
     count = max(1, round(reach_m / 4.75))
     cuts = np.linspace(-reach_m, reach_m, count + 1)
     cuts[1:-1] += rng.uniform(-0.8, 0.8, count - 1)
-    depth_m = min(_HOUSE_DEPTH_M, 0.9 * (room_m - HALF_STREET_M))
+    depth_m = min(_HOUSE_DEPTH_M, 0.9 * (room_m - HOUSE_LINE_M))
     for a, b in pairwise(cuts.tolist()):
-        high, front = rng.uniform(6.0, 9.5), HALF_STREET_M + rng.uniform(-0.5, 0.5)
+        high, front = rng.uniform(6.0, 9.5), HOUSE_LINE_M + rng.uniform(-0.5, 0.5)
         pictures.append(facade(rng, b - a, high))
         yield (a + b) / 2, left * (front + depth_m / 2), 0, b - a, depth_m, high, len(pictures) - 1, len(pictures) - 1
         for _ in range(int(rng.integers(4, 9))):  # signs and balconies, or bins and poles at the kerb

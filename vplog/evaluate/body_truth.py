@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Trajectory
-from vplog.evaluate.pairs import around, poses_at
+from vplog.evaluate.pairs import bracketing, poses_at
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class BodyTruth:
         if self.odometry is None:
             poses, known = poses_at(truth, stamp_ns)
             return TruthAt(poses, known, np.zeros((len(stamp_ns), 2)))
-        left, right, known = around(truth.stamp_ns, stamp_ns)
+        left, right, known = bracketing(truth.stamp_ns, stamp_ns)
         left, right, at_ns = left[known], right[known], stamp_ns[known]
         moved = _at(self.odometry, at_ns)
         poses = [

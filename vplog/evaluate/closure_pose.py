@@ -97,16 +97,16 @@ def pose_errors(
     lever = match.error[there, 0] * np.linalg.norm(true[:, :3, 3], axis=1)
     unsure = np.hypot(query.error[here], match.error[there])
     unsure[:, 1] = np.hypot(unsure[:, 1], lever)
-    inside, maybe, honest = (np.ones(len(rows), bool) for _ in range(3))
+    within, possible, consistent = (np.ones(len(rows), bool) for _ in range(3))
     for part, error in enumerate((se3.so3_log(apart[:, :3, :3]), apart[:, :3, 3])):
         covariance = claimed[:, 3 * part : 3 * part + 3, 3 * part : 3 * part + 3]
         size = np.maximum(np.linalg.norm(error, axis=1), 1e-12)
         left = error * np.maximum(1.0 - unsure[:, part] / size, 0.0)[:, None]
-        inside &= _within(error, covariance, bounds.b[part])
-        maybe &= _within(left, covariance, bounds.b[part])
-        honest &= _normalised(left, covariance) <= _CHI
+        within &= _within(error, covariance, bounds.b[part])
+        possible &= _within(left, covariance, bounds.b[part])
+        consistent &= _normalised(left, covariance) <= _CHI
     right, wrong, overconfident = (np.zeros(len(closures), bool) for _ in range(3))
-    right[rows], wrong[rows], overconfident[rows] = inside, ~maybe, inside & ~honest
+    right[rows], wrong[rows], overconfident[rows] = within, ~possible, within & ~consistent
     return posed, right, wrong, overconfident
 
 

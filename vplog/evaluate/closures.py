@@ -58,7 +58,7 @@ class Judgement:
     right: Bools
     """(C,) by pose where there is one, else by place."""
     wrong: Bools
-    """(C,) neither right nor wrong: not judged, as the truth is missing or too coarse."""
+    """(C,) closures neither right nor wrong are not judged: the truth is missing or too coarse."""
     curves: dict[str, Floats] = field(default_factory=dict)
     """By what candidates are ranked, (P, 3): recall of the revisits, precision of the candidates, and the value from
     which on; empty where nothing was revisited."""
@@ -100,7 +100,7 @@ class ClosureScore:
     directions: int
     """Closures that the solve took without metres (`direction_only`)."""
     directions_true: int
-    """Those whose turn and direction are right."""
+    """Direction-only closures whose rotation and direction are right."""
     average_precision: float | None
     """Area below precision over recall of all candidates by falling score, whatever their verdict, by place."""
     recall_at_full_precision: float | None
@@ -195,7 +195,7 @@ def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion)
     }
 
 
-def in_words(closures: dict[str, Any]) -> list[str]:
+def closure_sentences(closures: dict[str, Any]) -> list[str]:
     """Sentences of a ClosureScore, or of the counts between two drives with their criterion, as plain values."""
     share = {
         name: "none" if closures.get(name) is None else f"{closures[name]:.3f}"
@@ -326,7 +326,7 @@ class PoseScore:
     """Errors of the keyframes' poses, normalised by their covariances, both relative to the first keyframe."""
 
     keyframes: int
-    """Those with a covariance and a truth."""
+    """Keyframes with a covariance and a truth."""
     nees: float | None
     """Mean of e' C^-1 e / 6: about 1 for honest covariances. Neighbours share their errors, so that one drive alone is
     within a factor of 2 or 3 of it."""

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.errors import TruthError
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 
@@ -20,9 +18,6 @@ _MAX_GAP_S = 2.0
 """s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""
 _UPRIGHT = 0.9
 """Length of the mean of unit vectors: they are within some 25 degrees of each other."""
-_LINE_LIMIT = 256
-"""Characters; two frame numbers take about 15, and a file without line ends is not read whole."""
-_CSV_FORMAT = "A truth table has the header line `query,match`, then one pair of frame numbers a line, counted from 0."
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,56 +60,15 @@ class Pairs:
 
 
 def index_pairs(query: Ints, match: Ints, tolerance: int) -> Pairs:
-    """Frame i of one traversal shows the place of frame i of the other, give or take `tolerance` frames.
+    """Frame i of one traversal shows the place of frame i of the other, give or take `tolerance`.
 
-    `query` (Q,) and `match` (M,) are the frames' numbers in their traversals, increasing.
+    `query` (Q,) and `match` (M,) are the numbers of the frames, increasing.
     """
     first = np.searchsorted(match, query - tolerance, side="left")
     stop = np.searchsorted(match, query + tolerance, side="right")
     some = first < stop
     start = np.concatenate([[0], np.cumsum(some)]).astype(np.int64)
     return Pairs(start, first[some].astype(np.int32), stop[some].astype(np.int32))
-
-
-def read_pairs(path: Path, queries: int, matches: int) -> Ints:
-    """(P, 2) pairs of a table `query,match`: frame numbers below `queries` and `matches`, counted from 0.
-
-    Blank lines are skipped. Raises TruthError with the number of the first line that does not fit.
-    """
-    pairs: list[tuple[int, int]] = []
-    try:
-        with path.open(encoding="utf-8-sig") as lines:
-            header, number = None, 0
-            while line := lines.readline(_LINE_LIMIT):
-                number += 1
-                if len(line) >= _LINE_LIMIT:
-                    raise TruthError(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {_CSV_FORMAT}")
-                fields = [field.strip() for field in line.split(",")]
-                if fields == [""]:
-                    continue
-                if header is None:
-                    header = fields
-                    if header != ["query", "match"]:
-                        raise TruthError(f"{path}:{number} is not the header. {_CSV_FORMAT}")
-                    continue
-                pairs.append(_pair(fields, (queries, matches), f"{path}:{number}"))
-    except OSError as error:
-        raise TruthError(f"Cannot read {path}: {error.strerror}. {_CSV_FORMAT}") from None
-    except UnicodeDecodeError:
-        raise TruthError(f"{path} is not text. {_CSV_FORMAT}") from None
-    if not pairs:
-        raise TruthError(f"{path} holds no pair. {_CSV_FORMAT}")
-    return np.array(pairs, np.int64)
-
-
-def _pair(fields: list[str], counts: tuple[int, int], where: str) -> tuple[int, int]:
-    if len(fields) != 2 or not all(field.isascii() and field.isdigit() and len(field) < 10 for field in fields):
-        raise TruthError(f"{where} is not two frame numbers. {_CSV_FORMAT}")
-    query, match = int(fields[0]), int(fields[1])
-    for value, count, name in ((query, counts[0], "query"), (match, counts[1], "map")):
-        if value >= count:
-            raise TruthError(f"{where}: {value} is not a frame of the {name}, whose {count} frames count from 0.")
-    return query, match
 
 
 def listed_pairs(listed: Ints, query: Ints, match: Ints) -> Pairs:
@@ -172,14 +126,14 @@ def optical_axis(body_from_camera: Floats | None, poses: Floats) -> Floats | Non
     return None if upright else axis
 
 
-def position_pairs(query: Floats, match: Floats, distance_m: float) -> Pairs:
+def position_pairs(query: Floats | Ints, match: Floats | Ints, distance_m: float) -> Pairs:
     """Positions (Q, D) and (M, D) in one frame that are within a distance of each other."""
     return _runs(_near(query, match, distance_m))
 
 
 def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
     """The truth at the stamps, (N, 4, 4), and (N,) where it is known: at a pose of it, or between two near in time."""
-    left, right, known = around(truth.stamp_ns, at_ns)
+    left, right, known = bracketing(truth.stamp_ns, at_ns)
     poses = np.full((len(at_ns), 4, 4), np.nan)
     poses[known & (left == right)] = truth.world_from_body[right[known & (left == right)]]
     between = known & (left != right)
@@ -190,7 +144,7 @@ def poses_at(truth: Trajectory, at_ns: Ints) -> tuple[Floats, Bools]:
 
 def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats, Bools]:
     """Positions (T, D) at increasing stamps (T,), at other stamps: (N, D), and (N,) where known, as `poses_at`."""
-    _, _, known = around(stamp_ns, at_ns)
+    _, _, known = bracketing(stamp_ns, at_ns)
     result = np.full((len(at_ns), positions.shape[1]), np.nan)
     if known.any():
         seconds = (stamp_ns - stamp_ns[0]) / 1e9  # float64 holds the ns of a drive, not those since 1970
@@ -199,7 +153,7 @@ def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats
     return result, known
 
 
-def around(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
+def bracketing(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
     """Rows of the samples before and after each stamp, one and the same where it is hit, and where that is known."""
     if not len(stamp_ns):
         nothing = np.zeros(len(at_ns), np.int64)
@@ -211,7 +165,7 @@ def around(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
     return left, right, hit | (inside & (stamp_ns[right] - stamp_ns[left] <= _MAX_GAP_S * 1e9))
 
 
-def _near(query: Floats, match: Floats, distance_m: float) -> Iterable[Int32s]:
+def _near(query: Floats | Ints, match: Floats | Ints, distance_m: float) -> Iterable[Int32s]:
     """For each query the increasing rows of `match` within the distance; sorted along the longest axis: not Q x M."""
     axis = int(np.ptp(match, axis=0).argmax()) if len(match) else 0
     order = np.argsort(match[:, axis], kind="stable")

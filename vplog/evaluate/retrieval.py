@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """What the scores say of each of Q queries."""
+    """Ranks of the true rows of Q queries, by their scores."""
 
     candidates: Ints
     """(Q,) rows that could be an answer."""
@@ -39,6 +39,10 @@ class Ranks:
     """(Q,) other candidates, not true, that score as much."""
     tied_true: Ints
     """(Q,) true rows that score as much, itself included."""
+    true_row: Int32s
+    """(Q,) the true row that scores most, the earliest of several; -1 where the query has none."""
+    p_match: Floats | None = None
+    """(Q,) probability that the answer is right, NaN without an answer; None where none is stated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,24 +86,26 @@ def rank_queries(scores: Float32s, truth: Pairs, stops: Ints) -> Ranks:
     Q = len(scores)
     truth = truth.below(stops)
     top_row, top_score = np.full(Q, -1, np.int32), np.full(Q, np.nan, np.float32)
-    top_true = np.zeros(Q)
+    top_true, true_row = np.zeros(Q), np.full(Q, -1, np.int32)
     better, tied_false, tied_true = (np.zeros(Q, np.int64) for _ in range(3))
     for q in range(Q):
         score = np.asarray(scores[q, : stops[q]])
         score = np.where(np.isnan(score), -np.inf, score)
-        true = score[truth.rows(q)]
+        rows = truth.rows(q)
+        true = score[rows]
         if len(score) and score.max() > -np.inf:
             best = score.max()
             top_row[q], top_score[q] = score.argmax(), best
             top_true[q] = np.count_nonzero(true == best) / np.count_nonzero(score == best)
         if len(true):
-            best = true.max()
+            best, true_row[q] = true.max(), rows[true.argmax()]
             better[q] = np.count_nonzero(score > best)
             tied_true[q] = np.count_nonzero(true == best)
             tied_false[q] = np.count_nonzero(score == best) - tied_true[q]
     return Ranks(
-        np.asarray(stops, np.int64), top_row, top_score, top_true, truth.positive, better, tied_false, tied_true
-    )
+        np.asarray(stops, np.int64), top_row, top_score, top_true, truth.positive, better, tied_false, tied_true,
+        true_row,
+    )  # fmt: skip
 
 
 def recall_at(ranks: Ranks, k: int) -> float:

@@ -1,4 +1,4 @@
-"""How many threads there may be: the cores that this process may use, or as many as the user allowed."""
+"""How many threads there may be: the cores that this process may use, or fewer by the user's limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def available() -> int:
 
 
 def allowed() -> int:
-    """Threads for work that is not told how many: as `limited` says, otherwise as many as cores."""
+    """Threads for work without a number of its own: the limit of `limited`, else one for each core."""
     return _limit.get() or available()
 
 

@@ -1,4 +1,4 @@
-"""How work is executed: on how many threads, and who hears of progress and warnings."""
+"""How work is executed: on how many threads, and where progress and warnings go."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Execution:
     progress: Progress = silent
 
     def within(self, name: str) -> Execution:
-        """For a part of the work, whose stages are told as `name: stage`."""
+        """For a part of the work, whose stages are reported as `name: stage`."""
         return replace(self, progress=lambda stage, done, total: self.progress(f"{name}: {stage}", done, total))
 
     def part(self, before: int, total: int) -> Execution:

@@ -21,7 +21,7 @@ _ATTEMPTS = 3
 """At a task whose worker died: one that dies three times will most likely die again."""
 
 
-def each_done(
+def run_tasks(
     work: Callable[[Task], Result], tasks: Iterable[Task], executor: Executor | None
 ) -> Iterator[tuple[Task, Result | None, str]]:
     """Each task with its result, or with None and why it has none, in one line. Without an executor it is done here."""

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-class Watch:
-    """Measures stages one after the other; `stages` is what run.json says of them."""
+class StageTimer:
+    """Measures stages one after the other; `stages` is their entry in run.json."""
 
     def __init__(self) -> None:
         self.stages: dict[str, dict[str, Any]] = {}
@@ -22,7 +22,7 @@ class Watch:
     @contextmanager
     def stage(self, name: str, items: int | None = None) -> Iterator[None]:
         """Measure a block; `items` frames (or candidates) are worked off in it."""
-        _forget_peak()
+        _reset_peak()
         began, cpu = time.perf_counter(), time.process_time()
         yield
         seconds = time.perf_counter() - began
@@ -42,7 +42,7 @@ class Watch:
         }
 
 
-def _forget_peak() -> None:
+def _reset_peak() -> None:
     """Start a new peak where the system can (Linux); elsewhere the peak is that of the whole run so far."""
     try:
         Path("/proc/self/clear_refs").write_text("5")

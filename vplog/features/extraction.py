@@ -38,7 +38,7 @@ def extract_frames(
 
 
 def with_stereo_depth(features: Features, frame: Frame, extractor: Extractor, settings: StereoSettings) -> Features:
-    """The features of a frame with the depths that its right image tells; as they are without one."""
+    """The features of a frame with depths by its right image; unchanged without one."""
     camera = frame.camera
     if frame.right is None or camera.baseline_m is None or camera.matrix is None:
         return features

@@ -27,7 +27,7 @@ class MatchSettings(Settings):
     where 0.8 drops 90 % of the wrong matches; 0.75 halves the rest, so that most wrong candidates end here."""
     first_look: int = Field(default=400, ge=1)
     """Strongest features by which a candidate is first judged, at a sixth of the time: where they hold less than their
-    part of the matches that are asked for, it ends there. True candidates hold twice as many and more."""
+    part of the required matches, it ends there. True candidates hold twice as many and more."""
 
 
 def match(a: Bytes, b: Bytes, ratio: float) -> tuple[Ints, Ints]:

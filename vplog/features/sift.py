@@ -42,7 +42,6 @@ class SiftSettings(Settings):
     def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
         """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points."""
         height, width = image.shape
-        thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
         pixels = self._reduced(image)
         keypoints, descriptors = self._detect(pixels)
         x, y, sizes, angles, response = keypoints.T
@@ -54,10 +53,10 @@ class SiftSettings(Settings):
             points=points.astype(np.float32),
             sizes=sizes[order] * np.sqrt(scale[0] * scale[1]),
             descriptors=descriptors[order],
-            depth_m=_depth_at(points, depth_m),
+            depth_m=depth_at(points, depth_m),
             width=width,
             height=height,
-            thumbnail=thumbnail,
+            thumbnail=thumbnail_of_image(image),
         )
 
     def _reduced(self, image: Bytes) -> Bytes:
@@ -83,7 +82,13 @@ class SiftSettings(Settings):
         return rows.reshape(-1, 5), found.astype(np.uint8)  # whole numbers already
 
 
-def _depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:
+def thumbnail_of_image(image: Bytes) -> Bytes:
+    """(THUMBNAIL_SIDE, THUMBNAIL_SIDE) of a grey image, by area averages."""
+    side = THUMBNAIL_SIDE
+    return np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:
     """(M,) depth of the pixel each point falls in, NaN where there is none."""
     if depth_m is None:
         return np.full(len(points), np.nan, np.float32)

@@ -1,4 +1,4 @@
-"""Depth of the features of a rectified stereo pair: matches along rows, and what their disparity says."""
+"""Depth of the features of a rectified stereo pair: matches along rows, and the depth of their disparity."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class StereoSettings(Settings):
     """A match is kept when its distance is below this share of the second best's on its rows: Lowe 2004, section 7.1;
     the few rivals on a row allow more than a whole image does."""
     max_distance: float = Field(default=300.0, gt=0)
-    """Longest distance of matched descriptors: on rows without a rival the ratio says nothing. SIFT's have a length of
-    512; unrelated ones are about 500 apart, two views of a point seldom 300."""
+    """Longest distance of matched descriptors: on rows without a rival the ratio has no meaning. SIFT's have a length
+    of 512; unrelated ones are about 500 apart, two views of a point seldom 300."""
     min_disparity_px: float = Field(default=1.0, gt=0)
     """Disparities below this are no depth: with half a px of noise in each image they may as well be zero."""
     nearest_depths: float = Field(default=2.0, gt=0)

@@ -14,14 +14,16 @@ from vplog.errors import ResultError
 if TYPE_CHECKING:
     from pathlib import Path
 
-_ROW_BYTES = 4 * 4 + 128
-"""x, y, size, depth as float32, then the descriptor."""
+SIFT_BYTES = 128
+"""Of a descriptor."""
+_FLOAT_BYTES = 4 * 4
+"""x, y, size, depth as float32, before the descriptor."""
 _THUMBNAIL_BYTES = THUMBNAIL_SIDE**2
 
 
-def size_of(count: int, thumbnail: bool) -> int:
-    """Bytes of an image's features."""
-    return count * _ROW_BYTES + thumbnail * _THUMBNAIL_BYTES
+def size_of(count: int, thumbnail: bool, values: int = SIFT_BYTES) -> int:
+    """Bytes of an image's features, with descriptors of `values` bytes."""
+    return count * (_FLOAT_BYTES + values) + thumbnail * _THUMBNAIL_BYTES
 
 
 def features_to(features: Features) -> bytes:
@@ -31,14 +33,16 @@ def features_to(features: Features) -> bytes:
     return floats.tobytes() + features.descriptors.tobytes() + small
 
 
-def features_from(data: bytes, count: int, width: int, height: int, thumbnail: bool) -> Features:
-    """`count` features of an image of this size, from the `size_of(count, thumbnail)` bytes of `features_to`."""
+def features_from(
+    data: bytes, count: int, width: int, height: int, thumbnail: bool, values: int = SIFT_BYTES
+) -> Features:
+    """`count` features of an image of this size, from the `size_of` bytes of `features_to`."""
     floats = np.frombuffer(data, "<f4", count * 4).reshape(count, 4)
-    small = np.frombuffer(data, np.uint8, _THUMBNAIL_BYTES, count * _ROW_BYTES) if thumbnail else None
+    small = np.frombuffer(data, np.uint8, _THUMBNAIL_BYTES, size_of(count, False, values)) if thumbnail else None
     return Features(
         points=np.ascontiguousarray(floats[:, :2]),
         sizes=floats[:, 2],
-        descriptors=np.frombuffer(data, np.uint8, count * 128, count * 16).reshape(count, 128),
+        descriptors=np.frombuffer(data, np.uint8, count * values, count * _FLOAT_BYTES).reshape(count, values),
         depth_m=floats[:, 3],
         width=width,
         height=height,
@@ -51,7 +55,7 @@ class FeatureStore:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._entries: list[tuple[int, int, int, int, bool]] = []
+        self._entries: list[tuple[int, int, int, int, bool, int]] = []
         self._lock = threading.Lock()
         try:
             self._file = path.open("w+b")
@@ -62,7 +66,9 @@ class FeatureStore:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):  # a full disk fails again here; append has said so, and the file goes
+        with contextlib.suppress(
+            OSError
+        ):  # a full disk fails again here; append has raised it, and the file is removed
             self._file.close()
         self._path.unlink(missing_ok=True)
 
@@ -79,14 +85,15 @@ class FeatureStore:
         except OSError as error:
             raise ResultError(
                 f"Cannot store features in {self._path}: {error.strerror}. "
-                f"They need about {_ROW_BYTES * 2000 // 1000} kB per keyframe while the run lasts."
+                f"They need about {size_of(2000, False) // 1000} kB per keyframe while the run lasts."
             ) from None
-        self._entries.append((offset, len(features), features.width, features.height, features.thumbnail is not None))
+        small, values = features.thumbnail is not None, features.descriptors.shape[1]
+        self._entries.append((offset, len(features), features.width, features.height, small, values))
 
     def __getitem__(self, row: int) -> Features:
         """The features of keyframe `row`."""
-        offset, count, width, height, small = self._entries[row]
+        offset, count, width, height, small, values = self._entries[row]
         with self._lock:
             self._file.seek(offset)
-            data = self._file.read(size_of(count, small))
-        return features_from(data, count, width, height, small)
+            data = self._file.read(size_of(count, small, values))
+        return features_from(data, count, width, height, small, values)

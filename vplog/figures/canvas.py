@@ -18,7 +18,7 @@ DPI = 150
 
 
 @contextmanager
-def drawn(
+def saved_figure(
     folder: Path, name: str, width: float, height: float, kinds: tuple[Literal["png", "svg"], ...] = ("png", "svg")
 ) -> Iterator[Figure]:
     """A figure of so many inches to be filled, written as NAME.png and NAME.svg when the block ends well."""

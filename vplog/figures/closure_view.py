@@ -10,7 +10,7 @@ import numpy as np
 from vplog.features.matching import match_features
 from vplog.geometry import se3
 from vplog.loops import undistort
-from vplog.loops.verify_epipolar import agreeing
+from vplog.loops.verify_epipolar import epipolar_inliers
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Camera, Features, Float32s, Floats
@@ -63,9 +63,9 @@ def find_agreement(
     here, there = query.points[mine], match.points[theirs]
     if row["tx"] is not None and camera.matrix is not None:
         agrees = _on_epipolar_lines(here, there, row, camera, settings.metric.ransac_px)
-        model = f"the ledger's pose (verification also asks for a known position, and counted {row['inliers']})"
+        model = f"the ledger's pose (verification also requires a known position, and counted {row['inliers']})"
         return Agreement(here, there, agrees, model)
-    agrees, by_chance = agreeing(here, there, query.width, query.height, settings.epipolar)
+    agrees, by_chance = epipolar_inliers(here, there, query.width, query.height, settings.epipolar)
     if by_chance:
         return Agreement(here, there, np.zeros(len(here), bool), "")
     return Agreement(here, there, agrees, "the epipolar geometry that most agree with")
@@ -79,21 +79,25 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], cam
     rays = [np.column_stack([undistort.rays(camera, points), np.ones(len(points))]) for points in (here, there)]
     turned = rays[0] @ match_from_query[:3, :3].T
     shift, observed = match_from_query[:3, 3], rays[1]
-    focal_px = undistort.focal_px(camera)
+    noise = [undistort.noise_of_rays(camera, one[:, :2], 1.0) for one in rays]
     with np.errstate(all="ignore"):
         if np.linalg.norm(shift) < _SAME_SPOT_M:
-            error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - observed[:, :2], axis=1)
-            return (error * focal_px < most_px) & (turned[:, 2] > 0)
+            error = turned[:, :2] / turned[:, 2:] - observed[:, :2]
+            return (se3.mahalanobis2(error, noise[1]) < most_px**2) & (turned[:, 2] > 0)
         essential = se3.skew(shift) @ match_from_query[:3, :3]
         line, back = rays[0] @ essential.T, observed @ essential
-        error = np.abs((line * observed).sum(axis=1)) / np.sqrt((line[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+        ends = ((line, noise[1]), (back, noise[0]))
+        variance = sum(np.einsum("ki,kij,kj->k", one[:, :2], by_pixel, one[:, :2]) for one, by_pixel in ends)
+        error_px = np.abs((line * observed).sum(axis=1)) / np.sqrt(variance)
         # the depths at which both rays meet, times the square of the sine between them
         across = np.cross(turned, observed)
         square = (across**2).sum(axis=1)
         depth = (np.cross(observed, shift) * across).sum(axis=1), (np.cross(turned, shift) * across).sum(axis=1)
         ahead = (depth[0] > 0) & (depth[1] > 0)
-        far = square < (most_px / focal_px) ** 2  # parallel within the noise: at infinity, on either side of it
-        return (error * focal_px < most_px) & (ahead | far)
+        far = (
+            square < (most_px / undistort.focal_px(camera)) ** 2
+        )  # parallel within the noise: at infinity, on either side of it
+        return (error_px < most_px) & (ahead | far)
 
 
 def find_boxes(state: BoxState, query: Any, match: Any, references: list[int]) -> list[SharedBoxes]:

@@ -11,9 +11,9 @@ from vplog.data import Verdict
 from vplog.errors import ResultError
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
-from vplog.results.collage import Half, Panel, collage
+from vplog.results.collage import FramePanel, ReferencePanel, collage
 from vplog.results.geo import Earth
-from vplog.results.mcap import Explained, Shown
+from vplog.results.mcap import McapExtras, ReferenceBoxes
 from vplog.results.previews import jpeg, scaled_size, shrink
 from vplog.stages import BoxState
 
@@ -50,39 +50,41 @@ class ClosureInputs:
     """Descriptors of the keyframes."""
 
 
-def finished_picture(
-    inputs: ClosureInputs, picture: Callable[[int], bytes] | None, closures: Closures, references: list[Reference],
-    verify: VerifySettings, pictures: PictureSettings, gps: Gps | None, earth: Earth | None, about: dict[str, Any],
-    execution: Execution
-) -> Shown:  # fmt: skip
-    """All that result.mcap shows of a run, made while its features are at hand; `picture` gives a keyframe's JPEG."""
+def mcap_extras(
+    inputs: ClosureInputs,
+    previews: Callable[[int], bytes] | None,
+    closures: Closures,
+    references: list[Reference],
+    verify: VerifySettings,
+    pictures: PictureSettings,
+    execution: Execution,
+) -> McapExtras:
+    """Images, references and drawn closures for result.mcap; `previews` gives a keyframe's JPEG by its row."""
     state, camera = inputs.state, inputs.camera
     small = {
         number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
         for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
     }
     drawn = {}
-    if picture is not None:
+    if previews is not None:
         rows = choose_examples(closures, pictures.closures)
         drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, execution)
-    return Shown(
-        image=picture,
+    return McapExtras(
+        camera=camera,
+        image=previews,
         image_size=scaled_size(camera.width, camera.height, pictures.megapixels),
         explained=(lambda row: explain(state, inputs.places[row])) if isinstance(state, BoxState) else None,
         references=small,
         pictures=drawn,
-        gps=gps,
-        earth=earth,
-        about=about,
     )
 
 
-def explain(state: BoxState, place: Any) -> Explained | None:
+def explain(state: BoxState, place: Any) -> ReferenceBoxes | None:
     """Where the parts of a keyframe were found on the reference that explains it best; None where none does."""
     found = state.boxes(place)
     if not len(found.references):
         return None
-    return Explained(found.references.tolist(), state.windows(0), found.corners[0])
+    return ReferenceBoxes(found.references.tolist(), state.windows(0), found.corners[0])
 
 
 def reference_use(state: PlaceState, places: Sequence[Any]) -> list[int] | None:
@@ -135,18 +137,18 @@ def _draw(
     features = inputs.features(nodes[0]), inputs.features(nodes[1])
     agreement = find_agreement(*features, _pose_columns(closures, row), inputs.camera, verify)
     sides = [np.array([one.width, one.height]) for one in features]
-    halves = [
-        Half(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
+    frames = [
+        FramePanel(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
         for name, node, points, side in zip(
             ("query", "match"), nodes, (agreement.query, agreement.match), sides, strict=True
         )
     ]
-    return collage(halves[0], halves[1], agreement.agrees, _panels(row, nodes, features, inputs, closures))
+    return collage(frames[0], frames[1], agreement.agrees, _panels(row, nodes, features, inputs, closures))
 
 
 def _panels(
     row: int, nodes: Sequence[int], features: Sequence[Features], inputs: ClosureInputs, closures: Closures
-) -> list[Panel]:
+) -> list[ReferencePanel]:
     """Boxes of both on the references they share most on, and how both vote on the first of these."""
     shared, state = closures.shared_references[row].tolist(), inputs.state
     if not isinstance(state, BoxState):
@@ -154,11 +156,11 @@ def _panels(
     panels, none = [], np.zeros((0, 4))
     for found in find_boxes(state, inputs.places[nodes[0]], inputs.places[nodes[1]], shared)[:2]:
         name = f"reference {found.reference}"
-        panels.append(Panel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
+        panels.append(ReferencePanel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
         if len(panels) <= _VOTED:
             for who, one in zip(("query", "match"), features, strict=True):
                 votes = state.voting_map(one, found.reference)
-                panels.append(Panel(found.image, f"votes of the {who}", none, none, votes))
+                panels.append(ReferencePanel(found.image, f"votes of the {who}", none, none, votes))
     return panels
 
 

@@ -114,24 +114,44 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     lead = (2.0 * np.diagonal(likes, axis1=1, axis2=2) - np.abs(likes).sum(2)).min(1)
     unsure = np.flatnonzero(lead < _CLEARLY)
     values, vectors = np.linalg.eigh(likes[unsure])
-    least = _LEAST_SHARE * values[:, -1]
-    poor = values[:, 0] < least
+    poor = values[:, 0] < _LEAST_SHARE * values[:, -1]
     if not poor.any():
         return graph, []
-    negative = np.flatnonzero(values[:, 0] < -_NOISE * values[:, -1])
-    fixed = (vectors * np.maximum(values, least[:, None])[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale[unsure]
+    negative, rows = np.flatnonzero(values[:, 0] < -_NOISE * values[:, -1]), unsure[poor]
+    values, vectors = np.linalg.eigh(_possible(likes[rows]))
+    open_ = values[:, 0] < _LEAST_SHARE * values[:, -1]
+    values = np.maximum(values, 2.0 * _LEAST_SHARE * values[:, -1:])
+    mended = (vectors * values[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale[rows]
+    mended[open_] += _least_known(graph)
     axes = np.array(AXES[graph.dimension])
     repaired = graph.information.copy()
-    repaired[unsure[poor][:, None, None], axes[:, None], axes] = fixed[poor]
+    repaired[rows[:, None, None], axes[:, None], axes] = mended
     warnings = []
     if len(negative):
         edge = unsure[negative[0]]
         warnings.append(
             f"The information of {len(negative)} edges is not positive (first: edge {edge}, {graph.a[edge]} to "
-            f"{graph.b[edge]}, eigenvalue {values[negative[0], 0]:.3g} of a unit diagonal); the negative part was cut "
-            "off."
+            f"{graph.b[edge]}); entries off the diagonal that no such matrix has were taken for 0, and what was "
+            "negative still was cut off."
         )
     return replace(graph, information=repaired), warnings
+
+
+def _least_known(graph: PoseGraph) -> Floats:
+    """(d, d) information of what is known of any edge: it turns by no half circle, and is no longer than all together.
+
+    Else axes of which an edge says nothing would be as uncertain as no false closure is.
+    """
+    length_m = max(float(np.linalg.norm(graph.a_from_b[:, :3, 3], axis=1).sum()), 1.0)
+    sigma = np.repeat([np.pi, length_m], 3)[AXES[graph.dimension]]
+    return np.diag(sigma**-2.0)
+
+
+def _possible(likes: Floats) -> Floats:
+    """The matrices (K, d, d) without entries beyond the geometric mean of their diagonal's: correlations beyond 1."""
+    diagonal = np.diagonal(likes, axis1=1, axis2=2)
+    most = np.sqrt(diagonal[:, :, None] * diagonal[:, None, :]) * (1.0 + _NOISE)
+    return np.where(np.abs(likes) > most, 0.0, likes)
 
 
 def informed(graph: PoseGraph) -> Floats:

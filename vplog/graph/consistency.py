@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -11,21 +11,14 @@ import numba
 import numpy as np
 
 from vplog.data import EdgeKind
-from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.factors import Factors
-from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances
 from vplog.graph.normal_equations import edge_costs
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph, Solution
-
-_SURE = 0.999999
-"""Probability with which odometry as good as its noise claims passes keep_odometry_if_worse: 4.9 sigma of one edge."""
-KNOWN_TO = 30
-"""Degrees of freedom from which the noise of odometry is known at best, as `refine.least_redundancy` has it."""
+    from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph
+    from vplog.graph.least_squares import Objective
 
 
 def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:
@@ -149,54 +142,6 @@ def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain
     """Loops (E,) whose distance to the odometry alone is beyond what noise reaches with this probability."""
     bound = chi2_quantile(probability, degrees_of_freedom(graph))
     return np.asarray(np.nan_to_num(residual_before(graph, chain)) ** 2 > bound)
-
-
-def keep_odometry_if_worse(graph: PoseGraph, solution: Solution, known_to: int | None = None) -> Solution:
-    """The solution, or the odometry poses where the solution bends the odometry more than its noise allows.
-
-    If all inliers are true, the chi-square of the odometry edges has as many degrees of freedom as their redundancy in
-    the solution (Foerstner 1979). Beyond the 0.999999 quantile closures are false or the noise is far too small. Above
-    `known_to` degrees of freedom the bound on chi-square per degree stays, as the noise itself is known no better.
-    """
-    odometry = ~is_loop(graph)
-    accepted = np.where(odometry, 1.0, np.where(solution.weight > 0.5, solution.weight, 0.0))
-    closures = int((accepted[~odometry] > 0).sum())
-    if closures == 0:
-        if odometry.all():
-            return solution
-        none = f"Odometry was kept: none of the {int((~odometry).sum())} closures agrees with it. {solution.reason}"
-        return replace(solution, world_from_body=odometry_chain(graph)[0], reason=none)
-    chi2 = float((residual_sigma(graph, solution.world_from_body)[odometry] ** 2).sum())
-    if chi2 <= chi2_quantile(_SURE, 1):  # no bound is lower
-        return solution
-    try:
-        objective = Objective(Factors.of(graph), accepted)
-        checks = max(round(redundancy(objective, solution.world_from_body, np.flatnonzero(odometry))), 1)
-    except GraphError:  # too open to say: each closure checks it with its own degrees of freedom at most
-        checks = degrees_of_freedom(graph) * min(closures, int(odometry.sum()))
-    bound = chi2_quantile(_SURE, checks)
-    if known_to is not None and checks > known_to:
-        bound = chi2_quantile(_SURE, known_to) / known_to * checks
-    if chi2 <= bound:
-        return solution
-    return odometry_kept(
-        graph,
-        solution,
-        f"with {closures} closures its chi-square is {chi2:.4g} where its noise allows {bound:.4g}, so some are "
-        "false or the noise is set too small.",
-    )
-
-
-def odometry_kept(graph: PoseGraph, solution: Solution, why: str) -> Solution:
-    """The poses of the odometry alone, without any loop."""
-    return replace(
-        solution,
-        world_from_body=odometry_chain(graph)[0],
-        weight=np.where(is_loop(graph), 0.0, 1.0),
-        error_before=0.0,
-        error_after=0.0,
-        reason=f"Odometry was kept: {why}",
-    )
 
 
 def redundancy(objective: Objective, poses: Floats, rows: Ints) -> float:

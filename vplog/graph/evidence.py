@@ -33,6 +33,12 @@ _EARLIER = 200
 """Runs before one that may share its displacement: bounds the pairs of graphs with thousands of false closures."""
 _PAIRS = 1 << 12
 """Pairs of runs compared at once: some megabytes."""
+_RECENT = 10
+"""Last members of a family by which the next one is predicted."""
+_SAMPLE = 200
+"""Poses all pairs of which are looked at."""
+_CONCENTRATIONS = (2.0 ** np.arange(-4, 13)).tolist()
+"""Of families, from one to as many as there are runs."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""
@@ -40,6 +46,11 @@ _LEAST_SIDE = 0.1
 
 _LEAST_SIDE_M = 5.0
 """m; a camera that hardly moves sees as much, and takes any of it for another part of it."""
+
+
+_VIEW_RAD = 0.2
+"""Rotations that SIFT features stand."""
+_VIEW_M = 0.5
 
 
 class _Run(NamedTuple):
@@ -60,7 +71,7 @@ def log_evidence(factors: Factors, weight: Floats, poses: Floats, chain: Odometr
     graph = factors.graph
     loops = is_loop(graph)
     true, false = np.flatnonzero(loops & (weight > 0)), np.flatnonzero(loops & (weight == 0))
-    room = log_room(chain.poses[:, :3, 3], graph.dimension)
+    room = log_room(graph, chain.poses)
     total, accidents = _log_false(graph, false, chain, room)
     places = sum(1 for _ in runs(graph, true))
     # each place is true or an accident, the share of true ones unknown: the beta function
@@ -81,14 +92,48 @@ def _log_true(factors: Factors, weight: Floats, poses: Floats, true: Ints, room:
     return float(0.5 * (known - determinant - chi2) - 0.5 * _LOG_2PI * d * (len(true) - joined) - joined * room)
 
 
-def log_room(places: Floats, dimension: int) -> float:
-    """Log of how many relative poses there are between places (N, 3): metres cubed times 8 pi^2, or squared times 2 pi.
+def log_room(graph: PoseGraph, places: Floats) -> float:
+    """Log of how much less likely a closure is where it is false than its density where it is true.
 
-    8 pi^2 is the volume of the rotations in units of small rotation vectors.
+    A false closure pairs any two of the poses (N, 4, 4), a true one two that see the same; and its relative pose is as
+    the others' are, which is what verification lets pass. At most all of the box of positions: metres cubed times
+    8 pi^2, or squared times 2 pi, the volume of the rotations in units of small rotation vectors.
     """
-    side = 2.0 * np.ptp(places, axis=0)[:dimension]
+    side = 2.0 * np.ptp(places[:, :3, 3], axis=0)[: graph.dimension]
     side = np.maximum(side, max(_LEAST_SIDE * side.max(), _LEAST_SIDE_M))
-    return float(np.log(side).sum()) + math.log(2.0 * math.pi if dimension == 2 else 8.0 * math.pi**2)
+    box = float(np.log(side).sum()) + math.log(2.0 * math.pi if graph.dimension == 2 else 8.0 * math.pi**2)
+    loops = np.flatnonzero(is_loop(graph))
+    axes = np.array(AXES[graph.dimension])
+    if len(loops) <= 2 * len(axes):
+        return box
+    spread = np.cov(se3.log(forward(graph, loops)[2])[:, axes].T) + np.linalg.inv(informed(graph)[loops]).mean(0)
+    spread += np.diag(_of_a_view(places[:, :3, 3])[axes] ** 2)
+    of_views = 0.5 * (len(axes) * (_LOG_2PI + 1.0) + float(np.linalg.slogdet(spread)[1]))  # entropy of a Gaussian
+    variance = np.array([np.diag(spread)[axes < 3].mean(), np.diag(spread)[axes >= 3].mean()])
+    gap = int(np.abs(graph.a[loops].astype(np.int64) - graph.b[loops]).min())
+    pairs = len(places) ** 2 / 2.0
+    return min(box, math.log(pairs / max(len(loops), pairs * _share_near(places, variance, gap))) + of_views)
+
+
+def _share_near(places: Floats, variance: Floats, gap: int) -> float:
+    """Share of the pairs of poses (N, 4, 4), at least `gap` apart, that are as near as closures are: within sigmas
+    of the variances (2,) of rotation vectors and translations per axis."""
+    stride = -(-len(places) // _SAMPLE)
+    R, t = places[::stride, :3, :3], places[::stride, :3, 3]
+    one, two = np.triu_indices(len(R), max(gap // stride, 1))
+    if not len(one):
+        return 0.0
+    cosine = 0.5 * (np.einsum("nij,nij->n", R[one], R[two]) - 1.0)
+    angle2 = np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2
+    distance2 = ((t[one] - t[two]) ** 2).sum(1)
+    return float((angle2 / variance[0] + distance2 / variance[1] <= 6.0).mean())
+
+
+def _of_a_view(places: Floats) -> Floats:
+    """Sigmas (6,) of the relative poses, rad and m, from which views of one place are recognised at least."""
+    step = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    reach = _BESIDE * float(np.median(step)) if len(step) else 0.0
+    return np.repeat([_VIEW_RAD, max(reach, _VIEW_M)], 3)
 
 
 def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
@@ -112,7 +157,7 @@ def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
 def _log_false(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> tuple[float, int]:
     """Log density of the false closures, and how many runs they are."""
     total, accidents, together = 0.0, 0, []
-    for run in runs(graph, false):
+    for run in _accidents(graph, false, chain, room):
         accidents += 1
         inner, one = _as_one(graph, run, chain)
         if one is None or inner < -room * (len(run) - 1):  # they do not agree with each other
@@ -121,6 +166,16 @@ def _log_false(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float)
             total += inner
             together.append(one)
     return total + _log_displacements(together, chain, room), accidents
+
+
+def _accidents(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> Iterator[Ints]:
+    """Runs of false closures that agree with each other: of those that do not, each lot is an accident of its own."""
+    for run in runs(graph, false):
+        if len(run) == 1:
+            yield run
+            continue
+        claims = Displacements(chain, *forward(graph, run))
+        yield from (run[members] for members in families(claims, room)[0])
 
 
 def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _Run | None]:
@@ -152,18 +207,26 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
     Ad = se3.adjoint(se3.between(X[to][None], X[b]))[:, axes][:, :, axes]
     covariance[range(size), :, range(size), :] += Ad @ noise @ np.swapaxes(Ad, 1, 2)
     try:
-        root = np.linalg.cholesky(covariance.reshape(size * d, size * d))
+        inner, displaced, noise = _log_common(error, covariance)
     except np.linalg.LinAlgError:
         return 0.0, None
+    twist = np.zeros(6)
+    twist[axes] = displaced
+    return inner, _Run(at, to, measured[middle] @ se3.exp(twist[None])[0], noise)
+
+
+def _log_common(error: Floats, covariance: Floats) -> tuple[float, Floats, Floats]:
+    """Log density of errors (K, d) of `covariance` (K, d, K, d) about a common mean that may be anything; the mean (d,)
+    and its covariance (d, d). Raises LinAlgError where the covariance is not positive definite."""
+    size, d = error.shape
+    root = np.linalg.cholesky(covariance.reshape(size * d, size * d))
     whitened = np.linalg.solve(root, np.column_stack([np.tile(np.eye(d), (size, 1)), error.ravel()]))
     J, e = whitened[:, :d], whitened[:, d]
     information, gradient = J.T @ J, J.T @ e
-    displaced = np.zeros(6)
-    displaced[axes] = np.linalg.solve(information, gradient)
-    inner = -0.5 * float(e @ e - gradient @ displaced[axes]) - float(np.log(np.diag(root)).sum())
-    inner -= 0.5 * float(np.linalg.slogdet(information)[1]) + 0.5 * (size - 1) * d * _LOG_2PI
-    mean = measured[middle] @ se3.exp(displaced[None])[0]
-    return inner, _Run(at, to, mean, np.asarray(np.linalg.inv(information), np.float64))
+    mean = np.asarray(np.linalg.solve(information, gradient), np.float64)
+    density = -0.5 * float(e @ e - gradient @ mean) - float(np.log(np.diag(root)).sum())
+    density -= 0.5 * float(np.linalg.slogdet(information)[1]) + 0.5 * (size - 1) * d * _LOG_2PI
+    return density, mean, np.asarray(np.linalg.inv(information), np.float64)
 
 
 def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
@@ -181,27 +244,62 @@ def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
 
 
 def _log_displacements(together: list[_Run], chain: OdometryChain, room: float) -> float:
-    """Log density of the runs' displacements: each is a new one, anywhere, or that of an earlier run.
+    """Log density of the runs' displacements."""
+    return families(Displacements.of(together, chain), room)[1] if together else 0.0
 
-    Which of them is as likely one as the other, as at a new table of a Chinese restaurant.
-    """
+
+def agreeing(graph: PoseGraph, loops: Ints, chain: OdometryChain) -> list[Ints]:
+    """The edges `loops` (K,) in sets that claim one displacement, largest first; runs that disagree are in none."""
+    room = log_room(graph, chain.poses)
+    members, together = [], []
+    for run in _accidents(graph, loops, chain, room):
+        _, one = _as_one(graph, run, chain)
+        if one is not None:
+            members.append(run)
+            together.append(one)
     if not together:
-        return 0.0
-    count, density = len(together), np.full((len(together), len(together)), -np.inf)
-    a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
-    one, two = np.triu_indices(count, 1)
-    near = (two - one <= _EARLIER) & (chain.part[a[one]] == chain.part[a[two]])
-    near &= chain.part[b[one]] == chain.part[b[two]]
-    one, two = one[near], two[near]
-    measured = np.array([run.a_from_b for run in together])
-    claims = Displacements(chain, a, b, measured, np.array([run.covariance for run in together]))
-    for start in range(0, len(one), _PAIRS):
-        this, other = one[start : start + _PAIRS], two[start : start + _PAIRS]
-        error, covariance = claims.apart(this, other)
-        log_volume = np.linalg.slogdet(covariance)[1] + error.shape[1] * _LOG_2PI
-        density[this, other] = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume)
-    choices = np.logaddexp.reduce(np.vstack([np.full(count, -room), density]), axis=0)
-    return float(choices.sum()) - math.lgamma(count + 1)
+        return []
+    found, _ = families(Displacements.of(together, chain), room)
+    sets = [np.concatenate([members[run] for run in family.tolist()]) for family in found]
+    return sorted(sets, key=len, reverse=True)
+
+
+def families(claims: Displacements, room: float) -> tuple[list[Ints], float]:
+    """The claims in families that share a displacement, and the log density of all of them.
+
+    One after the other, each is of the family that predicts it best, the likelier the larger that is, or displaced
+    anywhere in the room, as at the tables of a Chinese restaurant whose concentration is the likeliest.
+    """
+    found: list[list[int]] = []
+    of: list[int] = []
+    density: list[float] = []  # of each family's last members
+    total = 0.0
+    near = claims.near(room)
+    for this in range(claims.count):
+        best, chosen, joint, density_here = -room, len(found), 0.0, -room
+        for family in sorted({of[other] for other in near[this]}):
+            grown = claims.log_joint([*found[family][-_RECENT:], this])
+            own = grown - density[family]
+            if own + math.log(len(found[family])) > best:
+                best, chosen, joint, density_here = own + math.log(len(found[family])), family, grown, own
+        if chosen == len(found):
+            found.append([])
+            density.append(0.0)
+        found[chosen].append(this)
+        of.append(chosen)
+        total += density_here
+        density[chosen] = joint if len(found[chosen]) <= _RECENT else claims.log_joint(found[chosen][-_RECENT:])
+    return [np.array(family) for family in found], total + log_partition([len(family) for family in found])
+
+
+def log_partition(sizes: list[int]) -> float:
+    """Log of Ewens's probability of a partition into families of these sizes, by the likeliest concentration."""
+    count = sum(sizes)
+    within = sum(math.lgamma(size) for size in sizes)
+    likeliest = max(
+        len(sizes) * math.log(alpha) + math.lgamma(alpha) - math.lgamma(alpha + count) for alpha in _CONCENTRATIONS
+    )
+    return within + likeliest
 
 
 class Displacements:
@@ -219,6 +317,55 @@ class Displacements:
         Ad = self._adjoint(at_b)
         self._own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
         self._after = self._adjoint(se3.inverse(self._displaced))
+
+    @classmethod
+    def of(cls, together: list[_Run], chain: OdometryChain) -> Displacements:
+        a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
+        measured = np.array([run.a_from_b for run in together])
+        return cls(chain, a, b, measured, np.array([run.covariance for run in together]))
+
+    @property
+    def count(self) -> int:
+        return len(self._a)
+
+    def near(self, room: float) -> list[list[int]]:
+        """Earlier claims with which each agrees more likely than it is anywhere in the room."""
+        part, near = self._chain.part, [[] for _ in range(self.count)]
+        one, two = np.triu_indices(self.count, 1)
+        comparable = (part[self._a[one]] == part[self._a[two]]) & (part[self._b[one]] == part[self._b[two]])
+        comparable &= two - one <= _EARLIER
+        one, two = one[comparable], two[comparable]
+        for start in range(0, len(one), _PAIRS):
+            rows = slice(start, start + _PAIRS)
+            error, covariance = self.apart(one[rows], two[rows])
+            log_volume = np.linalg.slogdet(covariance)[1] + error.shape[1] * _LOG_2PI
+            alike = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume) > -room
+            for earlier, later in zip(one[rows][alike].tolist(), two[rows][alike].tolist(), strict=True):
+                near[later].append(earlier)
+        return near
+
+    def log_joint(self, members: list[int]) -> float:
+        """Log density of these given that all claim one displacement, whatever it is.
+
+        An error of D is Ad(D)^-1 W_a - W_b, W the random walk of the odometry's error about the first pose.
+        """
+        if len(members) == 1:
+            return 0.0
+        total, a, b = self._chain.total, self._a[members], self._b[members]
+        middle = members[len(members) // 2]
+        after = self._after[middle]
+
+        def shared(one: Ints, other: Ints) -> Floats:
+            return total[np.minimum(one[:, None], other)]
+
+        mixed = after @ shared(a, b)
+        covariance = after @ shared(a, a) @ after.T + shared(b, b) - mixed - mixed.transpose(1, 0, 3, 2)
+        covariance[range(len(a)), range(len(a))] += self._own[members]
+        error = se3.log(se3.between(self._displaced[middle][None], self._displaced[members]))[:, self._chain.axes]
+        try:
+            return _log_common(error, np.swapaxes(covariance, 1, 2))[0]
+        except np.linalg.LinAlgError:
+            return -np.inf
 
     def _adjoint(self, poses: Floats) -> Floats:
         return se3.adjoint(poses)[:, self._chain.axes][:, :, self._chain.axes]

@@ -94,7 +94,7 @@ class GncSettings(Settings):
     def tested(self, factors: Factors, weight: Floats, poses: Floats, strict: bool = False) -> tuple[Floats, Floats]:
         """Weights (E,) and poses once no closure costs the others too much, and none is left out that they predict."""
         graph, chain = factors.graph, OdometryChain.of(factors.graph)
-        room = log_room(chain.poses[:, :3, 3], graph.dimension)
+        room = log_room(graph, chain.poses)
         loops = np.flatnonzero(is_loop(graph))
         test = OutlierTest(factors, loops, self.inlier_probability, room, self.max_iterations, chain, strict)
         state = test(weight, poses)

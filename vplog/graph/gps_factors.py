@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import RECEIVER_SIGMA_M
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
-from vplog.graph.consistency import chi2_quantile
-from vplog.graph.least_squares import Objective, Positions, minimised
+from vplog.graph.build import informed
+from vplog.graph.consistency import chi2_quantile, is_loop
+from vplog.graph.least_squares import GAUGE_SIGMA, Objective, Positions, minimised
+from vplog.graph.marginals import positions_redundancy
 from vplog.graph.robust_kernels import truncated_weights
+from vplog.graph.variance_components import most_likely_variance
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -24,12 +29,20 @@ _LEAST = 3
 """Fixes that fix where a graph is and how it is turned."""
 
 
-_NOISE_ROUNDS = 5
-"""Most rounds of estimating the noise of the fixes: poses follow them less as it grows."""
+_VERTICAL_SIGMA = 0.1
+"""rad; how far a body's vertical is from the plumb line, the mean over a drive: vehicles within some 3 degrees, what is
+held or mounted askew within some 10. It tells the turn about a straight road, which fixes leave open, and little beside
+what they tell of a road that bends."""
+_FORWARD = 0.7
+"""Share of the way along the body's z from which it is a camera's optical axis, with y down: within 45 degrees."""
+_JUMP = 2
+"""Fixes one after the other that are left out where one jumps; fewer are noise."""
+_MOST_JUMPS = 10
+"""Jumps that are tried: each costs a few solves."""
+_TESTS = 5
+"""Most tests of the fixes by a solution of those that passed the last one; 2 are usual."""
 _UNLIKE = 0.1
 """Autocorrelation below which errors are not alike."""
-_STEADY = 1.2
-"""Factor of the noise at which it is settled."""
 
 
 class GpsSettings(Settings):
@@ -37,7 +50,7 @@ class GpsSettings(Settings):
 
     use: bool = False
     """Whether fixes take part: `vplog run --gps`."""
-    unknown_sigma_m: float = Field(default=3.0, gt=0)
+    unknown_sigma_m: float = Field(default=RECEIVER_SIGMA_M, gt=0)
     """Horizontal noise of a fix whose covariance is unknown or zero: 3 m is an open sky without corrections; twice
     that upwards, as satellites are above only."""
     least_sigma_m: float = Field(default=0.02, gt=0)
@@ -64,9 +77,14 @@ class Fixes:
     """(F, 3) east, north, up of the first fix of the log."""
     covariance: Floats
     """(F, 3, 3) m^2 of the same axes."""
+    up: Floats
+    """(3,) axis of the body that points up."""
     origin: tuple[float, float, float]
     """Latitude, longitude in degrees, altitude in m of the first fix."""
+    settings: GpsSettings
     warnings: list[str]
+    alike: float = 1.0
+    """Fixes that tell as much as one: the covariance is multiplied by it, since errors of satellites wander."""
 
     def __len__(self) -> int:
         return len(self.row)
@@ -108,7 +126,9 @@ def fixes_on(gps: Gps | None, odometry: Odometry, keyframes: Keyframes, settings
         key_from_then[:, :3, :3] @ antenna + key_from_then[:, :3, 3],
         local.enu_m[inside][near],
         covariance * alike[:, None, None],
+        _up(keyframes.odom_from_body),
         local.origin,
+        settings,
         warnings,
     )
 
@@ -125,6 +145,13 @@ def _usable(covariance: Floats, settings: GpsSettings) -> tuple[Floats, int]:
     return np.where(sound[:, None, None], fixed, assumed), int((~sound).sum())
 
 
+def _up(poses: Floats) -> Floats:
+    """(3,) axis of the body that points up: z (REP 103), or where it moves along z as a camera that looks ahead, -y."""
+    moved = se3.between(poses[:-1], poses[1:])[:, :3, 3]
+    ahead = abs(moved[:, 2].sum()) > _FORWARD * np.linalg.norm(moved, axis=1).sum()
+    return np.array([0.0, -1.0, 0.0] if ahead else [0.0, 0.0, 1.0])
+
+
 def antennas(poses: Floats, fixes: Fixes) -> Floats:
     """(F, 3) where the antenna was by the poses (N, 4, 4)."""
     on = poses[fixes.row]
@@ -132,10 +159,16 @@ def antennas(poses: Floats, fixes: Fixes) -> Floats:
 
 
 def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
-    """(4, 4) rigid motion from the plane of the first fix to the world of the poses: Umeyama 1991, eq. 40-43."""
+    """(4, 4) rigid motion from the plane of the first fix to the world of the poses: Umeyama 1991, eq. 40-43.
+
+    The body's vertical counts as one more measurement, of `_VERTICAL_SIGMA`.
+    """
     target, share = antennas(poses, fixes), weight / weight.sum()
     middle, target_middle = share @ fixes.enu_m, share @ target
     spread = (share[:, None] * (target - target_middle)).T @ (fixes.enu_m - middle)
+    variance = float(np.median(np.trace(fixes.covariance, axis1=1, axis2=2))) / 3.0
+    vertical = (poses[fixes.row, :3, :3] @ fixes.up).mean(0)
+    spread[:, 2] += vertical * variance / (_VERTICAL_SIGMA**2 * weight.sum())
     left, _, right = np.linalg.svd(spread)
     rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
     return se3.pose(rotation, target_middle - rotation @ middle)
@@ -152,24 +185,26 @@ def with_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, in
     first_from_enu = se3.inverse(start[0]) @ world_from_enu(start, fixes, inlier)
     R = first_from_enu[:3, :3]
     Omega = np.linalg.inv(R @ fixes.covariance @ R.T) * inlier[:, None, None]
+    up = np.tile(fixes.up, (len(fixes), 1))
+    plumb = np.tile(np.eye(3) / (_VERTICAL_SIGMA**2 * len(fixes)), (len(fixes), 1, 1))
     return Objective(
         factors,
         weight,
         positions=Positions(fixes.row, fixes.arm_m, se3.transform(first_from_enu, fixes.enu_m), Omega),
+        verticals=Positions(fixes.row, up, np.tile(R[:, 2], (len(fixes), 1)), plumb, directions=True),
     )
 
 
-def inlier_fixes(
-    factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings
-) -> tuple[Floats, Floats]:
+def inlier_fixes(factors: Factors, weight: Floats, start: Floats, fixes: Fixes) -> tuple[Floats, Floats]:
     """Poses (N, 4, 4), pose 0 as given, and the inliers (F,) among the fixes, 0 or 1.
 
     Graduated non-convexity with the truncated least squares loss (Yang et al., RA-L 2020) over the fixes, the edges
     keeping their weights. The first solve uses all of them, so their frame is found whatever the odometry drifted. A
-    fix is judged by the noise that most have where that is more than they claim.
+    fix is judged by the noise that most have where that is more than they claim. Raises GraphError where hardly any
+    agree.
     """
-    bound, inlier, poses = chi2_quantile(settings.inlier_probability, 3), np.ones(len(fixes)), start
-    mu = 0.0
+    settings, inlier, poses = fixes.settings, np.ones(len(fixes)), start
+    bound, mu = chi2_quantile(settings.inlier_probability, 3), 0.0
     for _ in range(settings.max_stages):
         poses = minimised(with_fixes(factors, weight, poses, fixes, inlier), poses, 20, 1e-4).world_from_body
         chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)))
@@ -179,53 +214,121 @@ def inlier_fixes(
         if ((inlier == 0) | (inlier == 1)).all():
             break
     inlier = np.where(inlier > 0.5, 1.0, 0.0)
+    _check_enough(inlier)
+    return _without_jumps(factors, weight, poses, fixes, inlier)
+
+
+def _without_jumps(
+    factors: Factors, weight: Floats, poses: Floats, fixes: Fixes, inlier: Floats
+) -> tuple[Floats, Floats]:
+    """Poses and inliers (F,) of a lower cost, without jumps whose middle the odometry was bent to.
+
+    Sound fixes before and after such a jump were left out, so each run of inliers between two that were is tried
+    without, the shortest first.
+    """
+    bound = chi2_quantile(fixes.settings.inlier_probability, 3)
+
+    def tested(poses: Floats, inlier: Floats) -> tuple[float, Floats, Floats]:
+        for _ in range(_TESTS):
+            poses = minimised(with_fixes(factors, weight, poses, noisy, inlier), poses, 20, 1e-4).world_from_body
+            chi2 = chi2_of_fixes(poses, noisy, world_from_enu(poses, noisy, np.maximum(inlier, 1e-9)))
+            before, inlier = inlier, (chi2 <= bound).astype(float)
+            if inlier.sum() < _LEAST or (inlier == before).all():
+                break
+        cost = with_fixes(factors, weight, poses, noisy, np.maximum(inlier, 1e-9)).cost(se3.between(poses[:1], poses))
+        return cost + 0.5 * bound * float((1.0 - inlier).sum()), poses, inlier
+
+    chi2 = chi2_of_fixes(poses, fixes, world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)))
+    noise = max(float(np.median(chi2)) / chi2_quantile(0.5, 3), 1.0)
+    noisy = replace(fixes, covariance=fixes.covariance * noise)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inlier, [0]])))
+    kept = [np.arange(first, last) for first, last in edges.reshape(-1, 2).tolist()]
+    between = [
+        run
+        for before, run, after in zip(kept[:-2], kept[1:-1], kept[2:], strict=True)
+        if run[0] - before[-1] > _JUMP and after[0] - run[-1] > _JUMP and len(run) < len(fixes) / 2
+    ]
+    if not between:
+        return poses, inlier
+    best = tested(poses, inlier)
+    for run in sorted(between, key=len)[:_MOST_JUMPS]:
+        without = np.array(best[2])
+        without[run] = 0.0
+        if without.sum() >= _LEAST:
+            best = min(best, tested(best[1], without), key=lambda one: one[0])
+    _check_enough(best[2])
+    return best[1:]
+
+
+def _check_enough(inlier: Floats) -> None:
     if inlier.sum() < _LEAST:
         raise GraphError(
-            f"Only {int(inlier.sum())} of {len(fixes)} GPS fixes agree with the odometry and each other. "
+            f"Only {int(inlier.sum())} of {len(inlier)} GPS fixes agree with the odometry and each other. "
             "Run without --gps, or set gps.unknown_sigma_m to what the receiver does."
         )
-    return poses, inlier
 
 
-def with_noise_of(factors: Factors, weight: Floats, start: Floats, fixes: Fixes, settings: GpsSettings) -> Fixes:
-    """The fixes with the covariance that their residuals to the weighted edges (E,) say they have.
+def with_noise_of(fixes: Fixes, inlier: Floats, poses: Floats, checks: float) -> tuple[Fixes, Floats, float]:
+    """The fixes with the covariance that residuals at the least squares `poses` imply, their inliers (F,), its factor.
 
-    Not less than they claim, since poses follow them. Errors of satellites wander: fixes whose errors are alike count
-    for so much less, by the sum of the autocorrelation of their residuals as far as it is positive (Geyer, Practical
-    Markov Chain Monte Carlo, 1992).
+    `checks` are the degrees of freedom with which odometry and closures check the inliers (positions_redundancy).
+    Errors of satellites wander: fixes whose errors are alike count for so much less, by the sum of the autocorrelation
+    of their residuals as far as it is positive (Geyer, Practical Markov Chain Monte Carlo, 1992).
     """
-    for _ in range(_NOISE_ROUNDS):
-        poses, inlier = inlier_fixes(factors, weight, start, fixes, settings)
-        world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
-        sound = np.flatnonzero(inlier)
-        error = ((antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m)[sound]
-        root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
-        white = (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
-        power = max(float((white**2).mean()), 1e-12)
-        alike = 1.0
-        for lag in range(1, len(white) // 4):
-            share = float((white[lag:] * white[:-lag]).mean()) / power
-            if share < _UNLIKE:
-                break
-            alike += 2.0 * share
-        factor = power * alike
-        fixes = replace(fixes, covariance=fixes.covariance * max(factor, 1.0))
-        if factor < _STEADY:
+    world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
+    sound = np.flatnonzero(inlier)
+    error = ((antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m)[sound]
+    root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
+    white = (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
+    power = max(float((white**2).mean()), 1e-12)
+    alike = 1.0
+    for lag in range(1, len(white) // 4):
+        share = float((white[lag:] * white[:-lag]).mean()) / power
+        if share < _UNLIKE:
             break
-    return fixes
+        alike += 2.0 * share
+    checks = min(max(checks, 0.0), 3.0 * len(sound))
+    factor = most_likely_variance(power * 3.0 * len(sound) / alike, checks / alike) * alike
+    fixes = replace(fixes, covariance=fixes.covariance * factor, alike=alike)
+    chi2 = chi2_of_fixes(poses, fixes, world) * alike
+    inlier = (chi2 <= chi2_quantile(fixes.settings.inlier_probability, 3)).astype(float)
+    _check_enough(inlier)
+    return fixes, inlier, factor
 
 
-def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes, settings: GpsSettings) -> float:
+def noisier(fixes: Fixes, estimated: Fixes | None) -> Fixes:
+    """Those with the larger covariance of two that differ by a factor."""
+    return fixes if estimated is None or estimated.covariance[0, 0, 0] <= fixes.covariance[0, 0, 0] else estimated
+
+
+def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes) -> float:
     """By how much the log density is less with the fixes than that of the weighted edges (E,), least at `poses`.
 
-    But for a constant; outliers count as at the bound of inliers.
+    But for a constant; the fixes' noise is the likeliest where that is more than `fixes` have, and outliers count as at
+    the bound of inliers.
     """
-    most = 0.5 * chi2_quantile(settings.inlier_probability, 3)
+    most = 0.5 * chi2_quantile(fixes.settings.inlier_probability, 3)
     try:
-        moved, inlier = inlier_fixes(factors, weight, poses, fixes, settings)
+        moved, inlier = inlier_fixes(factors, weight, poses, fixes)
+        together = with_fixes(factors, weight, moved, fixes, inlier)
+        fit = minimised(together, moved, 20, 1e-4).world_from_body
+        present, inliers, factor = with_noise_of(fixes, inlier, fit, positions_redundancy(together, fit))
+        if factor > 1.0:
+            fixes, inlier = present, inliers
+            together = with_fixes(factors, weight, fit, fixes, inlier)
+            fit = minimised(together, fit, 20, 1e-4).world_from_body
     except GraphError:
         return most * len(fixes)
-    fit = minimised(with_fixes(factors, weight, moved, fixes, inlier), moved, 20, 1e-4).world_from_body
-    alone, together = Objective(factors, weight), with_fixes(factors, weight, fit, fixes, inlier)
-    cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
-    return cost + 0.5 * (together.information(fit).log_determinant() - alone.information(poses).log_determinant())
+    alone, noise = Objective(factors, weight), max(factor, 1.0) / fixes.alike
+    cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses)
+    cost += (most * float((1.0 - inlier).sum()) + 1.5 * math.log(noise) * float(inlier.sum())) / fixes.alike
+    return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))
+
+
+def _log_determinant(objective: Objective, poses: Floats) -> float:
+    """Log determinant of the information matrix; of a chain, where rounding may leave none, that of its edges."""
+    graph, on = objective.factors.graph, objective.weight > 0
+    if is_loop(graph)[on].any():
+        return objective.information(poses).log_determinant()
+    held = 1 + len(objective.factors.loose(objective.weight))
+    return float(np.linalg.slogdet(informed(graph)[on])[1].sum()) - 2.0 * held * 6.0 * float(np.log(GAUGE_SIGMA))

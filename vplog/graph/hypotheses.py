@@ -7,6 +7,7 @@ its own, and the evidence of all closures (`evidence`) chooses among them and th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,19 +15,19 @@ import numpy as np
 
 from vplog.errors import GraphError
 from vplog.graph.build import informed
-from vplog.graph.consistency import OdometryChain, is_loop
-from vplog.graph.evidence import log_evidence
+from vplog.graph.consistency import OdometryChain, is_loop, residual_sigma
+from vplog.graph.evidence import agreeing, log_evidence, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
 from vplog.graph.odometry_mixture import modes
 from vplog.graph.robust_kernels import DcsSettings
-from vplog.graph.variance_components import Sigmas, estimate
+from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from vplog.data import Bools, Floats, PoseGraph
+    from vplog.data import Bools, Floats, Ints, PoseGraph
     from vplog.stages import Optimiser
 
 _MOST_INFORMATION = 1e4
@@ -37,11 +38,19 @@ _STEADY = 0.2
 """Change of a sigma below which closures need not be tested again."""
 _ALIKE = 0.01
 """Share of the closures by which a start must differ from what was found to be tried."""
+_AS_CLAIMED = math.log(2.0)
+"""Logarithm of a sigma's factor up to which noise is as claimed: a factor of two."""
+_FAMILIES = 2
+"""Largest families of closures that are worth a solve: the true one and one that is taken for it."""
+_SHARES = (1.0, 0.25, 0.0625)
+"""Shares of the odometry's sigmas by which families are told apart."""
 _VERY_STRONG = 5.0
 """Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
 a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. What another method that was chosen makes
 of them is used where the odds are even."""
-_STEPS, _TOLERANCE = 100, 1e-6
+_FLIPS, _MOST_FLIPS = 4, 10
+"""Runs of either kind that are tried at once, and turns."""
+_STEPS, _TOLERANCE = 100, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,33 +78,117 @@ def best_hypothesis(
     chain = OdometryChain.of(graph)
     found: list[Hypothesis] = []
     if isinstance(optimiser, GncSettings):
-        sets = [np.ones(len(loops), bool)]
-        soft = DcsSettings()(graph).weight[loops] > 0.5  # which starts from all of them, and throws none out
-        for sigmas, likely in [(Sigmas(), sets[0]), *modes(graph, loops, chain), (Sigmas(), soft)]:
-            if found and min(float((likely != one).mean()) for one in sets) <= _ALIKE:
-                continue
-            try:
-                found += _from_start(graph, optimiser, sigmas, likely)
-            except (GraphError, np.linalg.LinAlgError):  # a start that leaves poses open
-                continue
-            sets = [one.weight[loops] > 0 for one in found]
+        found = _searched(graph, optimiser, loops, chain)
     else:
         solution = optimiser(graph)
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
-        found.append(_judged(graph, kept, *_estimated(graph, kept, solution.world_from_body, Sigmas())))
-    for sigmas in dict.fromkeys([Sigmas(), *(one.sigmas for one in found)]):
+        found.append(_refit(graph, kept, solution.world_from_body, Sigmas()))
+    likeliest = [one.sigmas for one in sorted(found, key=lambda one: -one.log_evidence)[:1]]
+    for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
         alone = _judged(graph, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     if cost is None:
         return max(found, key=lambda one: one.log_evidence)
     best, most = found[-1], -np.inf
+    judged: list[Hypothesis] = []
     for one in sorted(found, key=lambda one: -one.log_evidence):
         if one.log_evidence <= most:  # its measurements can only lower it
             break
-        left = one.log_evidence - cost(Factors.of(claimed_times(graph, one.sigmas)), one.weight, one.poses)
+        if any((one.weight == other.weight).all() and not one.sigmas.differ(other.sigmas, _STEADY) for other in judged):
+            continue
+        judged.append(one)
+        try:
+            left = one.log_evidence - cost(Factors.of(claimed_times(graph, one.sigmas)), one.weight, one.poses)
+        except GraphError:  # nearly singular
+            continue
         best, most = (one, left) if left > most else (best, most)
     return best
+
+
+def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryChain) -> list[Hypothesis]:
+    """Hypotheses by graduated non-convexity from sets of closures that may be true, and from families of them."""
+    likely_modes = modes(graph, loops, chain)
+    soft = DcsSettings()(graph).weight[loops] > 0.5  # which starts from all of them, and throws none out
+    found: list[Hypothesis] = []
+    tried: list[Bools] = []
+    for sigmas, likely in [(Sigmas(), np.ones(len(loops), bool)), *likely_modes, (Sigmas(), soft)]:
+        if _is_new(likely, tried):
+            found += _from_start(graph, gnc, sigmas, likely)
+            tried += [one.weight[loops] > 0 for one in found[-2:]]
+            best = max(found, key=lambda one: one.log_evidence, default=None)
+            if best is not None and best.weight.all() and not best.sigmas.differ(Sigmas(), _AS_CLAIMED):
+                return found  # all agree, as claimed
+    of_families = []
+    sigmas = likely_modes[0][0]
+    starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), _AS_CLAIMED) else [sigmas]
+    for likely in [one for sigmas in starts for one in _families(graph, loops, sigmas)]:
+        if _is_new(likely, tried):
+            weight = np.ones(len(graph.a))
+            weight[loops] = likely
+            of_families += _attempted(lambda weight=weight: [_refit(graph, weight, chain.poses, Sigmas())])
+    of_families = sorted(of_families, key=lambda one: -one.log_evidence)[:_FAMILIES]
+    for one in of_families:
+        found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
+    found += of_families
+    return [*found, _improved(graph, max(found, key=lambda one: one.log_evidence))] if found else []
+
+
+def _is_new(likely: Bools, tried: list[Bools]) -> bool:
+    """Whether the set (K,) differs from all that were tried; it is one of them then."""
+    new = bool(likely.any()) and all(float((likely != one).mean()) > _ALIKE for one in tried)
+    tried += [likely] * new
+    return new
+
+
+def _attempted(solve: Callable[[], list[Hypothesis]]) -> list[Hypothesis]:
+    """The hypotheses of a solve; none where closures leave poses open."""
+    try:
+        return solve()
+    except (GraphError, np.linalg.LinAlgError):
+        return []
+
+
+def _families(graph: PoseGraph, loops: Ints, sigmas: Sigmas) -> list[Bools]:
+    """Sets of closures (K,) that agree with each other, whatever they make of the odometry.
+
+    The better the odometry is taken to be, the finer it tells families apart.
+    """
+    found = []
+    for share in _SHARES:
+        tried = sigmas._replace(rotation=share * sigmas.rotation, translation=share * sigmas.translation)
+        present = claimed_times(graph, tried)
+        found += [np.isin(loops, edges) for edges in agreeing(present, loops, OdometryChain.of(present))[:_FAMILIES]]
+    return found
+
+
+def _improved(graph: PoseGraph, best: Hypothesis) -> Hypothesis:
+    """The hypothesis after flips of runs of closures, each the best of some, as long as they make it likelier.
+
+    Tried are the rejected runs that fit best, and the accepted ones that fit worst.
+    """
+    loops = is_loop(graph)
+    for _ in range(_MOST_FLIPS):
+        misfit = residual_sigma(claimed_times(graph, best.sigmas), best.poses)
+        flips: list[Ints] = []
+        for accepted, sign in ((False, 1.0), (True, -1.0)):
+            edges = np.flatnonzero(loops & ((best.weight > 0) == accepted))
+            flips += sorted(runs(graph, edges), key=lambda run: sign * float(misfit[run].mean()))[:_FLIPS]
+        tried = [one for run in flips for one in _flipped(graph, best, run)]
+        better = max(tried, key=lambda one: one.log_evidence, default=best)
+        if better.log_evidence <= best.log_evidence:
+            break
+        again = _refit(graph, better.weight, better.poses, better.sigmas)
+        best = max(again, better, key=lambda one: one.log_evidence)
+    return best
+
+
+def _flipped(graph: PoseGraph, best: Hypothesis, run: Ints) -> list[Hypothesis]:
+    weight = np.array(best.weight)
+    weight[run] = 1.0 - weight[run]
+    if not weight[is_loop(graph)].any():
+        return []
+    return _attempted(lambda: [_judged(graph, weight, best.poses, best.sigmas)])
 
 
 def bounded(graph: PoseGraph) -> PoseGraph:
@@ -110,19 +203,22 @@ def bounded(graph: PoseGraph) -> PoseGraph:
     return replace(graph, information=information)
 
 
-def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
-    """The graph with its sigmas multiplied."""
-    factor = np.where(is_loop(graph), sigmas.closures, sigmas.odometry)
-    return replace(graph, information=graph.information / factor[:, None, None] ** 2)
-
-
 def _from_start(graph: PoseGraph, gnc: GncSettings, sigmas: Sigmas, likely: Bools) -> list[Hypothesis]:
-    """Graduated non-convexity over the `likely` closures (K,), then estimates of the sigmas and tests by them.
+    """Graduated non-convexity over the `likely` closures (K,), then estimates of the sigmas and tests by them."""
+
+    def solve() -> list[Hypothesis]:
+        weight, poses = gnc.annealed(Factors.of(claimed_times(graph, sigmas)), likely)
+        return _tested(graph, gnc, weight, poses, sigmas)
+
+    return _attempted(solve)
+
+
+def _tested(graph: PoseGraph, gnc: GncSettings, weight: Floats, poses: Floats, sigmas: Sigmas) -> list[Hypothesis]:
+    """Estimates of the sigmas and tests of all closures by them, in turns.
 
     The last test lets pass what chance would hardly bring so near, and a stricter one what the noise explains; they are
     two hypotheses where they differ.
     """
-    weight, poses = gnc.annealed(Factors.of(claimed_times(graph, sigmas)), likely)
     found: list[Hypothesis] = []
     for strict in (False, True):
         for _ in range(_ROUNDS):
@@ -134,6 +230,10 @@ def _from_start(graph: PoseGraph, gnc: GncSettings, sigmas: Sigmas, likely: Bool
         if not found or (weight != found[0].weight).any():
             found.append(_judged(graph, weight, poses, sigmas))
     return found
+
+
+def _refit(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+    return _judged(graph, weight, *_estimated(graph, weight, poses, sigmas))
 
 
 def _estimated(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) -> tuple[Floats, Sigmas]:

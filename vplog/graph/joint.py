@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,8 +11,9 @@ from pydantic import Field
 from vplog.data import EdgeKind, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import parts
-from vplog.graph.consistency import KNOWN_TO, is_loop, keep_odometry_if_worse, residual_sigma
+from vplog.graph.consistency import residual_sigma
 from vplog.graph.refine import RefineSettings, refine
+from vplog.graph.solve import decided
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -54,11 +55,10 @@ class Drive:
     """One drive as its own closures leave it."""
 
     graph: PoseGraph
-    """Its odometry and its own closures that were kept, from its own first pose on; 3D."""
+    """Its odometry and its own closures that were kept, with the noise that its own solve found, from its own first
+    pose on; 3D."""
     of_odometry: Bools
     """(E,) edges whose metres are the odometry's."""
-    sigma_factor: float = 1.0
-    """What its own closures made of the sigma that its odometry claims, which the graph has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +108,7 @@ def join(
     """The maps that the drives make. Raises GraphError where a graph cannot be solved.
 
     Drives joined by enough closures are solved as one, with all closures between them. Pairs with too few inliers are
-    separated and the rest is solved again, until every pair has enough; other drives keep their own poses. Where the
-    odometry bends more than its noise allows, the half of the pairs with fewest inlier places is separated first.
+    separated and the rest is solved again, until every pair has enough; other drives keep their own poses.
     """
     joined = [_places(one, settings.spacing) >= settings.least_closures for one in between]
     weight = [np.zeros(len(one.query)) for one in between]
@@ -126,24 +125,23 @@ def join(
             if at not in apart and len(one.query) and one.later in inside and one.earlier in inside
         ]
         graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
-        as_estimated = _as_found(drives, members, graph)
-        tried = solve(as_estimated)
-        solution = keep_odometry_if_worse(as_estimated, tried, KNOWN_TO)
-        held = dict(zip(ties, rows, strict=True))
-        places = {at: _places(between[at], settings.spacing, tried.weight[held[at]]) for at in ties if joined[at]}
-        loose = [at for at, count in places.items() if count < settings.least_closures]
-        if not loose and solution is not tried:  # each by itself holds, and together they do not
-            loose = sorted(places, key=lambda at: (places[at], tried.weight[held[at]].sum(), at))
-            loose = loose[: -(-len(loose) // 2)]
+        decision = decided(graph, solve)
+        weights = decision.solution.weight
+        loose = [
+            at
+            for at, part in zip(ties, rows, strict=True)
+            if joined[at] and _places(between[at], settings.spacing, weights[part]) < settings.least_closures
+        ]
         if loose:
             for at in loose:
                 joined[at] = False
-                apart[at] = solution.reason
+                apart[at] = decision.solution.reason
             continue
-        refined = solved[members] = refine(graph, solution, of_odometry, learn)
+        refined = refine(decision.graph, decision.solution, of_odometry, learn, sigmas=decision.sigmas)
+        solved[members] = refined
         after = residual_sigma(refined.graph, refined.solution.world_from_body)
         for at, part in zip(ties, rows, strict=True):
-            weight[at], residual[at] = solution.weight[part], after[part]
+            weight[at], residual[at] = weights[part], after[part]
         for member, start in zip(members, starts, strict=True):
             count = len(drives[member].graph.world_from_body)
             poses[member] = refined.solution.world_from_body[start : start + count]
@@ -163,15 +161,6 @@ def spaced_apart(keyframes: Ints, spacing: int) -> int:
         if one >= last + spacing:
             count, last = count + 1, one
     return count
-
-
-def _as_found(drives: Sequence[Drive], members: Sequence[int], graph: PoseGraph) -> PoseGraph:
-    """The graph with the noise of odometry as the drives' own closures found it, where it was claimed to be less."""
-    factor = np.concatenate([np.full(len(drives[one].graph.a), max(drives[one].sigma_factor, 1.0)) for one in members])
-    odometry = ~is_loop(graph)[: len(factor)]
-    information = graph.information.copy()
-    information[: len(factor)][odometry] /= factor[odometry, None, None] ** 2
-    return replace(graph, information=information)
 
 
 def _maps(count: int, between: Sequence[Between], joined: Sequence[bool]) -> list[tuple[int, ...]]:

@@ -65,7 +65,10 @@ class Loss:
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Measured positions (F, 3), in the frame of the start's pose 0, of points fixed to bodies, as GPSFactorArm."""
+    """Measured positions (F, 3), in the frame of the start's pose 0, of points fixed to bodies, as GPSFactorArm.
+
+    Or measured directions (F, 3) of axes of bodies, as Pose3AttitudeFactor: they turn and do not move with the bodies.
+    """
 
     row: Ints
     """(F,) pose."""
@@ -74,20 +77,27 @@ class Positions:
     position_m: Floats
     Omega: Floats
     """(F, 3, 3) information; 0 for those that do not count."""
+    directions: bool = False
 
     def error(self, poses: Floats) -> Floats:
         at = poses[self.row]
-        return (at[:, :3, :3] @ self.arm_m[:, :, None])[:, :, 0] + at[:, :3, 3] - self.position_m
+        turned = (at[:, :3, :3] @ self.arm_m[:, :, None])[:, :, 0]
+        return turned - self.position_m + (0.0 if self.directions else at[:, :3, 3])
 
     def cost(self, poses: Floats) -> float:
         """Half the chi-square."""
         error = self.error(poses)
         return float(0.5 * np.einsum("fi,fij,fj->", error, self.Omega, error))
 
-    def add_to(self, diagonal: Floats, gradient: Floats, poses: Floats) -> None:
-        """Their normal equations, in place: the position moves with the pose as R (-[arm], I)."""
+    def jacobian(self, poses: Floats) -> Floats:
+        """(F, 3, 6) by the pose's own twist: R (-[arm], I)."""
         rotation = poses[self.row, :3, :3]
-        jacobian = np.concatenate([-rotation @ se3.skew(self.arm_m), rotation], axis=2)
+        moved = np.zeros_like(rotation) if self.directions else rotation
+        return np.concatenate([-rotation @ se3.skew(self.arm_m), moved], axis=2)
+
+    def add_to(self, diagonal: Floats, gradient: Floats, poses: Floats) -> None:
+        """Their normal equations, in place."""
+        jacobian = self.jacobian(poses)
         by_error = np.swapaxes(jacobian, 1, 2) @ self.Omega
         np.add.at(diagonal, self.row, by_error @ jacobian)
         np.add.at(gradient, self.row, (by_error @ self.error(poses)[:, :, None])[:, :, 0])
@@ -101,12 +111,13 @@ class Objective:
     weight: Floats
     loss: Loss | None = None
     positions: Positions | None = None
+    verticals: Positions | None = None
 
     def cost(self, poses: Floats) -> float:
         """Half the chi-square, or the loss, at poses (N, 4, 4)."""
         edges = edge_costs(self.factors.graph, self.weight, poses)
         total = float((edges if self.loss is None else self.loss.cost(edges)).sum())
-        return total if self.positions is None else total + self.positions.cost(poses)
+        return total + sum(one.cost(poses) for one in self._measured())
 
     def linearised(self, poses: Floats) -> tuple[Blocks, Floats]:
         """Half the Hessian and the gradient (N, d) at poses (N, 4, 4), as Gauss-Newton has them."""
@@ -114,9 +125,12 @@ class Objective:
         if self.loss is not None:
             weight = weight * self.loss.weight(edge_costs(graph, weight, poses))
         matrix, gradient, _ = normal_equations(graph, weight, poses)
-        if self.positions is not None:
-            self.positions.add_to(matrix.diagonal, gradient, poses)
+        for one in self._measured():
+            one.add_to(matrix.diagonal, gradient, poses)
         return matrix, gradient
+
+    def _measured(self) -> list[Positions]:
+        return [one for one in (self.positions, self.verticals) if one is not None]
 
     def factorised(self, matrix: Blocks, damping: float) -> Supernodes | BayesTree:
         """Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""

@@ -51,6 +51,21 @@ def pose_covariances(objective: Objective, poses: Floats) -> Floats:
     return result
 
 
+def positions_redundancy(objective: Objective, poses: Floats) -> float:
+    """Degrees of freedom with which the rest of what is minimised checks its positions (Foerstner 1979).
+
+    Raises GraphError where the poses are not determined.
+    """
+    positions = objective.positions
+    if positions is None:
+        return 0.0
+    used = positions.Omega.any((1, 2))
+    jacobian = positions.jacobian(se3.between(poses[:1], poses))[used]
+    own = pose_covariances(objective, poses)[positions.row[used]]
+    spread = jacobian @ own @ np.swapaxes(jacobian, 1, 2)
+    return 3.0 * float(used.sum()) - float(np.einsum("fij,fji->", positions.Omega[used], spread))
+
+
 def joint_covariance(factors: Factors, information: Supernodes | BayesTree, poses: Floats, edges: Ints) -> Floats:
     """Covariance (K d, K d) of a_from_b of a few edges together, each in the frame of its b."""
     graph = factors.graph

@@ -49,6 +49,26 @@ class NoiseSettings(Settings):
 def edge_covariance(
     odometry: Odometry, keyframe_stamp_ns: Ints, settings: NoiseSettings
 ) -> tuple[Floats, list[str], str]:
+    """`covariance_without_breaks`, but where the odometry breaks an edge may be any turn, and as long as the path."""
+    covariance, warnings, source = covariance_without_breaks(odometry, keyframe_stamp_ns, settings)
+    edges = broken_edges(odometry, keyframe_stamp_ns)
+    if len(edges):
+        path_m = np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1).sum()
+        covariance[edges] = np.diag([*[np.pi**2 / 3] * 3, *[max(float(path_m), 1.0) ** 2] * 3])
+    return covariance, warnings, source
+
+
+def broken_edges(odometry: Odometry, keyframe_stamp_ns: Ints) -> Ints:
+    """Edges, by the row of their earlier keyframe, within which the odometry breaks."""
+    if odometry.breaks is None or not len(odometry.breaks):
+        return np.zeros(0, np.int64)
+    edges = np.searchsorted(keyframe_stamp_ns, odometry.stamp_ns[odometry.breaks], "left") - 1
+    return np.unique(edges[(edges >= 0) & (edges < len(keyframe_stamp_ns) - 1)])
+
+
+def covariance_without_breaks(
+    odometry: Odometry, keyframe_stamp_ns: Ints, settings: NoiseSettings
+) -> tuple[Floats, list[str], str]:
     """Covariance (N-1, 6, 6) of each edge between consecutive keyframes, in the later body's frame; warnings; source.
 
     Logs use the covariance of odometry in three ways:
@@ -63,6 +83,8 @@ def edge_covariance(
     3. `increments`: it is constant or fluctuates. That cannot belong to an accumulated pose, so it is the noise of
        one increment, as RTAB-Map takes it. Errors add per sample: the covariances between the keyframes, moved to
        the later body by the adjoint, are summed, a cut interval by its share.
+
+    Fixes, as odometry that does not drift, are increments (`fixes`), whatever the drift model says.
 
     Single axes that are zero or beyond 1e3 (a planar robot), and edges with unusable samples, take the model. No edge
     has less noise than `best_share` of the model's: over-confident odometry would throw every closure out. A covariance
@@ -79,11 +101,12 @@ def edge_covariance(
             f"Keyframes at {keys[0]}..{keys[-1]} ns must increase and lie within the odometry "
             f"({len(stamps)} samples, {stamps[0] if len(stamps) else 0}..{stamps[-1] if len(stamps) else 0} ns)."
         )
+    if not odometry.drifts and odometry.covariance is not None:
+        return _sum(odometry, keys, odometry.covariance), [], "fixes"
     modelled = _drift_model(odometry, keys, settings)
-    if settings.source == "model":
-        return modelled, [], "model"
-    if odometry.covariance is None:
-        return modelled, [_unknown("The odometry has no covariance", settings)], "model"
+    if settings.source == "model" or odometry.covariance is None:
+        unknown = [_unknown("The odometry has no covariance", settings)]
+        return modelled, [] if settings.source == "model" else unknown, "model"
 
     logged = np.asarray(odometry.covariance, np.float64)
     finite: Bools = np.asarray(np.isfinite(logged).all((1, 2)))

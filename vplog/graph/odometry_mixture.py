@@ -11,7 +11,7 @@ from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.evidence import log_room, runs
-from vplog.graph.variance_components import Sigmas
+from vplog.graph.variance_components import Sigmas, claimed_times
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints, PoseGraph
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _ODOMETRY = 2.0 ** np.arange(-5, 6)
 _CLOSURES = 2.0 ** np.arange(-1, 4)
 """Factors of sigmas tried. 20 closures do not tell a factor more finely than by two."""
+_ROTATION = 4.0 ** np.arange(-2, 3)
+"""Factors of the rotation's sigma beside that of the translation."""
 _MOST = 3
 """Modes that are worth a solve."""
 
@@ -36,17 +38,22 @@ def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> 
     known = chain.part[graph.a[loops]] == chain.part[graph.b[loops]]
     if not known.any():
         return [(Sigmas(), np.ones(len(loops), bool))]
-    mixture = _Mixture(graph, loops[known], chain)
-    best = [
-        max((mixture.fit(Sigmas(float(s), float(t))) for t in _CLOSURES), key=lambda fit: fit[0]) for s in _ODOMETRY
-    ]
-    likelihood = np.array([-np.inf, *(fit[0] for fit in best), -np.inf])
-    peak = (likelihood[1:-1] >= likelihood[:-2]) & (likelihood[1:-1] >= likelihood[2:])
+    fits = np.empty((len(_ROTATION), len(_ODOMETRY)), object)
+    for k, rotation in enumerate(_ROTATION.tolist()):
+        present = claimed_times(graph, Sigmas(rotation=rotation)) if rotation != 1.0 else graph
+        mixture = _Mixture(present, loops[known], OdometryChain.of(present) if rotation != 1.0 else chain)
+        for n, s in enumerate(_ODOMETRY.tolist()):
+            tried = (mixture.fit(Sigmas(rotation * s, s, t)) for t in _CLOSURES.tolist())
+            fits[k, n] = max(tried, key=lambda fit: fit[0])
+    likelihood = np.array([[fit[0] for fit in row] for row in fits])
+    around = np.pad(likelihood, 1, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(around, (3, 3))
+    peaks = np.argwhere(likelihood >= windows.max((2, 3))).tolist()
     found = []
-    for number in sorted(np.flatnonzero(peak).tolist(), key=lambda number: -best[number][0])[:_MOST]:
+    for k, n in sorted(peaks, key=lambda at: -likelihood[at[0], at[1]])[:_MOST]:
         true = np.ones(len(loops), bool)
-        true[known] = best[number][2] > 0.5
-        found.append((best[number][1], true))
+        true[known] = fits[k, n][2] > 0.5
+        found.append((fits[k, n][1], true))
     return found
 
 
@@ -66,13 +73,13 @@ class _Mixture:
         self._spread = np.maximum(spread, 0.0)
         self._error2 = (np.swapaxes(turn, 1, 2) @ (root @ error[:, :, None]))[:, :, 0] ** 2
         self._log_volume = np.log(np.abs(np.linalg.det(root)))
-        self._false = -log_room(chain.poses[:, :3, 3], graph.dimension)
+        self._false = -log_room(graph, chain.poses)
         size = {edge: len(run) for run in runs(graph, loops) for edge in run.tolist()}
         self._counts = np.array([size[edge] for edge in loops.tolist()]) ** -0.5
 
     def fit(self, sigmas: Sigmas) -> tuple[float, Sigmas, Floats]:
         """Log likelihood with the prior of these sigmas, and the probability of each closure (K,) to be true."""
-        variance = sigmas.odometry**2 * self._spread + sigmas.closures**2
+        variance = sigmas.translation**2 * self._spread + sigmas.closures**2
         true = self._log_volume - 0.5 * (self._error2 / variance + np.log(2.0 * np.pi * variance)).sum(1)
         share, least = 0.5, 1.0 / (2.0 * len(true))  # half a closure, so that no share is 0 or 1
         sure = np.zeros(len(true))

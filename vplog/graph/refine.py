@@ -9,16 +9,16 @@ import numpy as np
 from pydantic import Field
 
 from vplog.graph.consistency import is_loop, residual_sigma
+from vplog.graph.evidence import runs
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, world_from_enu
-from vplog.graph.hypotheses import claimed_times
+from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.graph.least_squares import Objective, minimised
-from vplog.graph.variance_components import Sigmas, estimate
+from vplog.graph.marginals import positions_redundancy
+from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, PoseGraph, Solution
-    from vplog.graph.gps_factors import GpsSettings
 
 _STEP = 1e-4
 """Step of the scale for differences: far above rounding, far below what any drive determines."""
@@ -52,10 +52,7 @@ class RefineSettings(Settings):
     """How far the scale of closures with metres of their own is expected from 1: 5 % are a millimetre of a stereo
     pair's baseline, or a depth camera's error at 4 m."""
     significance: float = Field(default=3.0, ge=0)
-    """The odometry's scale is applied where it is so many sigmas from 1."""
-    closure_significance: float = Field(default=5.0, ge=0)
-    """The closures' scale is applied where it is so many sigmas from 1: what errors of neighbouring closures share
-    makes it look surer than it is."""
+    """A scale is applied where it is so many sigmas from 1; neighbouring closures count as one."""
     max_rounds: int = Field(default=12, ge=1)
     """Rounds after which it gives up; drives take 3-6."""
 
@@ -73,9 +70,11 @@ class Scale:
     significance: float
     """Sigmas that it must be from 1 to be applied."""
     value: float = 1.0
+    witnesses: float = 1.0
+    """Independent ones among the edges, as a share: neighbouring closures see the same landmarks."""
 
     def is_sure(self, sigma: float) -> bool:
-        return abs(self.value - 1.0) > self.significance * sigma
+        return abs(self.value - 1.0) > self.significance * sigma / self.witnesses**0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +82,28 @@ class Refined:
     """A solution with what it says of the sensors."""
 
     graph: PoseGraph
-    """The graph as solved: metres of the odometry multiplied by `scale`, its covariance by `noise`."""
+    """The graph as solved: metres of the odometry multiplied by `scale`, its covariance by the squares of `sigmas`."""
     solution: Solution
-    noise: float
-    """Factor of the odometry's covariance, 1 where it was not judged."""
+    sigmas: Sigmas
+    """Factors of the claimed sigmas, 1 where they were not judged."""
     scale: float
     """Factor of the odometry's metres, 1 where it was not judged."""
+    fixes: Fixes | None
+    """GPS with its covariance as estimated."""
     inlier: Floats
     """(F,) 1 for the GPS fixes that were kept, 0 for the others; empty without GPS."""
     world_from_enu: Floats | None
     """(4, 4) from the plane of the first fix, None without GPS."""
+
+
+def about_odometry(refined: Refined) -> dict[str, float]:
+    """What run.json says of it: factors of its claimed sigmas, and of its metres."""
+    sigmas = refined.sigmas
+    return {
+        "sigma_factor": sigmas.translation,
+        "rotation_sigma_factor": sigmas.rotation,
+        "scale": refined.scale,
+    }
 
 
 def refine(
@@ -101,40 +112,49 @@ def refine(
     of_odometry: Bools,
     settings: RefineSettings,
     fixes: Fixes | None = None,
-    gps: GpsSettings | None = None,
     sigmas: Sigmas = _AS_CLAIMED,
+    scale: float = 1.0,
 ) -> Refined:
     """Solve again with what the constraints kept say of the sensors, and with GPS where there is any.
 
     `of_odometry` (E,) marks edges whose metres are the odometry's: its own, and closures whose scale is taken from it.
-    `sigmas` are those of the solution. The weights of edges stay as they are. Raises GraphError where too few fixes
-    agree.
+    `sigmas` and `scale`, of the odometry, are those of the solution. The weights of edges stay as they are. Raises
+    GraphError where too few fixes agree.
     """
     weight, poses, inlier = solution.weight, solution.world_from_body, np.zeros(0)
     loops = is_loop(graph)
-    scales = [Scale("odometry", of_odometry, settings.scale_sigma, settings.significance)] if fixes is not None else []
+    scales = []
+    if fixes is not None:
+        scales = [Scale("odometry", of_odometry, settings.scale_sigma, settings.significance, scale)]
     metric = loops & ~of_odometry & (weight > 0)
     if metric.any() and np.median(_lengths(graph, metric)) >= _LONG:
         own, expected = loops & ~of_odometry, settings.closure_scale_sigma
-        scales.append(Scale("closures", own, expected, settings.closure_significance))
+        witnesses = sum(1 for _ in runs(graph, np.flatnonzero(metric))) / float(metric.sum())
+        scales.append(Scale("closures", own, expected, settings.significance, witnesses=witnesses))
     checked = bool((weight[loops] > 0).any())
-    if fixes is not None and gps is not None:
-        start = Factors.of(rescaled(graph, [], sigmas))
-        poses, inlier = inlier_fixes(start, weight, poses, fixes, gps)
+    if fixes is not None:
+        poses, inlier = inlier_fixes(Factors.of(rescaled(graph, scales, sigmas)), weight, poses, fixes)
         checked = True
     if not checked or not (settings.noise or settings.scale):
         return _refined(rescaled(graph, [], sigmas), solution, poses, sigmas, [], fixes, inlier)
 
-    scales = scales if settings.scale else []
+    scales, trail = scales if settings.scale else [], [sigmas]
     for _ in range(settings.max_rounds):
         objective = _objective(rescaled(graph, scales, sigmas), weight, poses, fixes, inlier)
         poses = minimised(objective, poses, _STEPS, 1e-6).world_from_body
-        before = sigmas
+        before, factor = sigmas, 1.0
         if settings.noise:
             sigmas = estimate(objective, poses, sigmas)
+            trail.append(sigmas)
+            if len(trail) >= 3 and sigmas.differ(before, _STEADY):
+                sigmas = extrapolated(*trail[-3:])
+                trail = [sigmas]
         moved = [_scale_step(graph, weight, scales, n, sigmas, poses, fixes, inlier) for n in range(len(scales))]
+        if fixes is not None:
+            fixes, inlier, factor = with_noise_of(fixes, inlier, poses, positions_redundancy(objective, poses))
         scales = [replace(one, value=one.value + step) for one, (step, _) in zip(scales, moved, strict=True)]
-        if sigmas.differ(before, _STEADY) or any(abs(step) > _SMALL * sigma for step, sigma in moved):
+        steady = abs(np.log(factor)) <= 2.0 * _STEADY and not sigmas.differ(before, _STEADY)
+        if not steady or any(abs(step) > _SMALL * sigma for step, sigma in moved):
             continue
         # what is not sure is left out, and the rest estimated without it
         sure = [one for one, (_, sigma) in zip(scales, moved, strict=True) if one.is_sure(sigma)]
@@ -220,8 +240,11 @@ def _refined(
 ) -> Refined:
     """The refined solution, its reason saying what was learned."""
     world, sentences = None, []
-    if sigmas.odometry != 1.0:
-        sentences.append(f"The odometry's noise is {sigmas.odometry:.2g} times what was assumed.")
+    if sigmas.translation != 1.0:
+        sentences.append(
+            f"The odometry's noise is {sigmas.translation:.2g} times what was assumed in translation, "
+            f"{sigmas.rotation:.2g} times in rotation."
+        )
     scale = {one.of: one.value for one in scales}
     for of, value in scale.items():
         too = "long" if value < 1.0 else "short"
@@ -234,4 +257,4 @@ def _refined(
     refined = replace(
         solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *sentences])
     )
-    return Refined(graph, refined, sigmas.odometry**2, scale.get("odometry", 1.0), inlier, world)
+    return Refined(graph, refined, sigmas, scale.get("odometry", 1.0), fixes, inlier, world)

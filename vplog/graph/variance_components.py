@@ -6,15 +6,19 @@ Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, 1
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vplog.errors import GraphError
-from vplog.graph.consistency import degrees_of_freedom, is_loop, redundancy, residual_sigma
+from vplog.geometry import se3
+from vplog.graph.build import AXES, informed
+from vplog.graph.consistency import degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.marginals import edge_covariances
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
+    from vplog.data import Floats, Ints, PoseGraph
     from vplog.graph.least_squares import Objective
 
 _SPREAD = 2.0 * math.log(4.0)
@@ -23,16 +27,26 @@ and, now and then, by ten."""
 _LEAST_CLOSURES = 0.5
 """Closures are not taken for much better than they claim: those of neighbouring keyframes share landmarks, so they
 agree with each other more than they are right."""
-_LEAST = 2.0**-10
-"""Variance factor beyond which, and beyond whose inverse, a claim is no longer one: 32 times in sigma."""
+_LEAST, _MOST = 2.0**-14, 2.0**10
+"""Variance factors beyond which a claim is no longer one: sigmas 128 times too large, as of a log that tells none and
+of odometry far better than the model, or 32 times too small."""
+_MOST_NOISE = 0.5
+"""Sigma of odometry over its motion from one keyframe to the next."""
 _STEPS = 30
 """Most Newton steps in one dimension; 5 are usual."""
+_STILL = 1e-3
+"""Step of a logarithm below which an estimate stands still."""
+_MOST_RATIO = 0.8
+"""Largest ratio of two steps that is extrapolated: to five times the second one."""
+_FURTHEST = math.log(2.0)
+"""Furthest extrapolation of a logarithm."""
 
 
 class Sigmas(NamedTuple):
-    """Factors by which claimed sigmas are multiplied."""
+    """Factors by which claimed sigmas are multiplied: rotation and translation of odometry, closures."""
 
-    odometry: float = 1.0
+    rotation: float = 1.0
+    translation: float = 1.0
     closures: float = 1.0
 
     def log_prior(self) -> float:
@@ -56,7 +70,14 @@ def most_likely_variance(chi2: float, redundancy: float) -> float:
         u += min(max(step, -1.0), 3.0)
         if abs(step) < 1e-6:
             break
-    return min(max(math.exp(u), _LEAST), 1.0 / _LEAST)
+    return min(max(math.exp(u), _LEAST), _MOST)
+
+
+def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
+    """The graph with its sigmas multiplied."""
+    odometry = np.repeat([sigmas.rotation, sigmas.translation], 3)
+    factor = np.where(is_loop(graph)[:, None], sigmas.closures, odometry)
+    return replace(graph, information=graph.information / (factor[:, :, None] * factor[:, None, :]))
 
 
 def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
@@ -67,20 +88,64 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     """
     graph, weight = objective.factors.graph, objective.weight
     loops = is_loop(graph)
-    chi2 = weight * residual_sigma(graph, poses) ** 2
-    dof = degrees_of_freedom(graph)
-    most = float(dof * np.count_nonzero(weight[loops]))
+    closures_dof = float(degrees_of_freedom(graph) * np.count_nonzero(weight[loops]))
+    most = closures_dof
     if objective.positions is not None:
         most += 3.0 * np.count_nonzero(objective.positions.Omega.any((1, 2)))
-    try:
-        checks = redundancy(objective, poses, np.flatnonzero(~loops))
-    except GraphError:  # noise so large that rounding decides
-        checks = most
-    checks = min(max(checks, 0.0), most, float(dof * (~loops).sum()))
-    own = max(float(dof * np.count_nonzero(weight[loops])) - checks, 0.0)
-    if objective.positions is not None:
-        own = max(float(dof * np.count_nonzero(weight[loops])) * (1.0 - checks / max(most, 1.0)), 0.0)
-    return Sigmas(
-        math.sqrt(most_likely_variance(float(chi2[~loops].sum()) * present.odometry**2, checks)),
-        max(math.sqrt(most_likely_variance(float(chi2[loops].sum()) * present.closures**2, own)), _LEAST_CLOSURES),
+    chi2, checks = _of_odometry(objective, poses, np.flatnonzero(~loops))
+    checks *= min(1.0, most / max(checks.sum(), 1e-12))
+    own = closures_dof * (1.0 - checks.sum() / max(most, 1.0))
+    closures = float((weight * residual_sigma(graph, poses) ** 2)[loops].sum())
+    rotation, translation = (  # the claim itself is always possible
+        min(math.sqrt(most_likely_variance(chi2[part] * factor**2, checks[part])), max(factor * most, 1.0))
+        for part, (factor, most) in enumerate(zip(present[:2], _most_factors(graph), strict=True))
     )
+    return Sigmas(
+        rotation,
+        translation,
+        max(math.sqrt(most_likely_variance(closures * present.closures**2, own)), _LEAST_CLOSURES),
+    )
+
+
+def _most_factors(graph: PoseGraph) -> list[float]:
+    """Most that the factors of rotation and translation can be: what odometry measures is motion and noise, and where
+    more than `_MOST_NOISE` of its root mean square is noise, it is none."""
+    edges = np.flatnonzero(~is_loop(graph))
+    axes = np.array(AXES[graph.dimension])
+    motion = se3.log(graph.a_from_b[edges])[:, axes]
+    covariance = np.asarray(np.linalg.inv(informed(graph)[edges]), np.float64)
+    found = []
+    for part in (axes < 3, axes >= 3):
+        chi2 = se3.mahalanobis2(motion[:, part], covariance[:, part][:, :, part])
+        share = math.sqrt(float(chi2.mean()) / int(part.sum())) if len(edges) else math.inf
+        found.append(_MOST_NOISE * share)
+    return found
+
+
+def extrapolated(first: Sigmas, second: Sigmas, third: Sigmas) -> Sigmas:
+    """Where three estimates in a row lead to: Aitken's delta-squared process in their logarithms, bounded."""
+    steps = np.diff(np.log([first, second, third]), axis=0)
+    ratio = np.divide(steps[1], steps[0], out=np.zeros(len(first)), where=np.abs(steps[0]) > _STILL)
+    ratio = np.clip(ratio, 0.0, _MOST_RATIO)
+    ahead = np.clip(steps[1] * ratio / (1.0 - ratio), -_FURTHEST, _FURTHEST)
+    return Sigmas(*(np.array(third) * np.exp(ahead)).tolist())
+
+
+def _of_odometry(objective: Objective, poses: Floats, edges: Ints) -> tuple[Floats, Floats]:
+    """Chi-square and redundancy of the rotations and of the translations of odometry `edges`, (2,) each."""
+    graph = objective.factors.graph
+    axes = np.array(AXES[graph.dimension])
+    claimed = np.linalg.inv(informed(graph)[edges])
+    error = se3.log(se3.between(graph.a_from_b[edges], se3.between(poses[graph.a[edges]], poses[graph.b[edges]])))
+    chi2, checks = np.zeros(2), np.zeros(2)
+    try:
+        solved = edge_covariances(objective, poses, edges)
+    except GraphError:  # noise so large that rounding decides
+        solved = None
+    for number, part in enumerate((axes < 3, axes >= 3)):  # of correlated noise, the marginal of each
+        Omega = np.linalg.inv(claimed[:, part][:, :, part])
+        e = error[:, axes[part]]
+        chi2[number] = np.einsum("ni,nij,nj->", e, Omega, e)
+        trusted = 0.0 if solved is None else float(np.einsum("nij,nji->", Omega, solved[:, part][:, :, part]))
+        checks[number] = max(len(edges) * int(part.sum()) - trusted, 0.0)
+    return chi2, checks

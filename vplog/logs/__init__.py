@@ -1,10 +1,10 @@
-"""In: MCAP, ROS 1 and ROS 2 bags and folders of images become one kind of Log. `open(path)` is the way in."""
+"""Readers of MCAP, ROS 1 and ROS 2 bags, videos, folders of images and data sets as one Log, by `open(path)`."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vplog.logs.topic_selection import TopicChoice
+from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from vplog.stages import Log
 
-__all__ = ["TopicChoice", "check", "open", "open_drive"]
+__all__ = ["EVERY_IMAGE", "TopicChoice", "check", "is_image_file", "open", "open_drive", "open_images"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
@@ -36,3 +36,20 @@ def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:
     from vplog.logs.detect import open_drive as open_parts
 
     return open_parts(paths, topics or TopicChoice())
+
+
+def open_images(files: Sequence[Path], topics: TopicChoice | None = None) -> Log:
+    """Files of images of one camera, in any folders. Raises LogError where one is no image."""
+    from vplog.logs.detect import open_images as open_files
+
+    return open_files(files, topics or TopicChoice())
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether a file is an image by its first bytes; not where it cannot be read."""
+    from vplog.logs.image_folder import is_image
+
+    try:
+        return path.is_file() and is_image(path)
+    except OSError:
+        return False

@@ -29,6 +29,8 @@ _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant
 """Coefficients that OpenCV takes for each model."""
 _BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
+_AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""body_from_camera of a camera that looks along the body's x, upright: ROS REP 103."""
 _LARGEST_PX = 1e7
 """px; a longer focal length is damage: telescopes have 1e6."""
 _SAME_PX = 1.0
@@ -119,15 +121,19 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
     return replace(camera, matrix=resized(x, y) @ matrix)
 
 
-def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes) -> Floats:
-    """(4, 4) through the static transforms; without a chain the identity, noted where that is a guess. `body` is the
-    odometry's child frame, empty where its type has none; `frame` is the image's frame_id."""
+def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead: bool = False) -> Floats:
+    """(4, 4) through the static transforms; without a chain the identity, noted where that is a guess, or, with
+    `ahead`, a camera that looks along x. `body` is the odometry's child frame, empty where its type has none; `frame`
+    is the image's frame_id."""
     if not body and _BODY in tree:
         body = _BODY
         notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
     found = tree.between(body, frame) if body and frame else None
     if found is not None:
         return found
+    if ahead:
+        notes.add("No static transforms say where the camera is; it is taken to sit at the body and look ahead.")
+        return _AHEAD.copy()
     if len(tree) or (body and frame):
         notes.add(
             f"No static transforms lead from the body {body or '(not named)'} to the camera's frame "

@@ -1,4 +1,4 @@
-"""Header stamps against log times: which of the two clocks was set, and what the stamps are without that.
+"""Clock steps of header stamps, found against the log times and removed.
 
 The log time is late by the transport but steady: between two messages of a topic both should advance alike, and their
 difference, the skew, stays at one level.
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from vplog.data import Ints
 
 LEAST_JUMP_NS = 1_000_000_000
-"""ns; stamps and log times part by less than a second when a computer is busy, and by hours when a clock is set."""
+"""ns; their difference changes by less than a second when a computer is busy, and by hours when a clock is set."""
 LATE_NS = 2_000_000_000
 """ns that messages may be later than others of the log: slow estimators, and links that send again what was lost."""
 _PERIODS = 10
@@ -33,9 +33,9 @@ GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also GAP_PERIODS of the topic's own."""
 GAP_PERIODS = 10
 _SHORT = 10
-"""Small steps are believed where less than a tenth of the messages are in runs too short to show a clock."""
+"""Small steps count as clock steps where less than a tenth of the messages are in runs too short to show a clock."""
 _NEAR = 4
-"""Runs beside a short one whose clock it may be on: messages that change places at a step make a few of them."""
+"""Neighbours of a short run whose clock it may be on: reordered messages at a step make a few short runs."""
 _MOST_CLOCKS = 20
 """A clock is set a few times in a drive; what jumps to more values than these is none."""
 
@@ -57,7 +57,7 @@ class Repaired:
     stamp_ns: Ints
     """(M,) in file order."""
     valid: np.ndarray
-    """(M,) bool, false where a stamp is far from those beside it, so that its time is not known."""
+    """(M,) bool, false for outliers, whose time is not known."""
     skew_ns: int
     """Skew of the clock that all are on."""
     jumps_ns: list[int]
@@ -83,7 +83,7 @@ class _Levels:
     """ns by which the skew changes over gaps, by no more than messages may be late."""
 
 
-def on_one_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
+def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
     """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1. Of
     several clocks, `reference_ns` is the skew of the one to end on; None takes that of most messages."""
     step, log_step = np.diff(header_ns), np.diff(log_ns)
@@ -171,18 +171,18 @@ def _change(before_ns: Ints, behind_ns: Ints) -> float:
 
 
 def _skew_of(own: int, clocks: list[int | None], number: int, limit: float) -> int | None:
-    """The skew that a run is shifted by: that of its clock, or of the one beside it that it is late on; its own where
-    the clock was set before and behind it; None for stray stamps."""
+    """The skew that a run is shifted by: that of its clock, or of a neighbouring one that it is late on; its own where
+    the clock was set before and behind it; None for outliers."""
     clock = clocks[number]
     if clock is not None:
         return clock
     before = next((one for one in clocks[number::-1] if one is not None), None)
     behind = next((one for one in clocks[number:] if one is not None), None)
-    beside = [one for one in (before, behind, *clocks[max(number - _NEAR, 0) : number + _NEAR]) if one is not None]
-    near = min(beside, key=lambda one: (abs(own - one), one))
+    nearby = [one for one in (before, behind, *clocks[max(number - _NEAR, 0) : number + _NEAR]) if one is not None]
+    near = min(nearby, key=lambda one: (abs(own - one), one))
     if abs(own - near) <= limit:
         return near
-    if min(beside) < own < max(beside):
+    if min(nearby) < own < max(nearby):
         return own
     return near if 0 < own - near <= max(limit, LATE_NS) else None
 

@@ -9,22 +9,22 @@ import numpy as np
 
 from vplog.logs.continuity import without_jumps
 from vplog.logs.formats.container import Notes, plural
-from vplog.logs.gather import Gathered
-from vplog.logs.odometry_sources import choose_odometry, read_sources, weigh_sources
-from vplog.logs.recorder_clock import mend_steps_back
-from vplog.logs.stamps import nearest, share_clock
+from vplog.logs.gather import TopicCollector
+from vplog.logs.odometry_sources import choose_odometry, other_sources, rank_sources, read_sources
+from vplog.logs.recorder_clock import correct_clock_steps
+from vplog.logs.stamps import nearest, set_common_clock
 from vplog.logs.tf_odometry import FrameTree
 
 if TYPE_CHECKING:
     from vplog.data import Gps, Ints, Odometry, OdometrySource
-    from vplog.logs.formats.container import Channel, Container, Place
+    from vplog.logs.formats.container import Channel, Container, Contents, Place
     from vplog.logs.messages.records import CalibrationMessage
     from vplog.logs.topic_selection import Selection
 
 
 @dataclass(frozen=True)
 class Content:
-    """What the pass gives."""
+    """The result of the pass."""
 
     stamp_ns: Ints
     """(F,) of the images, increasing."""
@@ -39,8 +39,8 @@ class Content:
     right_places: list[Place | None]
     """Where the right image of each lies."""
     calibrations: list[CalibrationMessage]
-    """Those that are set, each other than the one before: the first is the camera's, a later one that of images behind
-    its stamp."""
+    """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
+    behind its stamp."""
     right_calibration: CalibrationMessage | None
     odometry: Odometry | None
     frames: list[str]
@@ -52,7 +52,7 @@ class Content:
     chosen: Selection
     """With the source that the odometry was taken from."""
     sources: list[OdometrySource]
-    """Those that could be the odometry, the best first."""
+    """Sources that could be the odometry, the best first."""
     rates_hz: dict[Channel, float | None]
     """By topic that was read: messages a second."""
 
@@ -66,29 +66,51 @@ class Content:
         """The frame that the odometry moves, empty where it has no name."""
         return self.frames[-1] if self.frames else ""
 
+    def between(self, start_s: float | None, stop_s: float | None) -> Content:
+        """With the images from `start_s` up to `stop_s`, s after the first; all where None."""
+        if start_s is None and stop_s is None:
+            return self
+        since_s = (self.stamp_ns - self.stamp_ns[:1]) / 1e9
+        inside = (since_s >= (start_s or 0.0)) & (since_s < (np.inf if stop_s is None else stop_s))
+        return self.with_images(inside)
+
+    def with_images(self, wanted: np.ndarray) -> Content:
+        """With those of the images for which (F,) `wanted` is true."""
+        rows = np.flatnonzero(wanted).tolist()
+        places, depth, right = (
+            [listed[row] for row in rows] for listed in (self.places, self.depth_places, self.right_places)
+        )
+        return replace(
+            self, stamp_ns=self.stamp_ns[wanted], places=places, stream_rows=self.stream_rows[wanted],
+            depth_places=depth, right_places=right,
+        )  # fmt: skip
+
 
 _TOGETHER_NS = 5_000_000
 """ns that the images of a pair may be apart: 5 cm at 10 m/s, a tenth of a usual baseline."""
 
 
-def read_content(container: Container, chosen: Selection, notes: Notes) -> Content:
+def read_content(container: Container, contents: Contents, chosen: Selection, notes: Notes) -> Content:
     """Read the chosen topics once; what had to be repaired or left out is noted."""
-    read = Gathered(chosen)
+    read = TopicCollector(chosen)
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
     for block in container.blocks(chosen.channels, stamped):
-        read.take_block(block)
+        read.add_block(block)
     read.finish_poses()
-    mend_steps_back(read.every_stamps(), notes)
-    share_clock(stamps for _, stamps in read.stamps())
-    found = read_sources(read, chosen)
-    sources = weigh_sources(found, read.images.finish(Notes())[0])
+    correct_clock_steps(read.every_stamps(), notes)
+    set_common_clock(stamps for _, stamps in read.stamps())
+    gps_notes = Notes()
+    gps = read.fixes.finish(gps_notes) if read.fixes else None
+    found = read_sources(read, chosen) | other_sources(gps, contents, chosen)
+    sources = rank_sources(found, read.images.finish(Notes())[0])
     rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
+    sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
         if topic in {channel.topic for channel in chosen.channels}:
             notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
-    tree = FrameTree([*(read.moving.still() if chosen.tf else ()), *read.transforms])
+    tree = FrameTree([*(read.dynamic.static() if chosen.tf else ()), *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images.finish(notes)
@@ -103,14 +125,18 @@ def read_content(container: Container, chosen: Selection, notes: Notes) -> Conte
         late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
         if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
             notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion.")
+    for one in found.values():
+        if one.odometry is None:
+            notes.extend(one.notes)
     odometry, frames = None, []
     if chosen.odometry is not None:
         odometry, frames = found[chosen.odometry].odometry, found[chosen.odometry].frames
         notes.extend(found[chosen.odometry].notes)
-        if odometry is not None and next(one.jumps for one, source in sources if source == chosen.odometry):
+        jumps = next((one.jumps for one, source in sources if source == chosen.odometry), 0)
+        if odometry is not None and odometry.drifts and jumps:
             odometry = without_jumps(odometry, chosen.odometry.topic, notes)
     body = frames[-1] if frames else ""
-    gps = read.fixes.finish(notes) if read.fixes else None
+    notes.extend(gps_notes)
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
     calibrations = read.calibrations.finish(notes)

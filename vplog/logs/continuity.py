@@ -1,4 +1,4 @@
-"""Jumps of odometry: steps that no motion explains, of a relocalisation, a reset to zero or a stray pose."""
+"""Jumps of odometry: steps that no motion explains, of a relocalisation, a reset to zero or an outlier."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _TURN_RAD_S = 20.0
 _LEAST_TURN_RAD = 0.1
 """rad; a smaller turn in one step is noise of short periods."""
 _TIMES = 10.0
-"""A jump departs so many times further from the motion beside it than nine tenths of the drive's own steps do."""
+"""A jump deviates so many times further from the neighbouring motion than nine tenths of the drive's own steps do."""
 _PERIODS = 3.0
-"""A jump is also longer than the way of so many periods: stamps that jitter crowd that much motion into one step."""
+"""A jump is also longer than the path of so many periods: jittering stamps put that much motion into one step."""
 _GAP_S = 1.0
-"""s; what is longer between poses is a gap, and says nothing of their period."""
-_BESIDE = 3
+"""s; longer intervals are gaps, and do not count for the period."""
+_WINDOW = 3
 """Steps on either side whose median velocity a step is held against: one of them may be a jump itself."""
-_LEAST = 4 * _BESIDE
-"""Poses; fewer do not tell what is usual."""
+_LEAST = 4 * _WINDOW
+"""Poses; fewer are too few for a quantile."""
 _NAMED = 4
 """Jumps that are named."""
 
@@ -43,75 +43,75 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
         return np.zeros(0, np.int64)
     seconds = np.diff(stamp_ns) / 1e9
     step = se3.between(poses[:-1], poses[1:])
-    turns, way = se3.so3_log(step[:, :3, :3]), step[:, :3, 3]
-    departure_rad, departure_m = (_departure(steps, seconds) for steps in (turns, way))
+    rotation, translation = se3.so3_log(step[:, :3, :3]), step[:, :3, 3]
+    deviation_rad, deviation_m = (_deviation(steps, seconds) for steps in (rotation, translation))
     usual_s = np.minimum(seconds, max(_GAP_S, float(np.median(seconds)))).mean()  # the mean: stamps of bursts crowd
     least_s = np.maximum(seconds, usual_s)
     window_s = np.convolve(seconds, np.ones(3), "same")
     limits_m = (
-        least_s * (_ACCELERATION_M_S2 * window_s / 2 + _IMPULSE_M_S), _TIMES * _usual(departure_m),
-        _PERIODS * _usual(np.linalg.norm(way, axis=1) / seconds) * least_s,
+        least_s * (_ACCELERATION_M_S2 * window_s / 2 + _IMPULSE_M_S), _TIMES * _typical(deviation_m),
+        _PERIODS * _typical(np.linalg.norm(translation, axis=1) / seconds) * least_s,
     )  # fmt: skip
-    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _usual(np.linalg.norm(turns, axis=1)), _LEAST_TURN_RAD)
-    far = np.all([departure_m > limit for limit in limits_m], axis=0)
-    turned = np.all([departure_rad > limit for limit in limits_rad], axis=0)
+    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _typical(np.linalg.norm(rotation, axis=1)), _LEAST_TURN_RAD)
+    far = np.all([deviation_m > limit for limit in limits_m], axis=0)
+    turned = np.all([deviation_rad > limit for limit in limits_rad], axis=0)
     return np.flatnonzero(np.logical_or(far, turned))
 
 
 def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
-    """The odometry with its motion continued over each jump, and without stray poses; both is noted. What follows a
+    """The odometry with its motion continued over each jump, and without outliers; both are noted. What follows a
     jump is moved as one piece, and the covariance of the pose behind it becomes unknown."""
     stamp_ns, poses, covariance = odometry.stamp_ns, odometry.odom_from_body, odometry.covariance
     rows = find_jumps(stamp_ns, poses)
-    stray = _stray(stamp_ns, poses, rows)
-    if stray.any():
-        notes.add(f"{what}: {plural(int(stray.sum()), 'pose')} far from those before and after left out.")
-        stamp_ns, poses = stamp_ns[~stray], poses[~stray]
-        covariance = None if covariance is None else covariance[~stray]
+    outlier = _outlier(stamp_ns, poses, rows)
+    if outlier.any():
+        notes.add(f"{what}: {plural(int(outlier.sum()), 'pose')} far from those before and after left out.")
+        stamp_ns, poses = stamp_ns[~outlier], poses[~outlier]
+        covariance = None if covariance is None else covariance[~outlier]
         rows = find_jumps(stamp_ns, poses)
     if len(rows):
         notes.add(_sentence(stamp_ns, poses, rows, what))
-        poses = _continued(stamp_ns, poses, rows)
+        poses = _extrapolated(stamp_ns, poses, rows)
         covariance = None if covariance is None else covariance.copy()
         if covariance is not None:
             covariance[rows + 1] = np.nan
     return replace(odometry, stamp_ns=stamp_ns, odom_from_body=poses, covariance=covariance)
 
 
-def _departure(steps: Floats, seconds: Floats) -> Floats:
+def _deviation(steps: Floats, seconds: Floats) -> Floats:
     """(T,) how far each of (T, 3) steps is from those between the medians of the steps before and behind, as velocities
     or, where the stamps jitter, as they are."""
     found = []
     for scale in (seconds, np.ones_like(seconds)):
         rate = steps / scale[:, None]
-        around = np.pad(rate, ((_BESIDE, _BESIDE), (0, 0)), mode="reflect")
-        level = np.median(sliding_window_view(around, _BESIDE, axis=0), axis=-1)
+        around = np.pad(rate, ((_WINDOW, _WINDOW), (0, 0)), mode="reflect")
+        level = np.median(sliding_window_view(around, _WINDOW, axis=0), axis=-1)
         ends = level[: len(rate)], level[-len(rate) :]
         found.append(np.linalg.norm(rate - rate.clip(np.minimum(*ends), np.maximum(*ends)), axis=1) * scale)
     return np.minimum(*found)
 
 
-def _usual(values: Floats) -> float:
-    """What nine tenths of the values stay below, zeros left out: a robot that stands does not count."""
+def _typical(values: Floats) -> float:
+    """The 90 % quantile of the values above zero: a robot at rest does not count."""
     moving = values[values > 0]
     return float(np.quantile(moving, 0.9)) if len(moving) else 0.0
 
 
-def _stray(stamp_ns: Ints, poses: Floats, rows: Ints) -> np.ndarray:
+def _outlier(stamp_ns: Ints, poses: Floats, rows: Ints) -> np.ndarray:
     """(T,) bool: poses between two jumps close together, without which there is none."""
-    stray = np.zeros(len(stamp_ns), bool)
+    outlier = np.zeros(len(stamp_ns), bool)
     for a, b in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
-        if b - a < _BESIDE and not stray[a]:
+        if b - a < _WINDOW and not outlier[a]:
             rest = np.ones(len(stamp_ns), bool)
             rest[a + 1 : b + 1] = False
             near = slice(max(a - _LEAST, 0), b + _LEAST)
             rest_near = rest[near]
             jumps = find_jumps(stamp_ns[near][rest_near], poses[near][rest_near])
-            stray[a + 1 : b + 1] = a - near.start not in jumps
-    return stray
+            outlier[a + 1 : b + 1] = a - near.start not in jumps
+    return outlier
 
 
-def _continued(stamp_ns: Ints, poses: Floats, rows: Ints) -> Floats:
+def _extrapolated(stamp_ns: Ints, poses: Floats, rows: Ints) -> Floats:
     """The poses, those behind each jump moved to where the motion before it leads."""
     result = poses.copy()
     for row, stop in zip(rows.tolist(), [*(rows[1:] + 1).tolist(), len(poses)], strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import weakref
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -11,6 +12,9 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
 from vplog.logs import image_folder
+from vplog.logs.datasets.find import find_roots, is_video, read_folder, read_video
+from vplog.logs.datasets.images import read as read_images
+from vplog.logs.datasets.streams import DataSetContainer
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
 from vplog.logs.formats.compression import fetched, unpacked
 from vplog.logs.formats.container import Notes, plural
@@ -25,14 +29,15 @@ from vplog.logs.formats.ros2_folder import (
     split_parts,
 )
 from vplog.logs.formats.sqlite_bag import SqliteBag
-from vplog.logs.image_folder import ImageFolder
 from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
+from vplog.logs.topic_selection import EVERY_IMAGE
 from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from vplog.logs.datasets.streams import DataSet
     from vplog.logs.formats.container import Container, Contents
     from vplog.logs.topic_selection import TopicChoice
     from vplog.stages import Log
@@ -42,11 +47,16 @@ _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
 _LISTED = 5
 """Files that an error lists."""
+_DEEPEST, _MOST_FILES = 4, 10**6
+"""Levels of folders below the one given, and files in them, that are looked through for images."""
 _OVERLAP_NS = 10**9
 """ns that one file may reach into the next: recorders split between messages that are a little out of order."""
 _LONGEST_PAUSE_NS = 3600 * 10**9
 """ns between two files of one drive; who goes on after more than an hour has not kept the odometry running."""
-_KNOWN = "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder) or a folder of images"
+_KNOWN = (
+    "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a video, a folder of images, or the folder of a data set "
+    "(KITTI, EuRoC, TUM RGB-D, VSLAM-LAB, COLMAP)"
+)
 
 
 def open_log(path: Path, choice: TopicChoice) -> Log:
@@ -65,11 +75,12 @@ def check_log(path: Path) -> None:
     try:
         _check_there(path)
         if not path.is_dir():
-            if not _magic(path):
+            if not (_magic(path) or is_video(path)):
                 raise LogError(_no_log(path))
-        elif not (path / "metadata.yaml").is_file():
+        elif not (path / "metadata.yaml").is_file() and (isinstance(path, RemotePath) or not find_roots(path)):
             files = [file for file in path.iterdir() if file.is_file()]
-            if not any(_magic(file) or image_folder.is_image(file) for file in files):
+            found = any(_magic(file) or image_folder.is_image(file) for file in files)
+            if not found and not any(map(image_folder.is_image, _files_below(path))):
                 raise LogError(_no_folder(path, files))
     except OSError as error:
         raise _unreadable(path, error) from None
@@ -88,8 +99,16 @@ def _check_there(path: Path) -> None:
 
 
 def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
+    if not _magic(path) and is_video(path):
+        if isinstance(path, RemotePath):
+            raise LogError(f"{path} is a video, and videos are read from local files. Copy it to this machine.")
+        return _published(path, path.stem, read_video(path), notes, choice)
     container, kind = open_container(path, notes)
     return _recorded(path, _name(path), _KINDS[kind], container, notes, choice)
+
+
+def _published(path: Path, name: str, found: DataSet, notes: Notes, choice: TopicChoice) -> Log:
+    return _recorded(path, name, found.kind, DataSetContainer(found, notes), notes, choice)
 
 
 def _recorded(path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice) -> RecordedLog:
@@ -188,28 +207,72 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
             return _open_bag(path, read_metadata(path), choice, notes)
         except MetadataError as error:
             problem = str(error)
-    files = sorted((file for file in path.iterdir() if file.is_file()), key=image_folder.natural_order)
+    files = sorted((file for file in path.iterdir() if file.is_file()), key=_by_name)
     logs = [file for file in files if _magic(file) in (*_READERS, "zstd")]
     if logs:
         return _open_found(path, logs, problem or f"{path.name} has no metadata.yaml", choice, notes)
     if problem:
         raise LogError(f"{problem} Copy the whole bag folder, or give a storage file itself.")
-    images = [file for file in files if image_folder.is_image(file)]
-    if images:
-        endings = {file.suffix for file in images if file.suffix}
-        damaged = {file for file in files if file.suffix in endings}.difference(images)
-        return ImageFolder(path, [*images, *damaged], notes, choice, damaged)
-    inside = [folder for folder in sorted(path.iterdir()) if folder.is_dir()]
-    counts = [sum(file.is_file() and image_folder.is_image(file) for file in folder.iterdir()) for folder in inside]
-    named = [f"{folder.name} ({count})" for folder, count in zip(inside, counts, strict=True) if count]
-    if named:
-        found = ", ".join(named[:_LISTED])
-        raise LogError(f"{path} holds no images itself; folders in it do: {found}. Give one of them.")
+    roots = [] if isinstance(path, RemotePath) else find_roots(path)  # to look around costs a request each
+    if len(roots) == 1:
+        return _published(path, path.resolve().name, read_folder(roots[0]), notes, choice)
+    if roots:
+        names = ", ".join(str(root.relative_to(path)) for root in roots[:_LISTED])
+        raise LogError(f"{path} holds {len(roots)} drives of data sets. Give one of them: {names}.")
+    images = _images_in(path, files)
+    if images is not None:
+        found = read_images(path, *images, choice)
+        return _published(path, path.name, found, notes, choice.model_copy(update={"image": None}))
     raise LogError(_no_folder(path, files))
 
 
+def open_images(files: Sequence[Path], choice: TopicChoice) -> Log:
+    """Files of images as one log, each once, in natural order of their names or by the times in them."""
+    paths = [located(file) for file in dict.fromkeys(files)]
+    for path in paths:
+        try:
+            _check_there(path)
+            if isinstance(path, RemotePath) or path.is_dir() or not image_folder.is_image(path):
+                raise LogError(f"{path} is no local file of an image. Give images, or one log by itself.")
+        except OSError as error:
+            raise _unreadable(path, error) from None
+    root = Path(os.path.commonpath([path.absolute().parent for path in paths]))
+    found = read_images(root, [path.absolute() for path in paths], (), choice.model_copy(update={"image": EVERY_IMAGE}))
+    return _published(root, root.name, found, Notes(), choice.model_copy(update={"image": None}))
+
+
+def _by_name(path: Path) -> tuple:
+    return image_folder.natural_order(path.name)
+
+
+def _images_in(path: Path, files: list[Path]) -> tuple[list[Path], set[Path]] | None:
+    """The images among the files of a folder, or else of the folders below it, and those of them that are only named
+    like images; None where there are none."""
+    images = [file for file in files if image_folder.is_image(file)]
+    if not images:
+        files = [file for file in _files_below(path) if not file.name.startswith(".")]
+        images = [file for file in files if image_folder.is_image(file)]
+    endings = {file.suffix for file in images if file.suffix}
+    damaged = {file for file in files if file.suffix in endings}.difference(images)
+    return ([*images, *damaged], damaged) if images else None
+
+
+def _files_below(path: Path) -> list[Path]:
+    """Files of the folders in a folder, a few levels deep. Raises LogError where there are too many to look at."""
+    found, folders = list[Path](), [path]
+    for _ in range(_DEEPEST + 1):
+        inside = [one for folder in folders for one in folder.iterdir()]
+        folders = [one for one in inside if one.is_dir()]
+        found += [one for one in inside if one.is_file()]
+        if len(found) + len(folders) > _MOST_FILES:
+            raise LogError(
+                f"{path} holds more than {_MOST_FILES} files in its folders. Give the folder of one drive's images."
+            )
+    return sorted(found)
+
+
 def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:
-    """The logs of a folder whose metadata do not say which belong to the bag."""
+    """The logs of a folder without usable metadata."""
     if len(logs) == 1 and _magic(logs[0]) == "ros1":
         return _open_file(logs[0], choice, notes)
     parts = logs if len(logs) == 1 else split_parts(logs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,16 @@ from vplog.data import Frame
 from vplog.errors import LogError
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.formats.container import plural
+from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.pixels import depth_m, drive_levels, grey, spread
+from vplog.logs.messages.pixels import depth_m, drive_levels, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from av import VideoFrame
 
     from vplog.data import Bytes, Camera, Float32s, Floats
     from vplog.logs.content import Content
@@ -43,7 +46,7 @@ def image_in(channel: Channel, data: Octets) -> ImageMessage:
 
 
 @dataclass(frozen=True, eq=False)
-class Encoded:
+class EncodedImage:
     """An image message as bytes."""
 
     channel: Channel
@@ -53,7 +56,11 @@ class Encoded:
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
-        return self._pixels(stamp_ns, partial(grey, levels=self.levels))
+        return self._pixels(stamp_ns, partial(pixels.grey, levels=self.levels))
+
+    def rgb(self, stamp_ns: int) -> Bytes:
+        """(H, W, 3) uint8. Raises LogError."""
+        return self._pixels(stamp_ns, partial(pixels.rgb, levels=self.levels))
 
     def depth_m(self, stamp_ns: int) -> Float32s:
         """(H, W) float32 m, NaN where unknown. Raises LogError."""
@@ -67,14 +74,21 @@ class Encoded:
 
 
 @dataclass(frozen=True, eq=False)
-class Decoded:
+class DecodedImage:
     """A frame of a video, which decodes in the order of the file alone and so was decoded where it was read."""
 
     channel: Channel
-    image: Bytes | BadMessageError
+    image: VideoFrame | BadMessageError
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
+        return video.grey(self._frame(stamp_ns))
+
+    def rgb(self, stamp_ns: int) -> Bytes:
+        """(H, W, 3) uint8. Raises LogError."""
+        return video.rgb(self._frame(stamp_ns))
+
+    def _frame(self, stamp_ns: int) -> VideoFrame:
         if isinstance(self.image, BadMessageError):
             raise _undecodable(self.channel, stamp_ns, self.image)
         return self.image
@@ -86,23 +100,26 @@ class RecordedFrame:
 
     stamp_ns: int
     camera: Camera
-    image: Encoded | Decoded
-    depth: Encoded | None
-    right: Encoded | None
+    image: EncodedImage | DecodedImage
+    depth: EncodedImage | None
+    right: EncodedImage | None
     pair: Pair | None
     notes: Notes
     """Notes of the log, where what does not decode is counted."""
     calibration: CalibrationMessage | None = None
-    """That of the image, where it came later and is another than the camera's."""
+    """The calibration of the image, where a later one differs from the camera's."""
 
-    def decode(self) -> Frame:
+    def decode(self, colour: bool = False) -> Frame:
         """The frame, without depth or right image where that does not decode or fit. Raises LogError where the image
         does not."""
         image, affine = self._image()
+        rgb = self.image.rgb(self.stamp_ns) if colour else None
         if self.pair is not None:
-            return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), right=self._right(self.pair))
+            rgb = None if rgb is None else self.pair.rectify(rgb, 0)
+            return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), None, self._right(self.pair), rgb)
         depth = None if self.depth is None else self._registered(self.depth, image, affine)
-        return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth)
+        rgb = None if rgb is None else warped(rgb, affine, self.camera)
+        return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth, colour=rgb)
 
     def _image(self) -> tuple[Bytes, Floats | None]:
         """The image, and what leads from its px to the camera's. Raises LogError."""
@@ -113,11 +130,11 @@ class RecordedFrame:
                 return image, affine_to_camera(channel.topic, image, self.camera, self.calibration, self.notes)
             _check_size(channel, image, self.camera)
         except LogError as error:
-            self._lose(channel, "" if image is None else str(error))
+            self._count_undecodable(channel, "" if image is None else str(error))
             raise
         return image, None
 
-    def _registered(self, depth: Encoded, image: Bytes, affine: Floats | None) -> Float32s | None:
+    def _registered(self, depth: EncodedImage, image: Bytes, affine: Floats | None) -> Float32s | None:
         """The depth of the camera's px, NaN beyond the image; None, and counted, where it does not decode or has
         another size than the image."""
         detail, found = "", None
@@ -129,7 +146,7 @@ class RecordedFrame:
                 "registered to the image: choose another with --depth-topic."
             )
         if found is None or detail:
-            return self._lose(depth.channel, detail)
+            return self._count_undecodable(depth.channel, detail)
         if affine is None:
             return found
         size = self.camera.width, self.camera.height  # the nearest measurement to each px
@@ -142,10 +159,10 @@ class RecordedFrame:
             image = self.right.grey(self.stamp_ns)
             _check_size(self.right.channel, image, self.camera)
         except LogError:
-            return self._lose(self.right.channel)
+            return self._count_undecodable(self.right.channel)
         return pair.rectify(image, 1)
 
-    def _lose(self, channel: Channel, detail: str = "") -> None:
+    def _count_undecodable(self, channel: Channel, detail: str = "") -> None:
         at = self.stamp_ns
         self.notes.account.add("undecodable_image", {channel.topic: 1}, (channel.topic, at), [(at, at)], detail)
 
@@ -193,8 +210,8 @@ def _check_size(channel: Channel, image: np.ndarray, camera: Camera) -> None:
         raise LogError(f"{channel.topic} has an image of {size_of(image)} px among those of {size} px; it is left out.")
 
 
-class Pictures:
-    """Reads images where `content` says they lie."""
+class ImageReader:
+    """Reads images by their place in the container."""
 
     def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
         """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
@@ -203,20 +220,24 @@ class Pictures:
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """What was read, without the images before a video's first key frame."""
 
-    def image(self, row: int) -> Encoded | Decoded:
+    def image(self, row: int) -> EncodedImage | DecodedImage:
         if self._image is None:
             raise LogError("No image topic is chosen. Choose one with --image-topic.")
         if self._video is None:
-            return Encoded(self._image, self._container.read(self.content.places[row]), self._levels)
+            return EncodedImage(self._image, self._container.read(self.content.places[row]), self._levels)
         try:
-            return Decoded(self._image, self._video.frame(int(self.content.stream_rows[row])))
+            return DecodedImage(self._image, self._video.frame(int(self.content.stream_rows[row])))
         except BadMessageError as error:
-            return Decoded(self._image, error)
+            return DecodedImage(self._image, error)
 
-    def beside(self, channel: Channel | None, places: list[Place | None], row: int) -> Encoded | None:
+    def companion(self, channel: Channel | None, places: list[Place | None], row: int) -> EncodedImage | None:
         """The depth or right image of a row; None where there is none."""
         place = places[row]
-        return None if channel is None or place is None else Encoded(channel, self._container.read(place), self._levels)
+        return (
+            None
+            if channel is None or place is None
+            else EncodedImage(channel, self._container.read(place), self._levels)
+        )
 
     @cached_property
     def _levels(self) -> Levels | None:
@@ -232,12 +253,15 @@ class Pictures:
     def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
         """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
         does, and where it is a video that needs PyAV."""
-        video, reason = self._video if channel == self._image else None, ""
+        stream, reason = self._video if channel == self._image else None, ""
         for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
             try:
                 message = image_in(channel, self._container.read(place))
-                pixels = grey(message) if video is None else video.frame(int(self.content.stream_rows[i]))
-                return message.frame, (pixels.shape[1], pixels.shape[0])
+                if stream is not None:
+                    frame = stream.frame(int(self.content.stream_rows[i]))
+                    return message.frame, (frame.width, frame.height)
+                image = pixels.grey(message)
+                return message.frame, (image.shape[1], image.shape[0])
             except BadMessageError as error:
                 reason = str(error)
         raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another --image-topic.")
@@ -248,7 +272,7 @@ class Pictures:
         found = [(row, place) for row, place in enumerate(self.content.depth_places) if place is not None]
         for row, place in found[:_TRIED]:
             try:
-                return Encoded(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
+                return EncodedImage(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
             except LogError as error:
                 failures.append(error)
         if failures:
@@ -269,12 +293,4 @@ class Pictures:
         if self._image is not None and (lost := int((~decodable).sum())):
             why = "without a key frame before them" if first is None else "before the first key frame"
             notes.add(f"{self._image.topic}: {plural(lost, 'image')} {why} cannot be decoded; left out.")
-        rows = np.flatnonzero(decodable).tolist()
-        return replace(
-            content,
-            stamp_ns=content.stamp_ns[decodable],
-            places=[content.places[row] for row in rows],
-            stream_rows=content.stream_rows[decodable],
-            depth_places=[content.depth_places[row] for row in rows],
-            right_places=[content.right_places[row] for row in rows],
-        )
+        return content.with_images(decodable)

@@ -1,4 +1,4 @@
-"""What the pass over a log collects: motion, fixes and calibration as they come, images by stamp and place."""
+"""One pass over a log: motion, fixes and calibrations are collected, images by stamp and offset."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.logs.formats.container import Block, Notes, plural
-from vplog.logs.formats.loss_account import Runs
+from vplog.logs.formats.loss_account import LossRuns
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
     FixMessage,
     ImageMessage,
+    ImuMessage,
+    PathMessage,
     PoseMessage,
+    short_type,
 )
 from vplog.logs.stamps import NONE, Stamps, rate_hz
-from vplog.logs.tf_odometry import MovingFrames
-from vplog.logs.tracks import FixTrack, PoseTrack
+from vplog.logs.tf_odometry import DynamicTransforms
+from vplog.logs.tracks import FixTrack, GyroTrack, PoseTrack
 
 if TYPE_CHECKING:
     from vplog.data import Ints
@@ -32,6 +35,8 @@ _SMALL = 512
 """Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
 _HEADER = 12
 """Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
+PATH = "nav_msgs/Path"
+"""The type whose messages hold all poses up to then."""
 _TOGETHER = 1024
 """Messages of odometry that are read at once: 0.7 MB, with which the calls to set up take no time."""
 
@@ -98,7 +103,7 @@ class Calibrations:
         return ros and bool(self.found) and data[_HEADER:] == self._last
 
     def finish(self, notes: Notes) -> list[CalibrationMessage]:
-        """Those found; where none is set, the first."""
+        """The calibrations that are set; the first one where none is."""
         if self.unset and self.found and self.channel:
             notes.add(
                 f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
@@ -107,19 +112,26 @@ class Calibrations:
         return self.found or ([self._first] if self._first else [])
 
 
-class Gathered:
-    """What has been collected so far of the topics of a selection."""
+class TopicCollector:
+    """Collects the messages of the topics of a selection."""
 
     def __init__(self, chosen: Selection) -> None:
         self.images, self.depths, self.rights = Images(chosen.image), Images(chosen.depth), Images(chosen.right)
         self.calibrations = Calibrations(chosen.camera_info)
         self.right_calibrations = Calibrations(chosen.right_info)
-        self.poses = {source: PoseTrack(source.topic) for source in chosen.sources if source not in chosen.tf}
+        self.poses = {
+            source: PoseTrack(source.topic, chosen.geometry.get(source, (1.0, 1.0)))
+            for source in chosen.sources
+            if source not in chosen.tf
+        }
         """Tracks of the topics that may be the odometry."""
         self.fixes = FixTrack(chosen.gps.topic) if chosen.gps else None
+        self.gyro = GyroTrack(chosen.imu)
+        self._paths: dict[Channel, tuple[bytes, int]] = {}
+        """The last message of each topic of paths, which holds those before it, and its log time."""
         self.transforms: list[PoseMessage] = []
-        self.moving = MovingFrames(keep=any(source in chosen.tf for source in chosen.sources))
-        self.lost: dict[tuple[str, str], Runs] = {}
+        self.dynamic = DynamicTransforms(store=any(source in chosen.tf for source in chosen.sources))
+        self.lost: dict[tuple[str, str], LossRuns] = {}
         """Lost messages by reason and topic."""
         self._tf = chosen.tf
         self._waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = {}
@@ -134,8 +146,8 @@ class Gathered:
         """The image topics in use."""
         return {one.channel: one for one in (self.rights, self.depths, self.images) if one.channel}
 
-    def take_block(self, block: Block) -> None:
-        """Add the messages of a block; those that drives are full of, all of a topic at once."""
+    def add_block(self, block: Block) -> None:
+        """Add the messages of a block, odometry in batches."""
         rows: dict[Channel, list[int]] = {}
         view, first = memoryview(block.data), self._messages
         self._messages += len(block.channels)
@@ -146,6 +158,8 @@ class Gathered:
             log_ns, positions = [block.log_ns[row] for row in mine], [first + row for row in mine]
             if channel in self.by_channel:
                 single += mine
+            elif channel in self.poses and short_type(channel.type) == PATH:
+                self._paths[channel] = bytes(view[block.starts[mine[-1]] : block.stops[mine[-1]]]), log_ns[-1]
             elif channel in self.poses:
                 data, waiting_ns, waiting_positions = self._waiting.setdefault(channel, ([], [], []))
                 data += [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
@@ -160,12 +174,14 @@ class Gathered:
                     row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
                 ]
         for row in sorted(single):
-            self._take(block, row, first + row)
+            self._add_message(block, row, first + row)
 
     def finish_poses(self) -> None:
         """Add the messages of odometry that wait."""
         for channel in list(self._waiting):
             self._add_poses(channel)
+        for channel, (data, log_ns) in self._paths.items():
+            self._add_message(Block(data, [channel], [log_ns], [0], [len(data)], [()]), 0, self._messages)
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
@@ -176,9 +192,9 @@ class Gathered:
             self._sound(channel.topic)
         else:
             for one, time_ns, position in zip(data, log_ns, positions, strict=True):
-                self._take(Block(one, [channel], [time_ns], [0], [len(one)], [()]), 0, position)
+                self._add_message(Block(one, [channel], [time_ns], [0], [len(one)], [()]), 0, position)
 
-    def _take(self, block: Block, row: int, position: int) -> None:
+    def _add_message(self, block: Block, row: int, position: int) -> None:
         """Add a message, or count it among the lost ones."""
         channel = block.channels[row]
         try:
@@ -188,13 +204,13 @@ class Gathered:
                 self._add(block.message(row), position)
         except BadMessageError as error:
             reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
-            self.lost.setdefault((reason, channel.topic), Runs()).lost(block.log_ns[row])
+            self.lost.setdefault((reason, channel.topic), LossRuns()).add_lost(block.log_ns[row])
         else:
             self._sound(channel.topic)
 
     def _sound(self, topic: str) -> None:
         for runs in (runs for (_, lost), runs in self.lost.items() if lost == topic):
-            runs.sound()
+            runs.add_sound()
 
     def calibrations_of(self, channel: Channel) -> Calibrations | None:
         """The calibrations that a channel holds, if it is one of them."""
@@ -203,13 +219,14 @@ class Gathered:
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
         images = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
-        return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one]
+        gyro = [(self.gyro.topic, self.gyro.stamps)] if self.gyro.topic else []
+        return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one] + gyro
 
     def every_stamps(self) -> list[Stamps]:
         """Stamps of every topic that was read, each pose with its position."""
         for track in self.poses.values():
-            track.give_places()
-        return [*(stamps for _, stamps in self.stamps()), *self._others.values(), *self.moving.stamps()]
+            track.set_xyz()
+        return [*(stamps for _, stamps in self.stamps()), *self._others.values(), *self.dynamic.stamps()]
 
     def skew_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
@@ -228,9 +245,15 @@ class Gathered:
                 known.add(replace(calibration, stamp_ns=calibration.stamp_ns or message.log_ns), message.data)
             case PoseMessage() as pose if channel in self.poses:
                 self.poses[channel].add(pose, message.log_ns, position)
+            case PathMessage(stamp_ns, _, poses):
+                late_ns = message.log_ns - stamp_ns
+                for pose in poses:
+                    self.poses[channel].add(pose, max(pose.stamp_ns + late_ns, 0), position)
+            case ImuMessage() as imu:
+                self.gyro.add(imu, message.log_ns, position)
             case FixMessage() as fix if self.fixes:
                 self.fixes.add(fix, message.log_ns, position)
             case list() as transforms if channel in self._tf:
-                self.moving.add(transforms, message.log_ns, position)
+                self.dynamic.add(transforms, message.log_ns, position)
             case list() as transforms:
                 self.transforms += transforms

@@ -1,7 +1,7 @@
 """Which source of a log is the drive's odometry: the evidence on each, and the score by which the best is taken.
 
-A score is a product of factors, 1 where nothing speaks against a source. What the type, the frames and the name say are
-guesses, so they leave more than half; what was measured (coverage, rate, jumps) may leave next to nothing.
+A score is a product of factors, 1 where there is no evidence against a source. Type, frames and name
+are guesses, so they mostly leave more than half; measured evidence (coverage, rate, jumps) may leave next to nothing.
 """
 
 from __future__ import annotations
@@ -13,24 +13,44 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import OdometrySource
+from vplog.data import Odometry, OdometrySource, Trajectory
 from vplog.logs.continuity import find_jumps
-from vplog.logs.formats.container import Notes, plural
+from vplog.logs.dead_reckoning import dead_reckoned, odometry_of_fixes, turned_by_gyro
+from vplog.logs.formats.container import Channel, Notes, plural
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
-from vplog.logs.tf_odometry import FrameTree
+from vplog.logs.tf_odometry import FrameTree, clean
+from vplog.logs.topic_selection import SOURCES
 
 if TYPE_CHECKING:
-    from vplog.data import Ints, Odometry
-    from vplog.logs.formats.container import Channel
-    from vplog.logs.gather import Gathered
+    from vplog.data import Floats, Gps, Ints
+    from vplog.logs.formats.container import Contents
+    from vplog.logs.gather import TopicCollector
     from vplog.logs.topic_selection import Selection
+    from vplog.logs.tracks import PoseTrack
 
+TRUTH = Channel("truth", "ground truth", "")
+"""The ground truth of a data set as a source; it is no topic."""
 _TYPES = {"nav_msgs/Odometry": 1.0, "foxglove.Odometry": 1.0, "geometry_msgs/PoseWithCovarianceStamped": 0.8}
 _OTHER_TYPE = 0.7
-"""A type that says where something is, but not that it is the body by its odometry; transforms among them."""
+"""Pose types that need not be the odometry of the body; transforms among them."""
 _TRANSFORMS = 0.75
 """Transforms, a little before such types: they name both frames."""
+_OF_KIND = {
+    "twist": ("velocities added up", 0.5),
+    "gps": ("positions, with headings from their motion", 0.2),
+    "truth": ("is the ground truth of the data set", 0.01),
+}
+"""The evidence against other kinds of sources than poses."""
+PROPERTIES = {
+    "poses": "drifts as the estimator behind it does, wheels and cameras by about 0.5 to 2 % of the way",
+    "tf": "drifts as the estimator behind it does, wheels and cameras by about 0.5 to 2 % of the way",
+    "twist": "drifts by about 1 to 5 % of the way; knows neither slip nor, without a gyroscope, small turns",
+    "gps": "does not drift, and is off by metres at any time; knows neither roll and pitch nor a heading at rest",
+    "visual": "drifts by about 0.5 to 2 % of the way; ends where nothing is to be seen, and goes on as another piece",
+    "truth": "does not drift; an evaluation with it tells nothing about real odometry",
+}
+"""The drift of each kind of source, and what it cannot know."""
 _MAP = ("map", "world", "earth", "utm", "enu")
 """Frames whose poses jump when the place is known better (ROS REP 105)."""
 _BODIES = ("base_link", "base_footprint", "base", "body", "robot", "chassis", "vehicle")
@@ -48,11 +68,13 @@ COVERED = 0.9
 _LEAST_HZ = 5.0
 """Poses a second, or one per image, beyond which more of them add nothing: 2 m apart at 10 m/s."""
 _SPARSE = "poses a second that differ"
-_FAINT = 0.01
+_LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
 
 
-def weigh(source: Channel, frames: list[str], odometry: Odometry, camera_ns: Ints, span_ns: Ints) -> OdometrySource:
+def score_source(
+    source: Channel, frames: list[str], odometry: Odometry, camera_ns: Ints, span_ns: Ints, source_kind: str = "poses"
+) -> OdometrySource:
     """The evidence on one source. `camera_ns` (F,) are the stamps of the images; where there are none, `span_ns` (2,),
     the time that all sources cover together, counts instead."""
     stamp_ns, poses, topic, kind = odometry.stamp_ns, odometry.odom_from_body, source.topic, source.type
@@ -64,20 +86,20 @@ def weigh(source: Channel, frames: list[str], odometry: Odometry, camera_ns: Int
     camera_hz = _LEAST_HZ
     if len(camera_ns) > 1:
         camera_hz = (len(camera_ns) - 1) * 1e9 / int(camera_ns[-1] - camera_ns[0])
-    evidence = _named(topic, kind, frames)
+    evidence = _evidence_by_name(topic, kind, frames, source_kind)
     if coverage < COVERED:
         whose = "camera's" if len(camera_ns) else "sources'"
-        evidence[f"covers {coverage:.0%} of the {whose} time"] = max(coverage * coverage / 2, _FAINT)
+        evidence[f"covers {coverage:.0%} of the {whose} time"] = max(coverage * coverage / 2, _LEAST_FACTOR)
     if rate_hz is not None and (share := rate_hz / min(camera_hz, _LEAST_HZ)) < COVERED:
         what = f"{rate_hz:.2g} {_SPARSE}" if moved else "its pose never changes"
-        evidence[what] = max(math.sqrt(share), _FAINT)  # the root: a robot that mostly stands has odometry too
+        evidence[what] = max(math.sqrt(share), _LEAST_FACTOR)  # the root: a robot that mostly stands has odometry too
     if rate_hz is None:
-        evidence["a single pose"] = _FAINT
+        evidence["a single pose"] = _LEAST_FACTOR
     if jumps:
         evidence[f"jumps {plural(jumps, 'time')}"] = 1.0 / (1.0 + jumps)
     score, rate_hz = round(math.prod(evidence.values()), 6), None if rate_hz is None else round(rate_hz, 3)
     numbers = len(stamp_ns), rate_hz, round(coverage, 4), round(path_m, 3), jumps
-    return OdometrySource(topic, kind, frames, *numbers, evidence, score)
+    return OdometrySource(topic, kind, frames, *numbers, evidence, score, source_kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,26 +111,70 @@ class SourceOdometry:
     """From the one that stands still to the body."""
     notes: Notes
     """On what was repaired or left out of it."""
+    kind: str = "poses"
+    """As `OdometrySource.kind`."""
 
 
-def read_sources(read: Gathered, chosen: Selection) -> dict[Channel, SourceOdometry]:
+def read_sources(read: TopicCollector, chosen: Selection) -> dict[Channel, SourceOdometry]:
     """The odometry that was gathered from each source."""
-    tree, found = FrameTree([*read.moving.still(), *read.transforms]), {}
+    tree, found = FrameTree([*read.dynamic.static(), *read.transforms]), {}
     for source in chosen.sources:
         notes, track = Notes(), read.poses.get(source)
-        if track is not None:
+        if track is None:
+            found[source] = SourceOdometry(*read.dynamic.odometry(tree, source.topic, notes), notes, "tf")
+        elif (chosen.kind == "twist" or not track.moves) and (twists := track.twists) is not None:
+            odometry = _by_twists(read, track, twists, tree, notes)
+            found[source] = SourceOdometry(odometry, [track.parent or "odom", track.child], notes, "twist")
+        elif chosen.kind != "twist":
             found[source] = SourceOdometry(track.finish(notes), [track.parent, track.child], notes)
-        else:
-            found[source] = SourceOdometry(*read.moving.odometry(tree, source.topic, notes), notes)
     return found
 
 
-def weigh_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list[tuple[OdometrySource, Channel]]:
+def _by_twists(
+    read: TopicCollector, track: PoseTrack, twists: Floats, tree: FrameTree, notes: Notes
+) -> Odometry | None:
+    """Velocities (K, 12) added up, turned by the gyroscope where the log has one and says how it is mounted."""
+    stamp_ns, rows = track.stamps.order(track.topic, notes)
+    if len(rows) < 2:
+        return None
+    moving, variances = twists[rows, :6], twists[rows, 6:]
+    text = f"{track.topic}: the odometry is its velocities, added up"
+    gyro_ns, gyro = read.gyro.finish(notes)
+    placed = tree.between(track.child or "base_link", read.gyro.frame) if len(gyro_ns) else None
+    inside = np.asarray((gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]))
+    if inside.sum() < len(rows):
+        notes.add(f"{text}.")
+        return dead_reckoned(stamp_ns, moving, variances)
+    if placed is None and clean(read.gyro.frame) not in ("", track.child, "base_link"):
+        notes.add(f"{read.gyro.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
+    turned = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro, np.eye(4) if placed is None else placed)
+    bias = "its bias unknown, as nothing stands for a second"
+    bias = bias if turned.bias is None else f"less a bias of {np.degrees(turned.bias):.3f} deg/s at rest"
+    notes.add(f"{text}; it turns by the gyroscope of {read.gyro.topic}, {bias}.")
+    return dead_reckoned(turned.stamp_ns, turned.twists, np.full_like(turned.twists, np.nan))
+
+
+def other_sources(gps: Gps | None, contents: Contents, chosen: Selection) -> dict[Channel, SourceOdometry]:
+    """Fixes and the ground truth of a data set, as odometry."""
+    found = {}
+    if gps is not None and chosen.gps is not None and chosen.kind in ("", "gps"):
+        odometry, notes = odometry_of_fixes(gps), Notes()
+        notes.add(f"The odometry is the fixes of {chosen.gps.topic}, which are constraints of the graph, too.")
+        found[chosen.gps] = SourceOdometry(odometry, ["enu", ""], notes, "gps")
+    if isinstance(truth := contents.truth, Trajectory) and chosen.kind in ("", "truth"):
+        odometry = Odometry(truth.stamp_ns, truth.world_from_body, None)
+        notes = Notes()
+        notes.add(f"The odometry is the ground truth of the data set: {PROPERTIES['truth'].split('; ')[1]}.")
+        found[TRUTH] = SourceOdometry(odometry, ["world", contents.body], notes, "truth")
+    return found
+
+
+def rank_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list[tuple[OdometrySource, Channel]]:
     """Every source with a usable pose, the best first; of equal ones that with most poses, then by name."""
     ends = [one.odometry.stamp_ns[[0, -1]] for one in found.values() if one.odometry is not None]
     span_ns = np.array([min(end[0] for end in ends), max(end[1] for end in ends)]) if ends else NONE
     weighed = [
-        (weigh(source, one.frames, one.odometry, camera_ns, span_ns), source)
+        (score_source(source, one.frames, one.odometry, camera_ns, span_ns, one.kind), source)
         for source, one in found.items()
         if one.odometry is not None
     ]
@@ -117,9 +183,10 @@ def weigh_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list
 
 def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selection, notes: Notes) -> Channel | None:
     """The source to use: the requested one, else the best. What is lost with it is noted."""
-    requested = chosen.odometry
+    requested = chosen.odometry or (sources[0][1] if chosen.kind in SOURCES and sources else None)
     commands = [one for one, _ in sources if not requested and _COMMANDED in one.evidence]
-    fit = [one for one in sources if one[0] not in commands]
+    withheld = [one for one, _ in sources if one.kind == "truth" and not requested]
+    fit = [one for one in sources if one[0] not in commands + withheld]
     if commands and (not fit or commands[0].score > fit[0][0].score):
         names = ", ".join(source.topic for source in commands)
         notes.add(
@@ -127,20 +194,20 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
             f"{commands[0].topic} takes it."
         )
     if not fit:
-        return None if sources else requested or next(iter(chosen.sources), None)
+        return None if sources or chosen.kind in SOURCES else requested or next(iter(chosen.sources), None)
     best, source = fit[0]
     _note_doubts(best, requested is not None, chosen.image is not None, notes)
     return source
 
 
-def _note_doubts(source: OdometrySource, requested: bool, pictured: bool, notes: Notes) -> None:
-    if source.coverage < COVERED and pictured:
+def _note_doubts(source: OdometrySource, requested: bool, has_images: bool, notes: Notes) -> None:
+    if source.coverage < COVERED and has_images:
         better = "" if requested else " No other source is better; --odometry-file takes one from a file."
         notes.add(
             f"{source.topic} covers {source.coverage:.0%} of the camera's time; the frames outside have no odometry "
             f"and are left out.{better}"
         )
-    if pictured and any(_SPARSE in what for what in source.evidence) and (source.rate_hz or 1.0) < 1.0:
+    if has_images and any(_SPARSE in what for what in source.evidence) and (source.rate_hz or 1.0) < 1.0:
         notes.add(
             f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is "
             "interpolated."
@@ -153,20 +220,28 @@ def _note_doubts(source: OdometrySource, requested: bool, pictured: bool, notes:
     if any(map(_TRUTH.search, (source.topic, *source.frames))):
         notes.add(
             f"{source.topic} is ground truth by its name{'' if requested else ', and the best that the log has'}; "
-            "measured against it, the trajectory says nothing about real odometry."
+            "an evaluation with it tells nothing about real odometry."
         )
 
 
-def in_words(source: OdometrySource) -> str:
-    """The score and what speaks against the source."""
+def is_truth(topic: str) -> bool:
+    """Whether a topic is ground truth by its name."""
+    return _TRUTH.search(topic) is not None
+
+
+def evidence_text(source: OdometrySource) -> str:
+    """The score of a source and the evidence against it."""
     return f"score {source.score:.2g}" + "".join(f", {what}" for what in source.evidence)
 
 
-def _named(topic: str, kind: str, frames: list[str]) -> dict[str, float]:
-    """What name, type and frames say against a source."""
+def _evidence_by_name(topic: str, kind: str, frames: list[str], source_kind: str) -> dict[str, float]:
+    """The evidence against a source by name, type and frames."""
+    if source_kind in ("gps", "truth"):
+        return dict([_OF_KIND[source_kind]])
     name = short_type(kind)
     likely = _TRANSFORMS if "TFMessage" in name or "FrameTransform" in name or name == "tf/tfMessage" else _OTHER_TYPE
     found = {f"a {name.replace('.', '/').split('/')[-1]}": _TYPES.get(name, likely)}
+    found = dict([_OF_KIND["twist"]]) if source_kind == "twist" else found
     parent, child = (frame.split("/")[-1] for frame in (*frames[:1], *frames[-1:])) if frames else ("", "")
     if parent in _BODIES or (parent and parent == child):
         found[f"is placed in {parent}, which moves"] = 0.05
@@ -179,9 +254,9 @@ def _named(topic: str, kind: str, frames: list[str]) -> dict[str, float]:
     elif child and child not in _BODIES:
         found[f"moves {child}, not base_link"] = 0.9
     if any(map(_TRUTH.search, (topic, *frames))):
-        found["is ground truth by its name"] = _FAINT
+        found["is ground truth by its name"] = _LEAST_FACTOR
     if _COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
-        found |= {_MAYBE_COMMANDED: 0.1} if child else {_COMMANDED: _FAINT}
+        found |= {_MAYBE_COMMANDED: 0.1} if child else {_COMMANDED: _LEAST_FACTOR}
     return {what: factor for what, factor in found.items() if factor < 1.0}
 
 

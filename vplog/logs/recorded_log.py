@@ -7,14 +7,16 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from vplog.data import LogInfo, Topic
+from vplog.data import LogInfo, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.logs.calibration_file import SidecarFiles
 from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
 from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
-from vplog.logs.frames import Pictures, RecordedFrame, size_of
+from vplog.logs.frames import ImageReader, RecordedFrame, size_of
+from vplog.logs.messages.records import GEOMETRY, short_type
+from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
@@ -47,7 +49,7 @@ class RecordedLog:
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
         self._selection = select(self._candidates, choice, path.name)
-        self._sidecar = SidecarFiles(choice, notes)
+        self._sidecar, self._choice = SidecarFiles(choice, notes), choice
 
     @property
     def warnings(self) -> list[str]:
@@ -69,7 +71,7 @@ class RecordedLog:
         end_ns = max((int(track.stamp_ns[-1]) for track in tracks), default=self._contents.end_ns)
         return LogInfo(
             str(self._path), self._kind, start_ns, end_ns, self._contents.messages, topics, self.warnings,
-            [frame for frame in content.frames if frame], content.skew_ms, content.sources,
+            [frame for frame in content.frames if frame], content.skew_ms, content.sources, self._truth_name,
         )  # fmt: skip
 
     def _topic(self, channel: Channel, count: int) -> Topic:
@@ -89,19 +91,53 @@ class RecordedLog:
 
     def frames(self, stamp_ns: Ints) -> Iterator[RecordedFrame]:
         """Raises LogError where a stamp is not one of `stamps()`."""
-        content, pictures, pair, camera = self._content, self._pictures, self._pair, self.camera()
+        content, images, pair, camera = self._content, self._images, self._pair, self.camera()
         for row in rows_of(content.stamp_ns, stamp_ns, self.name):
-            right = None if pair is None else pictures.beside(self._selection.right, content.right_places, row)
-            depth = pictures.beside(self._depth, content.depth_places, row)
-            at_ns, image = int(content.stamp_ns[row]), pictures.image(row)
+            right = None if pair is None else images.companion(self._selection.right, content.right_places, row)
+            depth = images.companion(self._depth, content.depth_places, row)
+            at_ns, image = int(content.stamp_ns[row]), images.image(row)
             own = self._calibration_at(at_ns)
             yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own)
+
+    def file_names(self) -> list[str] | None:
+        names = self._contents.names
+        return [names[stamp_ns] for stamp_ns in self.stamps().tolist()] if names else None
 
     def odometry(self) -> Odometry | None:
         return self._sidecar.odometry or self._content.odometry
 
+    def has_depth(self) -> bool:
+        return self._pair is not None or self._depth is not None
+
     def gps(self) -> Gps | None:
         return self._content.gps
+
+    def truth(self) -> Trajectory | Gps | None:
+        """That of the data set, else the poses of a topic that is called ground truth."""
+        if self._contents.truth is not None or not self._truth_name:
+            return self._contents.truth
+        chosen = select(self._candidates, TopicChoice(odometry=self._truth_name), self._path.name)
+        found = read_content(self._container, self._contents, chosen, Notes()).odometry
+        return None if found is None else Trajectory(found.stamp_ns, found.odom_from_body)
+
+    @cached_property
+    def _truth_name(self) -> str:
+        """The kind of truth: poses or positions of the data set, or the first topic that is called ground truth."""
+        if (known := self._contents.truth) is not None:
+            return f"{len(known.stamp_ns)} {'poses' if isinstance(known, Trajectory) else 'positions'} of the data set"
+        named = (c.channel.topic for c in self._candidates if c.role == "odometry" and c.count)
+        return min(filter(is_truth, named), default="")
+
+    def without_odometry(self) -> str:
+        """Ways out where there is none: the sources that are not taken by themselves, and files."""
+        content = self._content
+        given = [f"--odometry {source.topic}: {PROPERTIES[source.kind]}" for source in content.sources]
+        wheels = [c for c in self._candidates if short_type(c.channel.type) in GEOMETRY and c.count]
+        for one in wheels:
+            needs = " and ".join(f"--{name.replace('_', '-')}" for name in GEOMETRY[short_type(one.channel.type)])
+            given.append(f"{needs} make odometry of {one.channel.topic}")
+        given += ["--odometry visual needs a calibrated camera with depth or a stereo pair"]
+        return "; ".join([*given, "--odometry-file takes poses from a file; `vplog library` needs none"]) + "."
 
     def _check_images(self) -> None:
         """Everything that decoding the first image and depth would warn of, for info."""
@@ -131,7 +167,7 @@ class RecordedLog:
 
     @cached_property
     def _later_calibrations(self) -> list[CalibrationMessage]:
-        """Those that change the camera's, by stamp: a lens in focus has one for every image."""
+        """Calibrations that replace the camera's, by stamp: an autofocus lens has one for every image."""
         if self._sidecar.camera(self._image_channel().topic) is not None:
             return []
         return sorted(self._content.calibrations[1:], key=lambda calibration: calibration.stamp_ns)
@@ -141,7 +177,7 @@ class RecordedLog:
         """The depth topic, or None, with a note, where its first images do not decode or do not fit the camera's."""
         depth, camera = self._selection.depth, self.camera()
         try:
-            first = None if depth is None else self._pictures.first_depth(depth)
+            first = None if depth is None else self._images.first_depth(depth)
         except LogError as error:
             self._notes.add(f"Depth is not used: {error}")
             return None
@@ -154,14 +190,19 @@ class RecordedLog:
         return depth
 
     @cached_property
-    def _pictures(self) -> Pictures:
-        image, content = self._selection.image, read_content(self._container, self._selection, self._notes)
+    def _images(self) -> ImageReader:
+        image, content = self._selection.image, self._read()
         known = self._candidate(image)
-        return Pictures(self._container, image, known.codec if known else "", content, self._notes)
+        return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
+
+    def _read(self) -> Content:
+        """Content of the topics, of images that between start and stop."""
+        found = read_content(self._container, self._contents, self._selection, self._notes)
+        return found.between(self._choice.start_s, self._choice.stop_s)
 
     @property
     def _content(self) -> Content:
-        return self._pictures.content
+        return self._images.content
 
     def camera(self) -> Camera:
         """Raises LogError where the log has no images."""
@@ -172,15 +213,17 @@ class RecordedLog:
         """The camera of the images as they come, and its frame."""
         image = self._image_channel()
         content, notes = self._content, self._notes
-        frame, size = self._pictures.first(image, [*content.places], self._path.name)
+        frame, size = self._images.first(image, [*content.places], self._path.name)
         known = self._sidecar.camera(image.topic)
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
         named = content.body and frame and content.tree.between(content.body, frame) is not None
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
-        elif self.odometry() is not None:
-            placed = body_from_camera(content.tree, content.body, frame, notes)
+        elif self.odometry() is not None or (camera.matrix is not None and self._selection.has_depth):
+            ahead = self.odometry() is None  # it is visual odometry then
+            ahead |= any(source.used and source.kind in ("gps", "twist") for source in content.sources)
+            placed = body_from_camera(content.tree, content.body, frame, notes, ahead)
             camera = replace(camera, body_from_camera=placed)
         return camera, frame
 
@@ -194,7 +237,7 @@ class RecordedLog:
         if left.matrix is None:  # warned of as such: it costs more than the depth
             return None
         try:
-            if (beside := self._candidate(right)) and beside.codec:
+            if (candidate := self._candidate(right)) and candidate.codec:
                 raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
             known = [self._sidecar.camera(channel.topic) for channel in (image, right)]
             calibrations = [camera.calibration if camera else None for camera in known]
@@ -202,13 +245,13 @@ class RecordedLog:
                 calibrations = [content.calibration, content.right_calibration]
             if calibrations[0] is None or calibrations[1] is None:
                 raise NoPairError(f"{right.topic} has no calibration")
-            other, size = self._pictures.first(right, content.right_places, self._path.name)
+            other, size = self._images.first(right, content.right_places, self._path.name)
             camera = camera_of(right.topic, calibrations[1], size, self._notes)
             left_side = Side(left, calibrations[0], is_rectified(image.topic))
             right_side = Side(camera, calibrations[1], is_rectified(right.topic))
-            apart = content.tree.between(other, frame) if other and frame else None
-            apart = self._sidecar.right_from_left(image.topic, right.topic) if known[0] else apart
-            pair = pair_of(left_side, right_side, apart)
+            right_from_left = content.tree.between(other, frame) if other and frame else None
+            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known[0] else right_from_left
+            pair = pair_of(left_side, right_side, right_from_left)
             error_px = row_error_px(self._rectified(pair, right))
             if error_px is not None and error_px > MOST_ROWS_PX:
                 raise NoPairError(
@@ -221,13 +264,13 @@ class RecordedLog:
 
     def _rectified(self, pair: Pair, right: Channel) -> Iterator[tuple[Bytes, Bytes]]:
         """Images of a few frames; what does not decode is left out."""
-        content, pictures, camera = self._content, self._pictures, self._left[0]
+        content, images, camera = self._content, self._images, self._left[0]
         rows = [row for row, place in enumerate(content.right_places) if place is not None]
         for row in rows[:: max(len(rows) // CHECKED_FRAMES, 1)][:CHECKED_FRAMES]:
-            image, beside = pictures.image(row), pictures.beside(right, content.right_places, row)
+            image, other = images.image(row), images.companion(right, content.right_places, row)
             stamp_ns = int(content.stamp_ns[row])
-            try:  # nothing of a trial is counted
-                frame = RecordedFrame(stamp_ns, camera, image, None, beside, pair, Notes()).decode()
+            try:  # not counted as lost: only a check
+                frame = RecordedFrame(stamp_ns, camera, image, None, other, pair, Notes()).decode()
             except LogError:
                 continue
             if frame.right is not None:

@@ -1,4 +1,4 @@
-"""The recorder's clock set back on the way: found by the order of the file and undone in all topics.
+"""Backward steps of the recorder's clock: found by the order of the file and undone in all topics.
 
 A clock that was set back passes a time twice: the messages behind it fall between those before it. Parts of a recording
 in another order do not overlap, and a part that was written twice holds the same messages. Where a clock was set back
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Notes
     from vplog.logs.stamps import Stamps
 
-_TURNS = 3
+_ALTERNATIONS = 3
 """Turns from one side of a step to the other in the order of time that mere neighbours make: A B A B."""
 _OVERLAP = 2
 """Turns beyond these, of all topics together, by which a time was passed twice; one message more makes two."""
 _MOST_STEPS = 20
 """A clock is set a few times in a drive; times that go back more often are in no order."""
-_ONWARD = 3
+_FURTHEST_STEP = 3
 """Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 
 
@@ -45,11 +45,11 @@ class _Drop:
     """How much, by the header stamps or the period."""
     overlap: int
     """Turns from one side to the other beyond those of neighbours."""
-    onward: bool
+    continuous: bool
     """The motion leads on over it in the order of the file and not in that of time."""
 
 
-def mend_steps_back(topics: Iterable[Stamps], notes: Notes) -> None:
+def correct_clock_steps(topics: Iterable[Stamps], notes: Notes) -> None:
     """Shift all log times behind each step back of the recorder's clock on by its size."""
     topics = [one for one in topics if len(one.log_ns)]
     drops = sorted((drop for one in topics for drop in _drops(one)), key=lambda drop: (drop.behind, drop.before))
@@ -58,7 +58,7 @@ def mend_steps_back(topics: Iterable[Stamps], notes: Notes) -> None:
         position = drops[0].behind
         group = [drop for drop in drops if drop.before < position]
         drops = [drop for drop in drops if drop.before >= position]
-        if sum(drop.overlap for drop in group) >= _OVERLAP or any(drop.onward for drop in group):
+        if sum(drop.overlap for drop in group) >= _OVERLAP or any(drop.continuous for drop in group):
             fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns))
             steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *(drop.back_ns for drop in group))))
     if not 0 < len(steps) <= _MOST_STEPS:
@@ -93,21 +93,22 @@ def _drops(one: Stamps) -> list[_Drop]:
         behind = np.arange(row, bounds[at + 1])
         first_ns, last_ns = log_ns[behind].min(), log_ns[behind].max()
         before = np.flatnonzero((log_ns[:row] >= first_ns) & (log_ns[:row] <= last_ns))
-        behind = behind[~_again(one, log_ns, header_ns, before, behind)]
+        behind = behind[~_duplicates(one, log_ns, header_ns, before, behind)]
         elapsed = int(header_ns[row] - header_ns[row - 1])  # by a header's clock that went on
         found.append(
             _Drop(
                 int(positions[row - 1]), int(positions[row]), period,
                 -int(step[row - 1]), elapsed if elapsed > 0 else period,
-                max(_turns(log_ns[before], log_ns[behind]) - _TURNS, 0), _leads_on(log_ns, one.places, row),
+                max(_alternations(log_ns[before], log_ns[behind]) - _ALTERNATIONS, 0),
+                _is_continuous(log_ns, one.xyz_m, row),
             )
         )  # fmt: skip
     return found
 
 
-def _again(one: Stamps, log_ns: Ints, header_ns: Ints, before: Ints, behind: Ints) -> np.ndarray:
-    """Which messages behind a step are the same as one before it, by times and position: written twice."""
-    numbers = [log_ns, header_ns] if one.places is None else [log_ns, header_ns, *one.places.T.copy().view(np.int64)]
+def _duplicates(one: Stamps, log_ns: Ints, header_ns: Ints, before: Ints, behind: Ints) -> np.ndarray:
+    """Which messages behind a step duplicate one before it, by times and position."""
+    numbers = [log_ns, header_ns] if one.xyz_m is None else [log_ns, header_ns, *one.xyz_m.T.copy().view(np.int64)]
     rows = np.concatenate([before, behind])
     _, first, inverse = np.unique(
         np.stack([each[rows] for each in numbers]), axis=1, return_index=True, return_inverse=True
@@ -115,19 +116,19 @@ def _again(one: Stamps, log_ns: Ints, header_ns: Ints, before: Ints, behind: Int
     return first[inverse.ravel()[len(before) :]] < len(before)
 
 
-def _turns(before_ns: Ints, behind_ns: Ints) -> int:
+def _alternations(before_ns: Ints, behind_ns: Ints) -> int:
     """How often the messages in order of time change from one side of a step to the other."""
     side = np.repeat([False, True], [len(before_ns), len(behind_ns)])
     return int((np.diff(side[np.argsort(np.concatenate([before_ns, behind_ns]), kind="stable")]) != 0).sum())
 
 
-def _leads_on(log_ns: Ints, places: Floats | None, row: int) -> bool:
+def _is_continuous(log_ns: Ints, xyz_m: Floats | None, row: int) -> bool:
     """Whether the motion goes on from the row before, and would jump at this row in the order of time."""
-    if places is None:
+    if xyz_m is None:
         return False
-    step_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    limit = _ONWARD * float(np.quantile(step_m, 0.9))
+    step_m = np.linalg.norm(np.diff(xyz_m, axis=0), axis=1)
+    limit = _FURTHEST_STEP * float(np.quantile(step_m, 0.9))
     earlier = np.flatnonzero(log_ns < log_ns[row])
     last = earlier[np.argmax(log_ns[earlier])] if len(earlier) else None
-    apart = last is None or float(np.linalg.norm(places[row] - places[last])) > limit
+    apart = last is None or float(np.linalg.norm(xyz_m[row] - xyz_m[last])) > limit
     return bool(step_m[row - 1] <= limit) and apart

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _BASELINES_M = (1e-3, 20.0)
 """m; endoscopes have 4 mm, stereo across a lorry's cab 2 m: anything outside is another unit, or another thing."""
-_APART_RAD = np.radians(20.0)
+_MOST_TURN_RAD = np.radians(20.0)
 """Most that the two cameras may be turned: stereo heads are parallel to a few degrees, surround views 55 apart and
 more."""
 _REMAP_PX = 2**15
@@ -31,7 +31,7 @@ _CHECKED_FEATURES = 1000
 _NEAR_BITS = 40
 """Bits of 256 that two descriptors of one point may differ by: unrelated ones differ by 64 and more (Rublee 2011)."""
 _LEAST_MATCHES = 50
-"""Matches whose median says something."""
+"""Matches from which a median is meaningful."""
 CHECKED_FRAMES = 5
 """Frames, spread over the drive, whose rows are compared."""
 MOST_ROWS_PX = 2.0
@@ -65,7 +65,7 @@ class Pair:
     """What cv2.remap takes for left and right images; None where they are rectified as they come."""
 
     def rectify(self, image: Bytes, side: int) -> Bytes:
-        """(H, W) uint8 the left (0) or right (1) image on the common rows."""
+        """(H, W) or (H, W, 3) uint8 the left (0) or right (1) image on the common rows."""
         found = self.maps[side]
         if found is None:
             return image
@@ -165,7 +165,7 @@ def _rotation(calibration: CalibrationMessage) -> Floats:
 def _rectification(left: Side, right: Side, right_from_left: Floats) -> tuple[list[Floats], list[Floats]]:
     """Rotations and projections that put both images on common rows (Bouguet's method, cv2.stereoRectify)."""
     angle = float(se3.angle(right_from_left[:3, :3]))
-    if angle > _APART_RAD:
+    if angle > _MOST_TURN_RAD:
         raise NoPairError(f"the static transforms turn it by {np.degrees(angle):.0f} degrees against the left camera")
     shift = right_from_left[:3, 3]
     if abs(shift[1]) > abs(shift[0]) or abs(shift[2]) > 2 * abs(shift[0]):

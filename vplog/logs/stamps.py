@@ -18,7 +18,7 @@ from vplog.logs.clocks import (
     LEAST_STEP_NS,
     STEP_PERIODS,
     Clock,
-    on_one_clock,
+    align_clock,
 )
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.formats.loss_account import runs_of
@@ -49,8 +49,8 @@ class Stamps:
 
     header_ns: array[int] = field(default_factory=partial(array, "q"))
     log_ns: array[int] = field(default_factory=partial(array, "q"))
-    places: Floats | None = None
-    """(M, 3) positions that the messages say, where they do: they tell a message from one that was written twice."""
+    xyz_m: Floats | None = None
+    """(M, 3) positions in the messages, where they have one: they tell a message from its duplicate."""
     common: Clock | None = None
     """The clock that all topics of the log are to be on, where that is known."""
     _positions: array[int] = field(default_factory=partial(array, "q"))
@@ -68,7 +68,7 @@ class Stamps:
 
     def skew_ns(self) -> int | None:
         """Log time less header stamp, the median; None where the header stamps follow no clock."""
-        found = self._on_one_clock()
+        found = self._aligned()
         return found.skew_ns if found is not None and found.valid.any() else None
 
     def positions(self) -> Ints:
@@ -82,14 +82,17 @@ class Stamps:
 
     def clocks(self) -> dict[int, int]:
         """Messages by the skew of the clock that they came on; several where it was set."""
-        found = self._on_one_clock()
+        found = self._aligned()
         return {} if found is None else found.counts
 
-    def _on_one_clock(self) -> Repaired | None:
+    def _aligned(self) -> Repaired | None:
         if self._found is None or self._found[0] != len(self.log_ns):
             header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
-            stamped = header_ns != 0
-            self._found = len(self.log_ns), on_one_clock(header_ns[stamped], log_ns[stamped]) if stamped.any() else None
+            stamped = _stamped(header_ns, log_ns)
+            self._found = (
+                len(self.log_ns),
+                align_clock(header_ns[stamped], log_ns[stamped]) if stamped.any() else None,
+            )
         return self._found[1]
 
     def order(self, topic: str, notes: Notes) -> tuple[Ints, Ints]:
@@ -100,16 +103,17 @@ class Stamps:
         lost; where the clock was set on the way, the stamps are shifted to the one of most messages.
         """
         header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
-        rows = np.flatnonzero(header_ns)
+        stamped = _stamped(header_ns, log_ns)
+        rows = np.flatnonzero(stamped)
         if not len(header_ns):
             return NONE, NONE
         if 2 * len(rows) < len(header_ns):
             return self._by_log_times(topic, notes, "has no header stamps")
-        _lose("no_stamp", topic, header_ns == 0, log_ns, notes)
+        _lose("no_stamp", topic, ~stamped, log_ns, notes)
         if why := _no_clock(header_ns[rows], log_ns[rows]):
             return self._by_log_times(topic, notes, why)
         common_ns = self.common.skew_ns if self.common else None
-        found = on_one_clock(header_ns[rows], log_ns[rows], common_ns)
+        found = align_clock(header_ns[rows], log_ns[rows], common_ns)
         if found is None:
             return self._by_log_times(topic, notes, "has header stamps that follow no clock")
         if found.jumps_ns:
@@ -122,7 +126,7 @@ class Stamps:
         for change in found.unclear_ns:
             notes.add(
                 f"{topic}: behind a gap the log times are {change / 1e9:+.3f} s further from the header stamps. Was a "
-                "clock set, or does it take longer since? The stamps are left as they are."
+                "clock set, or is the transport slower since? The stamps are not changed."
             )
         _lose("stray_stamp", topic, ~found.valid, log_ns[rows], notes)
         rows, stamp_ns = rows[found.valid], found.stamp_ns[found.valid]
@@ -143,6 +147,11 @@ def rate_hz(stamp_ns: Ints) -> float | None:
     return round(rate, 3) if rate is not None and rate < _FASTEST_HZ else None
 
 
+def _stamped(header_ns: Ints, log_ns: Ints) -> np.ndarray:
+    """(M,) bool: a stamp of 0 is one that nobody set, except at the start of a clock that begins at 0."""
+    return np.asarray((header_ns != 0) | (log_ns == 0))
+
+
 def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
     """Why header stamps are no times, as it follows the topic's name; empty where they may be."""
     if len(np.unique(header_ns)) * _STANDING < len(header_ns):
@@ -157,7 +166,7 @@ def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
     return ""
 
 
-def share_clock(topics: Iterable[Stamps]) -> None:
+def set_common_clock(topics: Iterable[Stamps]) -> None:
     """Set the common clock of all topics of a log: that of most messages, by log time less stamp."""
     topics = [one for one in topics if len(one.header_ns)]
     pooled: dict[int, int] = {}

@@ -102,7 +102,7 @@ class _Link:
     values: array[float] = field(default_factory=lambda: array("d"))
     """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
 
-    def keep(self, transform: PoseMessage, time_ns: tuple[int, int, int]) -> None:
+    def add(self, transform: PoseMessage, time_ns: tuple[int, int, int]) -> None:
         if not self.moves:
             self.times_ns[1:] = [time_ns]  # the first stays
             return
@@ -116,12 +116,12 @@ class _Link:
         self.values.extend((*transform.position, *transform.quaternion))
 
 
-class MovingFrames:
+class DynamicTransforms:
     """Collects the transforms of tf topics."""
 
-    def __init__(self, keep: bool) -> None:
-        self._keep = keep
-        """Keep every sample, for odometry; else only what tells whether a frame moves."""
+    def __init__(self, store: bool) -> None:
+        self._store = store
+        """Store every sample, for odometry; else only whether a frame moves."""
         self._links: dict[Edge, _Link] = {}
 
     def add(self, transforms: list[PoseMessage], log_ns: int, position: int) -> None:
@@ -132,11 +132,11 @@ class MovingFrames:
                 link = self._links[edge] = _Link(transform)
             link.travels = link.travels or link.first.position != transform.position
             link.moves = link.travels or link.moves or link.first.quaternion != transform.quaternion
-            if self._keep:
-                link.keep(transform, (transform.stamp_ns, log_ns, position))
+            if self._store:
+                link.add(transform, (transform.stamp_ns, log_ns, position))
 
-    def still(self) -> list[PoseMessage]:
-        """Transforms that were the same whenever they were sent."""
+    def static(self) -> list[PoseMessage]:
+        """Transforms that never changed."""
         return [link.first for _, link in sorted(self._links.items()) if not link.moves]
 
     def stamps(self) -> list[Stamps]:
@@ -153,8 +153,8 @@ class MovingFrames:
         frames = [chain[0][0], *(child for _, child in chain)]
         names = " -> ".join(frames)
         tracks = {edge: self._track(edge, topic, notes) for edge in moving}
-        pace = max(moving, key=lambda edge: len(tracks[edge][0]))
-        at_ns = tracks[pace][0]
+        fastest = max(moving, key=lambda edge: len(tracks[edge][0]))
+        at_ns = tracks[fastest][0]
         for stamps, _ in tracks.values():
             at_ns = at_ns[(at_ns >= stamps[0]) & (at_ns <= stamps[-1])] if len(stamps) else NONE
         if not len(at_ns):
@@ -166,8 +166,8 @@ class MovingFrames:
                 stamps, samples = tracks[edge]
                 poses = poses @ (samples if len(stamps) == 1 else se3.interpolate_at(stamps, samples, at_ns))
             else:
-                still = tree.between(*edge)
-                poses = poses @ (np.eye(4) if still is None else still)
+                static = tree.between(*edge)
+                poses = poses @ (np.eye(4) if static is None else static)
         notes.add(f"Odometry is {names} of {topic}, which carries no covariance; its noise is that of the drift model.")
         return Odometry(at_ns, poses, None), frames
 
@@ -177,7 +177,7 @@ class MovingFrames:
         moving = {edge for edge, link in self._links.items() if link.moves}
         by_root = sorted(edges, key=lambda edge: -_ROOTS.index(_name(edge[0])) if _name(edge[0]) in _ROOTS else -9)
         parents = {child: parent for parent, child in by_root}  # of several parents the root that does not jump
-        up = {frame: _upwards(frame, parents) for edge in edges for frame in edge}
+        up = {frame: _ancestors(frame, parents) for edge in edges for frame in edge}
         bodies = [body for name in _BODIES for body in sorted(up) if _name(body) == name]
         body = next((body for body in bodies if moving.intersection(up[body])), None)
         if body is None:
@@ -211,7 +211,7 @@ class MovingFrames:
         return stamp_ns[usable], se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
 
 
-def _upwards(frame: str, parents: dict[str, str]) -> list[Edge]:
+def _ancestors(frame: str, parents: dict[str, str]) -> list[Edge]:
     """Edges from a frame to the top of its tree; in a circle, up to the frame that comes twice."""
     result: list[Edge] = []
     passed = {frame}

@@ -1,4 +1,4 @@
-"""The topics of a log that could play a part, and what the first message of each says of it."""
+"""The topics of a log that could be used, described by the first message of each."""
 
 from __future__ import annotations
 
@@ -76,5 +76,5 @@ def _is_thermal(candidate: Candidate, first: object, candidates: list[Candidate]
 
 
 def _named_depth(topic: str, first: ImageMessage) -> bool:
-    """Where the encoding leaves it open: old compressedDepth says only `png`, RealSense records depth as mono16."""
+    """Whether ambiguous encodings are depth by their name: old compressedDepth is `png`, RealSense records mono16."""
     return topic.endswith("/compressedDepth") or (first.encoding == "mono16" and "depth" in topic.lower())

@@ -18,11 +18,14 @@ other parts the first by these rules does, unless TopicChoice names another:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import Field
+
 from vplog.errors import LogError, nearest
+from vplog.logs.messages.records import GEOMETRY, TWISTS, WHEELS, short_type
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -31,11 +34,18 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Channel
 
 
+EVERY_IMAGE = "*"
+"""Choice of all images of a folder and of the folders in it, whatever their names and sizes."""
+SOURCES = ("twist", "gps", "truth", "visual")
+"""Odometry that no topic is chosen for: velocities added up, positions of fixes, the ground truth of a data set, and
+visual odometry, which a run computes."""
+
+
 class TopicChoice(Settings):
     """Topics to use instead of those the rules pick."""
 
     image: str | None = None
-    """Topic of the camera's images."""
+    """Topic of the camera's images; of a folder with those of several cameras the group of one, or `*` for all."""
     depth: str | None = None
     """Topic of the depth images; an empty string uses none."""
     right: str | None = None
@@ -43,7 +53,7 @@ class TopicChoice(Settings):
     camera_info: str | None = None
     """Topic of the camera's calibration; an empty string uses none."""
     odometry: str | None = None
-    """Topic of the odometry; an empty string uses none."""
+    """Topic of the odometry, or a source of SOURCES; an empty string uses none."""
     odometry_file: Path | None = None
     """TUM file of poses beside the log that is the odometry: of the body, or of the camera where the log's static
     transforms have no base_link; its clock is that of the images' stamps."""
@@ -52,11 +62,23 @@ class TopicChoice(Settings):
     EuRoC's sensor.yaml."""
     gps: str | None = None
     """Topic of the satellite fixes; an empty string uses none."""
+    imu: str | None = None
+    """Topic of the IMU whose gyroscope turns velocities that are the odometry; an empty string uses none."""
+    wheelbase_m: float | None = Field(default=None, gt=0, le=100)
+    """m between the axles, for ackermann_msgs/AckermannDriveStamped."""
+    track_m: float | None = Field(default=None, gt=0, le=100)
+    """m between left and right wheels, for wheel speeds in sensor_msgs/JointState."""
+    wheel_radius_m: float | None = Field(default=None, gt=0, le=100)
+    """m; for wheel speeds in sensor_msgs/JointState."""
+    start_s: float | None = Field(default=None, ge=0, le=1e9)
+    """s after the first image, before which images are left out."""
+    stop_s: float | None = Field(default=None, ge=0, le=1e9)
+    """s after the first image, from which on images are left out."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A topic that could play a part, with what its first message says."""
+    """A topic that could be used, described by its first message."""
 
     channel: Channel
     count: int
@@ -85,6 +107,12 @@ class Selection:
     """As requested, or as chosen among `sources` once these are read."""
     sources: tuple[Channel, ...] = ()
     """Topics that may be the odometry; the transforms over time are one source, named by the largest topic."""
+    kind: str = ""
+    """The one of SOURCES that is requested, `topic` of a topic or none at all, or empty."""
+    geometry: dict[Channel, tuple[float, float]] = field(default_factory=dict)
+    """What linear and angular velocities of sources are multiplied by, where they are those of wheels."""
+    imu: Channel | None = None
+    """The IMU whose gyroscope turns velocities, where these are the odometry."""
     gps: Channel | None = None
     tf_static: tuple[Channel, ...] = ()
     tf: tuple[Channel, ...] = ()
@@ -95,14 +123,19 @@ class Selection:
     @property
     def parts(self) -> dict[Channel, str]:
         """What each topic in use is used as, in the words of `vplog.data.Topic.part`."""
-        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info")
+        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu")
         many = [(channel, name) for name in ("tf_static", "tf") for channel in getattr(self, name)]
         one = [(channel, name) for name in named if (channel := getattr(self, name)) is not None]
         return dict(many) | dict(one)
 
     @property
+    def has_depth(self) -> bool:
+        """Whether depth or right images are among them."""
+        return self.depth is not None or self.right is not None
+
+    @property
     def channels(self) -> list[Channel]:
-        return list(dict.fromkeys((*self.parts, *self.sources)))
+        return list(dict.fromkeys((*self.parts, *self.sources, *([self.imu] if self.imu else ()))))
 
     def with_odometry(self, odometry: Channel | None) -> Selection:
         """The selection once the source of odometry is known."""
@@ -112,12 +145,13 @@ class Selection:
 
 _NAMES = {
     "image": "Image", "depth": "Depth", "right": "Image", "camera_info": "Calibration", "odometry": "Odometry",
-    "gps": "GPS",
+    "gps": "GPS", "imu": "IMU",
 }  # fmt: skip
 _ROLES = {"right": "image"}
 """What a topic of a part is taken for before parts are given out, where it is called otherwise."""
-_PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"))
-"""Words that tell the topics of a stereo pair apart: most drivers', RealSense's, and EuRoC's."""
+_PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"),
+          ("image_0", "image_1"), ("image_2", "image_3"), ("rgb_0", "rgb_1"))  # fmt: skip
+"""Words that tell the topics of a stereo pair apart: most drivers', RealSense's, EuRoC's, KITTI's and VSLAM-LAB's."""
 
 
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
@@ -136,7 +170,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         named = [c for c in candidates if c.channel.topic == wanted]
         fitting = sorted((c for c in named if c.role in (_ROLES.get(role, role), also)), key=key)
         if not fitting:
-            raise LogError(_refusal(named, wanted, role, [c.channel.topic for c in found], log))
+            raise LogError(_no_topic(named, wanted, role, [c.channel.topic for c in found], log))
         return fitting[0]
 
     def calibrations(image: Candidate) -> list[Candidate]:
@@ -164,28 +198,63 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         calibration = next(iter(calibrations(image)), None)
         if choice.calibration_file is not None:
             if choice.camera_info:
-                raise LogError(_two("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic"))
+                raise LogError(
+                    _conflict("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic")
+                )
             calibration = right_info = None
         elif choice.camera_info is not None:
             calibration = pick("camera_info", _by_size)
     if choice.odometry_file is not None:
         if choice.odometry:
-            raise LogError(_two("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
+            raise LogError(_conflict("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
         choice = choice.model_copy(update={"odometry": ""})
-    requested = pick("odometry", _by_size, "tf") if choice.odometry is not None else None
+    named = choice.odometry in SOURCES and all(c.channel.topic != choice.odometry for c in candidates)
+    kind = "" if choice.odometry is None else choice.odometry if named else "topic"
+    requested = pick("odometry", _by_size, "tf") if kind == "topic" else None
+    geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
+    sources = _sources(candidates, kind, requested, geometry)
     moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size)
-    sources = [requested] if requested else []
-    if choice.odometry is None:
-        sources = [*sorted((c for c in candidates if c.role == "odometry" and c.count), key=_by_size), *moving[:1]]
+    turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
+    imu = pick("imu", _by_size) if sources and turned else None
     gps = pick("gps", _by_size)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     parts = {
         "image": image, "depth": depth, "camera_info": calibration, "odometry": requested, "gps": gps,
-        "right": right, "right_info": right_info,
+        "right": right, "right_info": right_info, "imu": imu,
     }  # fmt: skip
     found = {name: part.channel for name, part in parts.items() if part is not None}
     tf = tuple(c.channel for c in moving) if not static or any(c.role == "tf" for c in sources) else ()
-    return Selection(**found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf)
+    return Selection(
+        **found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
+    )
+
+
+def _sources(
+    candidates: list[Candidate], kind: str, requested: Candidate | None, geometry: dict[Channel, tuple[float, float]]
+) -> list[Candidate]:
+    """The topics that may be the odometry, with `kind` one of SOURCES, `topic` or empty. Raises LogError where the
+    requested one is speeds of wheels without their measures."""
+    if requested is not None:
+        lacks = GEOMETRY.get(short_type(requested.channel.type))
+        if lacks and requested.channel not in geometry:
+            options = " and ".join(f"--{name.replace('_', '-')}" for name in lacks)
+            raise LogError(f"{requested.channel.topic} is speeds of wheels; they are odometry with {options}, in m.")
+        return [requested]
+    if kind not in ("", "twist"):
+        return []
+    posed = sorted((c for c in candidates if c.role == "odometry" and c.count), key=_by_size)
+    found = [c for c in posed if c.channel in geometry or short_type(c.channel.type) not in GEOMETRY]
+    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size)
+    return [*found, *([] if kind else moving[:1])]
+
+
+def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:
+    """What the velocities of wheels are multiplied by, by the measures in `choice`; None where these are not given."""
+    kind = short_type(c.channel.type)
+    if kind not in GEOMETRY or any(getattr(choice, name) is None for name in GEOMETRY[kind]):
+        return None
+    radius = choice.wheel_radius_m or 1.0
+    return (1.0, 1.0 / (choice.wheelbase_m or 1.0)) if kind != WHEELS else (radius, radius / (choice.track_m or 1.0))
 
 
 def _by_size(c: Candidate) -> tuple:
@@ -224,14 +293,17 @@ def _shared(a: Candidate, b: Candidate) -> int:
     return next((i for i, (p, q) in enumerate(zip(x, y, strict=False)) if p != q), min(len(x), len(y)))
 
 
-def _two(what: str, topic: str, file: Path, option: str) -> str:
+def _conflict(what: str, topic: str, file: Path, option: str) -> str:
     return f"The {what} is either {topic} or {file}. Leave out --{option} or the file."
 
 
-def _refusal(named: list[Candidate], wanted: str, role: str, found: list[str], log: str) -> str:
+def _no_topic(named: list[Candidate], wanted: str, role: str, found: list[str], log: str) -> str:
     what = f"No topic {wanted!r} in {log}." if not named else f"Topic {wanted!r} in {log} is {named[0].channel.type}."
     if not found:
         return f"{what} {_NAMES[role]} topics: none."
     option = role.replace("_", "-")
     near = nearest(wanted, sorted(found), key=lambda topic: topic.strip("/"), cutoff=0.5)
-    return f"{what}{near} {_NAMES[role]} topics: {', '.join(sorted(set(found)))}. Choose one with --{option}-topic."
+    choices = f"{_NAMES[role]} topics: {', '.join(sorted(set(found)))}"
+    if role == "odometry":
+        return f"{what}{near} {choices}. Choose one with --odometry, or a source: {', '.join(SOURCES)}."
+    return f"{what}{near} {choices}. Choose one with --{option}-topic."

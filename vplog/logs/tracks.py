@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Gps, Odometry
+from vplog.data import RECEIVER_SIGMA_M, Gps, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.logs.formats.container import Notes, plural
@@ -19,8 +19,9 @@ from vplog.logs.stamps import Stamps
 from vplog.logs.tf_odometry import are_usable, clean
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.logs.messages.records import FixMessage, PoseMessage
+    from vplog.data import Bools, Floats, Ints
+    from vplog.logs.formats.container import Channel
+    from vplog.logs.messages.records import FixMessage, ImuMessage, PoseMessage
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
@@ -31,26 +32,28 @@ _LARGEST = 1e15
 _NULL_ISLAND_DEG = 1e-6
 """Degrees, 0.1 m: nobody drives that near to (0, 0), which lies in the Atlantic."""
 _HIGHEST_M = 1e5
-"""m; above it is space, so an altitude beyond is damage. As a sigma it lets an altitude say nothing."""
-_PLAIN_M = 3.0
-"""m; horizontal noise of a receiver under an open sky, as `gps.unknown_sigma_m`."""
+"""m; above it is space, so an altitude beyond is damage. As a sigma it gives an altitude no weight."""
 _FASTEST_M_S = 100.0
-"""m/s; what drives, walks or flies low is slower. Faster drives have their own speed as the measure:"""
+"""m/s; ground robots and low flights are slower. Faster drives are measured by their own speed:"""
 _TIMES_USUAL = 10.0
 """times the median speed between fixes, beyond which they jump."""
 
 
 class PoseTrack:
-    """Collects the poses of one odometry topic."""
+    """Collects the poses of one odometry topic, and the velocities beside them."""
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, geometry: tuple[float, float] = (1.0, 1.0)) -> None:
+        """`geometry` is what velocities are multiplied by, linear and angular, where they are those of wheels."""
         self.topic = topic
+        self._geometry = geometry
+        self._twists = array("d")
+        """12 numbers of every pose, as `Poses.twists`; empty where a pose has none."""
         self.stamps = Stamps()
         self._poses = array("d")
         """x y z, x y z w of every pose."""
         self._covariances = array("d")
         """36 numbers of every pose, NaN where it has none."""
-        self._bare = True
+        self._without_covariance = True
         """No pose has a covariance."""
         self._dropped = self._others = 0
         """Poses that are unusable, and those of other bodies than the first."""
@@ -60,9 +63,9 @@ class PoseTrack:
         """The frame that it moves in."""
 
     def add(self, message: PoseMessage, log_ns: int, position: int | None = None) -> None:
-        stamp_ns, frame, child, place, quaternion, covariance = message
-        known = None if covariance is None else np.array(covariance, np.float64)[None]
-        poses = Poses(np.array([stamp_ns]), frame, child, np.array([[*place, *quaternion]]), known)
+        stamp_ns, frame, child, place, quaternion, covariance, twist = message
+        known, moving = (None if one is None else np.array(one, np.float64)[None] for one in (covariance, twist))
+        poses = Poses(np.array([stamp_ns]), frame, child, np.array([[*place, *quaternion]]), known, moving)
         self.add_all(poses, [log_ns], None if position is None else [position])
 
     def add_all(self, poses: Poses, log_ns: list[int], positions: list[int] | None = None) -> None:
@@ -73,21 +76,27 @@ class PoseTrack:
             self._others += len(log_ns)
             return
         usable = are_usable(poses.poses)
+        if poses.twists is not None:
+            usable |= ~poses.poses.any(1)  # drivers that give velocities alone leave the whole pose zero
         self._dropped += int((~usable).sum())
         at = None if positions is None else list(compress(positions, usable))
         self.stamps.extend(poses.stamp_ns[usable].tolist(), list(compress(log_ns, usable)), at)
         self._poses.frombytes(poses.poses[usable].tobytes())
+        if poses.twists is not None:
+            self._twists.frombytes(poses.twists[usable].tobytes())
         known = poses.covariances
-        self._bare &= known is None or not usable.any()
+        self._without_covariance &= known is None or not usable.any()
         self._covariances.frombytes((np.full((len(usable), 36), np.nan) if known is None else known)[usable].tobytes())
 
     def finish(self, notes: Notes) -> Odometry | None:
         """The odometry, or None where no pose is usable."""
-        if self._dropped:
-            notes.add(f"{self.topic}: {plural(self._dropped, 'pose')} out of range or without a rotation dropped.")
+        given = self._given
+        if dropped := self._dropped + int((~given).sum()):
+            notes.add(f"{self.topic}: {plural(dropped, 'pose')} out of range or without a rotation dropped.")
         if self._others:
             notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {self.child} left out.")
         stamp_ns, rows = self.stamps.order(self.topic, notes)
+        stamp_ns, rows = stamp_ns[given[rows]], rows[given[rows]]
         if not len(rows):
             return None
         poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
@@ -99,7 +108,7 @@ class PoseTrack:
             covariance[part] = body_covariance(poses[part], logged[1][rows[part]])
         usable = np.isfinite(covariance).all((1, 2))
         if not usable.any():
-            why = "carries no covariance" if self._bare else "has no usable covariance (zero or invalid)"
+            why = "carries no covariance" if self._without_covariance else "has no usable covariance (zero or invalid)"
             notes.add(f"{self.topic} {why}; its noise is that of the drift model.")
             return Odometry(stamp_ns, poses, None)
         if not usable.all():
@@ -107,9 +116,30 @@ class PoseTrack:
             notes.add(f"{self.topic}: {bad} with zero, negative or not finite values taken as unknown.")
         return Odometry(stamp_ns, poses, covariance)
 
-    def give_places(self) -> None:
+    @property
+    def twists(self) -> Floats | None:
+        """(K, 12) velocities, linear in m/s, then angular in rad/s, and their variances; None where they are no whole,
+        or never change from zero."""
+        found = np.frombuffer(self._twists).reshape(-1, 12)
+        if 7 * len(found) != len(self._poses) or not np.isfinite(found[:, :6]).all() or not found[:, :6].any():
+            return None
+        factors = np.repeat(self._geometry, 3)
+        return found * np.concatenate([factors, factors**2])
+
+    @property
+    def moves(self) -> bool:
+        """Whether the poses change."""
+        poses = np.frombuffer(self._poses).reshape(-1, 7)[self._given]
+        return bool((poses != poses[:1]).any())
+
+    @property
+    def _given(self) -> Bools:
+        """(K,) whether each message sets a pose, which has a quaternion."""
+        return np.asarray(np.frombuffer(self._poses).reshape(-1, 7)[:, 3:].any(1))
+
+    def set_xyz(self) -> None:
         """Give the stamps the position of each pose."""
-        self.stamps.places = np.array(self._poses).reshape(-1, 7)[:, :3]
+        self.stamps.xyz_m = np.array(self._poses).reshape(-1, 7)[:, :3]
 
 
 def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
@@ -128,6 +158,28 @@ def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
     result = (result + np.swapaxes(result, 1, 2)) / 2  # symmetric to the last bit
     result[~usable] = np.nan
     return result
+
+
+class GyroTrack:
+    """Collects the turn rates of an IMU."""
+
+    def __init__(self, channel: Channel | None) -> None:
+        self.topic = channel.topic if channel else ""
+        self.stamps = Stamps()
+        self.frame = ""
+        """Frame of the IMU, by the first message."""
+        self._rates = array("d")
+
+    def add(self, message: ImuMessage, log_ns: int, position: int | None = None) -> None:
+        self.frame = self.frame or message.frame
+        if all(map(math.isfinite, message.gyro)):
+            self.stamps.add(message.stamp_ns, log_ns, position)
+            self._rates.extend(message.gyro)
+
+    def finish(self, notes: Notes) -> tuple[Ints, Floats]:
+        """Increasing stamps (K,) and rates (K, 3) in rad/s about the axes of the IMU's frame."""
+        stamp_ns, rows = self.stamps.order(self.topic, notes)
+        return stamp_ns, np.frombuffer(self._rates).reshape(-1, 3)[rows]
 
 
 class FixTrack:
@@ -151,8 +203,8 @@ class FixTrack:
         self._fixes.append(message)
 
     def finish(self, notes: Notes) -> Gps | None:
-        """The fixes, or None where none is usable. Altitudes are known: where the log has none, those beside stand in,
-        with a variance that lets them say nothing."""
+        """The fixes, or None where none is usable. Missing altitudes are interpolated,
+        with a variance that gives them no weight."""
         for why, count in sorted(self._dropped.items()):
             notes.add(f"{self.topic}: {plural(count, 'message')} without a fix dropped: {why}.")
         stamp_ns, rows = self.stamps.order(self.topic, notes)
@@ -198,7 +250,7 @@ def _without_altitude(covariance: Floats) -> Floats:
     result = np.zeros_like(covariance)
     plane = covariance[:, :2, :2]
     known = np.asarray(np.isfinite(plane).all((1, 2)))
-    result[:, :2, :2] = np.where(known[:, None, None], plane, _PLAIN_M**2 * np.eye(2))
+    result[:, :2, :2] = np.where(known[:, None, None], plane, RECEIVER_SIGMA_M**2 * np.eye(2))
     result[:, 2, 2] = _HIGHEST_M**2
     return result
 

@@ -1,4 +1,4 @@
-"""Uncertainty that all closures of a drive share: calibration and stamps of its camera."""
+"""Systematic errors of a drive's closures: the calibration and the time stamps of its camera."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 class CalibrationSettings(Settings):
-    """How the camera's rotations are held against the odometry's.
+    """How the camera's rotations are compared with the odometry's.
 
-    A focal length that is wrong by a share makes every rotation between two views wrong by the same share, and leaves
-    small residuals: only another sensor can tell. A wrong one is not corrected, but closures then claim less.
+    A relative error of the focal length makes every rotation between two views wrong by the same factor and leaves
+    small residuals, so only another sensor detects it. It is not corrected: it widens the closures' covariance.
     """
 
     pairs: int = Field(default=32, ge=0, le=10_000)
@@ -40,25 +40,26 @@ def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
     """(P, 2) int64 rows (earlier, later) of keyframes that turn by about `angle` within `reach`, spread evenly."""
     count = len(keyframes.stamp_ns)
     later = np.full(count, -1)
-    for apart in range(settings.reach, 0, -1):  # from far to near, so that the nearest is kept
-        if apart < count:
-            turn = se3.angle(se3.between(keyframes.odom_from_body[:-apart], keyframes.odom_from_body[apart:]))
+    for separation in range(settings.reach, 0, -1):  # from far to near, so that the nearest is kept
+        if separation < count:
+            turn = se3.angle(se3.between(keyframes.odom_from_body[:-separation], keyframes.odom_from_body[separation:]))
             fits = np.flatnonzero((turn > settings.angle) & (turn < 2.0 * settings.angle))
-            later[fits] = fits + apart
+            later[fits] = fits + separation
     earlier = np.flatnonzero(later >= 0)
     if len(earlier) > settings.pairs:
         earlier = earlier[np.linspace(0, len(earlier) - 1, settings.pairs).astype(np.int64)]
     return np.column_stack([earlier, later[earlier]]).astype(np.int64)
 
 
-def rotation_share(driven: Floats, observed: Floats, settings: CalibrationSettings) -> float:
-    """By what share the camera's rotations disagree with the odometry's, at least `least_share`.
+def rotation_share(odometry_motion: Floats, image_motion: Floats, settings: CalibrationSettings) -> float:
+    """Relative disagreement of the camera's rotations with the odometry's, at least `least_share`.
 
-    `driven` and `observed` are (P, 4, 4) motions of the body over turning pairs, by odometry and by the images alone.
+    `odometry_motion` and `image_motion` (P, 4, 4) are motions of the body over turning pairs, the latter from images
+    alone.
     """
-    if len(driven) < 8:  # the median of fewer says little
+    if len(odometry_motion) < 8:  # the median of fewer is not robust
         return settings.least_share
-    expected, found = se3.so3_log(driven[:, :3, :3]), se3.so3_log(observed[:, :3, :3])
+    expected, found = se3.so3_log(odometry_motion[:, :3, :3]), se3.so3_log(image_motion[:, :3, :3])
     ratio = (found * expected).sum(axis=1) / (expected**2).sum(axis=1)
     return float(np.clip(abs(np.median(ratio) - 1.0), settings.least_share, settings.most_share))
 

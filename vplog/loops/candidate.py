@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from vplog.loops.landmarks import FeaturesOf
 
 
-_ANY_POSE = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
+_LENIENT = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
 """Metric settings under which a pose is found wherever chance does not explain it."""
 _CHI2_6 = 22.458
 """Mahalanobis^2 of a 6D error that 0.1 % of right pairs exceed: chi-square, 6 degrees of freedom, 99.9 %."""
-_HALVINGS = 20
+_BISECTIONS = 20
 """Bisections of the weight 0..1, to one in a million."""
 
 
@@ -37,8 +37,8 @@ class VerifySettings(Settings):
     """How a proposed closure is checked."""
 
     min_matches: int = Field(default=25, ge=0)
-    """Feature matches below which two images are not looked at further. Of the 20 that must agree in the end a fifth
-    has no landmark, and two images of different places share 16 by chance, seldom 25."""
+    """Feature matches below which a candidate is rejected before its pose is estimated. Of the 20 inliers required a
+    fifth has no landmark, and two images of different places share 16 by chance, seldom 25."""
     matching: MatchSettings = MatchSettings()
     """Which features are taken for the same point."""
     landmarks: LandmarkSettings = LandmarkSettings()
@@ -56,14 +56,17 @@ class VerifySettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What every candidate of a drive is checked with."""
+    """Keyframes, camera, features and settings of a drive, as verification takes them."""
 
     keyframes: Keyframes
     camera: Camera
     features: FeaturesOf
     settings: VerifySettings
-    stereo: bool
-    """Whether depths are those of a stereo pair."""
+
+    @property
+    def stereo(self) -> bool:
+        """Whether depths are those of a stereo pair."""
+        return self.camera.baseline_m is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +108,11 @@ def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[in
         else:
             if landmarks is None:
                 landmarks = _landmarks(earlier, match)
-            rows.append(_check_metric(later, own, mine, found, landmarks, earlier.stereo, settings.metric))
+            rows.append(_check_metric(later, own, (mine, found), landmarks, earlier.stereo, settings.metric))
     return rows
 
 
-def check_back(
+def check_reverse(
     later: Drive, earlier: Drive, query: int, matches: Sequence[int], rows: Sequence[Row], share: float
 ) -> list[Row]:
     """The accepted rows of one query, each fused with its pose in reverse, from the query's own landmarks.
@@ -118,18 +121,18 @@ def check_back(
     """
     landmarks = _landmarks(later, query)
     # the limits have been checked in one direction; in reverse only the pose is compared
-    lenient = later.settings.metric.model_copy(update=_ANY_POSE)
+    lenient = later.settings.metric.model_copy(update=_LENIENT)
     result = []
     for match, row in zip(matches, rows, strict=True):
         if row.pairs is None:
             raise ValueError("only a row with a pose is checked in reverse")
-        mine, found = row.pairs
-        there = None if row.pose.match_from_query is None else se3.inverse(row.pose.match_from_query)
-        back = _check_metric(earlier, earlier.features(match), found, mine, landmarks, later.stereo, lenient, there)
-        if back.landmarks < later.settings.metric.min_inliers:
+        start = None if row.pose.match_from_query is None else se3.inverse(row.pose.match_from_query)
+        theirs, pairs = earlier.features(match), (row.pairs[1], row.pairs[0])
+        reverse = _check_metric(earlier, theirs, pairs, landmarks, later.stereo, lenient, start)
+        if reverse.landmarks < later.settings.metric.min_inliers:
             result.append(row)
         else:
-            result.append(replace(row, pose=_of_both(row.pose, back.pose, share), reverse_inliers=back.pose.inliers))
+            result.append(replace(row, pose=_fuse(row.pose, reverse.pose, share), reverse_inliers=reverse.pose.inliers))
     return result
 
 
@@ -141,16 +144,15 @@ def _landmarks(drive: Drive, row: int) -> Landmarks:
 def _check_metric(
     drive: Drive,
     own: Features,
-    mine: np.ndarray,
-    found: np.ndarray,
+    pairs: tuple[np.ndarray, np.ndarray],
     landmarks: Landmarks,
     stereo: bool,
     metric: MetricSettings,
     start: Floats | None = None,
 ) -> Row:
-    """Features `mine` (K,) of one frame of `drive` against the landmarks of `found` (K,) in the other frame, whose
-    depths, if it has any, are of a stereo pair or not; `start` is a pose to try first."""
-    settings, camera = drive.settings, drive.camera
+    """Features `own` of a frame of `drive`, rows pairs[0] (K,), against the landmarks of rows pairs[1] (K,) of the
+    other frame, whose depths, if it has any, are of a stereo pair or not; `start` is a pose to try first."""
+    settings, camera, (mine, found) = drive.settings, drive.camera, pairs
     rays = undistort.rays(camera, own.points[mine])
     usable = landmarks.known[found] & np.isfinite(rays).all(axis=1)
     matches, count = len(mine), int(usable.sum())
@@ -160,35 +162,27 @@ def _check_metric(
         verdict = Verdict.DEGENERATE_MOTION if still else Verdict.TOO_FEW_LANDMARKS
         return Row(matches, count, Pose(verdict, 0, 0.0))
     depth_m = own.depth_m[mine[usable]].astype(np.float64)
-    pose = verify_metric.solve(
-        landmarks,
-        found[usable],
-        rays[usable],
-        inverse_depth(depth_m, settings.landmarks),
-        own.points[mine[usable]] / [own.width, own.height],
-        camera,
-        settings.landmarks,
-        metric,
-        start,
-    )
+    image_share = own.points[mine[usable]] / [own.width, own.height]
+    observed = rays[usable], inverse_depth(depth_m, settings.landmarks), image_share
+    pose = verify_metric.solve(landmarks, found[usable], *observed, camera, settings.landmarks, metric, start)
     if pose.verdict is not Verdict.ACCEPTED:
         return Row(matches, count, pose)
     scale = ("stereo" if stereo else "depth") if landmarks.from_depth else "odometry"
     return Row(matches, count, pose, scale, (mine.astype(np.int32), found.astype(np.int32)))
 
 
-def _of_both(pose: Pose, back: Pose, share: float) -> Pose:
-    """The pose of the query in the match and that of the match in the query as one, or their disagreement."""
+def _fuse(pose: Pose, reverse: Pose, share: float) -> Pose:
+    """The poses estimated from query to match and in reverse, fused; INCONSISTENT where they disagree."""
     if pose.match_from_query is None or pose.covariance is None:
         raise ValueError("only a row with a pose is checked in reverse")
-    apart = replace(pose, verdict=Verdict.INCONSISTENT, match_from_query=None, covariance=None)
-    if back.match_from_query is None or back.covariance is None:
-        return apart
-    other, covariance = reversed_pose(back.match_from_query, back.covariance)
+    inconsistent = replace(pose, verdict=Verdict.INCONSISTENT, match_from_query=None, covariance=None)
+    if reverse.match_from_query is None or reverse.covariance is None:
+        return inconsistent
+    other, covariance = reversed_pose(reverse.match_from_query, reverse.covariance)
     # a wrong calibration changes the two poses differently, as their depths differ
     wider = pose.covariance + motion_covariance(pose.match_from_query, share)
     if not agree(pose.match_from_query, wider, other, covariance):
-        return apart
+        return inconsistent
     fused, joint = covariance_intersection(pose.match_from_query, pose.covariance, other, covariance)
     return replace(pose, match_from_query=fused, covariance=joint)
 
@@ -208,8 +202,8 @@ def agree(pose: Floats, covariance: Floats, other: Floats, other_covariance: Flo
     They share pixels, whose errors partly cancel in the difference: the sum of the covariances is generous, and what
     fails it is no noise.
     """
-    apart = se3.log(se3.between(pose, other))
-    return bool(apart @ np.linalg.solve(covariance + other_covariance, apart) < _CHI2_6)
+    difference = se3.log(se3.between(pose, other))
+    return bool(difference @ np.linalg.solve(covariance + other_covariance, difference) < _CHI2_6)
 
 
 def covariance_intersection(
@@ -225,7 +219,7 @@ def covariance_intersection(
     # det(w A + (1 - w) B) = det(B) prod(1 + w (r - 1)) over the eigenvalues r of B^-1 A; its log is concave in w
     gain = np.linalg.eigvals(other_covariance @ a).real - 1.0
     low, high = 0.0, 1.0
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         w = (low + high) / 2.0
         low, high = (w, high) if (gain / (1.0 + w * gain)).sum() > 0 else (low, w)
     w = (low + high) / 2.0

@@ -1,4 +1,4 @@
-"""3D landmarks behind the features of one keyframe, with what is known of each: from depth, or from motion.
+"""3D landmarks of the features of one keyframe, with their covariance: from measured depth, or from motion.
 
 A landmark is (x, y, rho): its normalised image coordinates in the keyframe's camera and its inverse depth in 1/m
 (Civera, Davison & Montiel 2008). Inverse depth is close to Gaussian for near and far points alike, and depth sensors
@@ -55,7 +55,7 @@ class LandmarkSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """What is known of the points behind M features of one keyframe."""
+    """3D positions of M features of one keyframe."""
 
     rho: Floats
     """(M,) inverse depth in 1/m along the camera's z, NaN where the feature was found in one view only."""
@@ -83,7 +83,7 @@ def landmarks_of(
     own = features(row).rows(slice(match.features))  # those that matching looks at
     rays = undistort.rays(camera, own.points)
     if np.isfinite(own.depth_m).any():
-        return from_depth(rays, own.depth_m.astype(np.float64), undistort.focal_px(camera), settings)
+        return from_depth(rays, own.depth_m.astype(np.float64), camera, settings)
     first, last = max(row - settings.neighbours, 0), min(row + settings.neighbours + 1, len(keyframes.stamp_ns))
     rows = [other for other in range(first, last) if other != row]
     observed = np.full((len(rows), len(rays), 2), np.nan)
@@ -93,15 +93,15 @@ def landmarks_of(
         observed[view, mine] = undistort.rays(camera, theirs.points[found])
     motion = se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
     views = se3.inverse(camera.body_from_camera) @ motion @ camera.body_from_camera
-    return from_motion(rays, observed, views, undistort.focal_px(camera), settings)
+    return from_motion(rays, observed, views, camera, settings)
 
 
-def from_depth(rays: Floats, depth_m: Floats, focal_px: float, settings: LandmarkSettings) -> Landmarks:
-    """Landmarks of rays (M, 2) with measured depths (M,) in m, NaN unknown."""
+def from_depth(rays: Floats, depth_m: Floats, camera: Camera, settings: LandmarkSettings) -> Landmarks:
+    """Landmarks of rays (M, 2) of the camera with measured depths (M,) in m, NaN unknown."""
     rho, variance = inverse_depth(depth_m, settings)
     rho = np.where(np.isfinite(rays).all(axis=1), rho, np.nan)
     covariance = np.zeros((len(rays), 3, 3))
-    covariance[:, 0, 0] = covariance[:, 1, 1] = (settings.pixel_sigma / focal_px) ** 2
+    covariance[:, :2, :2] = undistort.noise_of_rays(camera, rays, settings.pixel_sigma)
     covariance[:, 2, 2] = variance
     known = rho > settings.certainty * np.sqrt(variance)
     return Landmarks(rho, rays, covariance, known, int(np.isfinite(rho).sum()), from_depth=True)
@@ -120,38 +120,41 @@ def inverse_depth(depth_m: Floats, settings: LandmarkSettings) -> tuple[Floats, 
     return rho, settings.depth_sigma**2 + (settings.depth_share * rho) ** 2
 
 
-def from_motion(
-    rays: Floats, observed: Floats, views: Floats, focal_px: float, settings: LandmarkSettings
-) -> Landmarks:
+def from_motion(rays: Floats, observed: Floats, views: Floats, camera: Camera, settings: LandmarkSettings) -> Landmarks:
     """Landmarks of rays (M, 2), found again at `observed` (V, M, 2), NaN where not, by cameras `views` (V, 4, 4).
 
     `views` are view_from_camera by odometry, which fixes the scale; images refine them, together with the landmarks,
     by a bundle adjustment of the window with the odometry as prior (Triggs et al. 2000, section 6.1: the landmarks are
     eliminated). A landmark's covariance holds the uncertainty of the views.
     """
-    sigma = settings.pixel_sigma / focal_px
-    gate = settings.gate_px / focal_px
+    gate = settings.gate_px
     moved = np.linalg.norm(views[:, :3, 3], axis=1)
     prior = np.zeros((len(views), 6, 6))
     turn, shift = settings.odometry_rotation, settings.odometry_share * moved
     prior[:, [0, 1, 2], [0, 1, 2]] = turn**-2
     prior[:, [3, 4, 5], [3, 4, 5]] = (np.maximum(shift, 1e-6) ** -2)[:, None]  # 1 um: a camera that stood still
     # what odometry may be wrong by moves points by this much more
-    loose = gate + settings.certainty * turn
+    loose = gate + settings.certainty * turn * undistort.focal_px(camera)
     visible = np.isfinite(observed).all(axis=2) & np.isfinite(rays).all(axis=1).reshape(1, -1)
     rho, refined, covariance = np.full(len(rays), np.nan), rays.copy(), np.zeros((len(rays), 3, 3))
     tracked = np.flatnonzero(visible.any(axis=0))
     if len(tracked):
         own, observed, visible = rays[tracked], observed[:, tracked], visible[:, tracked]
+        px_from_ray = undistort.px_from_ray(camera, observed.reshape(-1, 2)).reshape(*observed.shape, 2)
+        own_px = undistort.px_from_ray(camera, own)
+        own_information = np.swapaxes(own_px, 1, 2) @ own_px / settings.pixel_sigma**2
         points = np.column_stack([own, _linear_inverse_depth(own, observed, views, visible)])
-        visible &= _errors(points, observed, views) < loose
+        visible &= _errors(points, observed, views, px_from_ray) < loose
         start = views
         spread = np.zeros((len(own), 3, 3))
         for step in range(settings.iterations):
             if step == settings.iterations - 1:  # the views are refined: now the pixels' own gate
-                visible &= _errors(points, observed, views) < gate
-            points, views, spread = _adjust(points, views, own, observed, visible, sigma, start, prior)
-        visible &= _errors(points, observed, views) < gate
+                visible &= _errors(points, observed, views, px_from_ray) < gate
+            points, views, spread = _adjust(
+                points, views, (own, own_information), (observed, px_from_ray / settings.pixel_sigma), visible,
+                start, prior,
+            )  # fmt: skip
+        visible &= _errors(points, observed, views, px_from_ray) < gate
         found = visible.any(axis=0)
         rho[tracked[found]] = points[found, 2]
         refined[tracked[found]] = points[found, :2]
@@ -163,28 +166,33 @@ def from_motion(
 def _adjust(
     points: Floats,
     views: Floats,
-    rays: Floats,
-    observed: Floats,
+    own: tuple[Floats, Floats],
+    seen: tuple[Floats, Floats],
     visible: np.ndarray,
-    sigma: float,
     start: Floats,
     prior: Floats,
 ) -> tuple[Floats, Floats, Floats]:
-    """One Gauss-Newton step over landmarks and views: both, moved, and the landmarks' covariance (M, 3, 3)."""
-    visible = visible & np.isfinite(_errors(points, observed, views))
+    """One Gauss-Newton step over landmarks and views: both, moved, and the landmarks' covariance (M, 3, 3).
+
+    `own` are the keyframe's rays (M, 2) with their information (M, 2, 2), `seen` those of the views (V, M, 2) with what
+    whitens them (V, M, 2, 2).
+    """
+    (rays, information), (observed, whiten) = own, seen
+    visible = visible & np.isfinite(_errors(points, observed, views, whiten))
     residual, by_point, by_view = _linearise(points, observed, views)
+    whiten = np.where(visible[..., None, None], whiten, 0.0)
     # whitened, and Huber at one sigma: beyond it an error counts linearly
-    error = np.where(visible[..., None], residual, 0.0) / sigma
-    root = np.where(visible, 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0)), 0.0)
-    error, scale = error * root[..., None], (root / sigma)[..., None, None]
-    by_point, by_view = by_point * scale, by_view * scale
+    error = (whiten @ np.where(visible[..., None], residual, 0.0)[..., None])[..., 0]
+    root = 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0))
+    error, whiten = error * root[..., None], whiten * root[..., None, None]
+    by_point, by_view = whiten @ by_point, whiten @ by_view
     by_view_t, by_point_t = np.swapaxes(by_view, 2, 3), np.swapaxes(by_point, 2, 3)
     # the keyframe's own observation holds x and y; a whisper on rho keeps what no view sees invertible
     point_hessian = (by_point_t @ by_point).sum(axis=0)
-    point_hessian[:, [0, 1], [0, 1]] += sigma**-2
+    point_hessian[:, :2, :2] += information
     point_hessian[:, 2, 2] += 1e-6  # m^2, a sigma of 1000 /m: a millimetre of depth
     point_gradient = (by_point_t @ error[..., None])[..., 0].sum(axis=0)
-    point_gradient[:, :2] += (points[:, :2] - rays) / sigma**2
+    point_gradient[:, :2] += (information @ (points[:, :2] - rays)[..., None])[..., 0]
     # to first order the prior's error moves with the view: log(start^-1 view exp(d)) = log(start^-1 view) + d
     size = 6 * len(views)
     view_hessian = np.zeros((size, size))
@@ -232,10 +240,12 @@ def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats,
     return image - observed, by_point, by_view
 
 
-def _errors(points: Floats, observed: Floats, views: Floats) -> Floats:
-    """(V, M) reprojection errors in normalised coordinates; infinite behind a view, NaN where not observed."""
+def _errors(points: Floats, observed: Floats, views: Floats, px_from_ray: Floats) -> Floats:
+    """(V, M) reprojection errors in px, by `px_from_ray` (V, M, 2, 2); infinite behind a view, NaN where not
+    observed."""
     _, image, depth = _project(points, views)
-    return np.where(np.isfinite(depth[..., 0]), np.linalg.norm(image - observed, axis=2), np.inf)
+    error = (px_from_ray @ (image - observed)[..., None])[..., 0]
+    return np.where(np.isfinite(depth[..., 0]), np.linalg.norm(error, axis=2), np.inf)
 
 
 def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, visible: np.ndarray) -> Floats:
@@ -243,6 +253,6 @@ def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, visible
     bearing = np.column_stack([rays, np.ones(len(rays))])
     turned = bearing @ np.swapaxes(views[:, :3, :3], 1, 2)
     translation = views[:, None, :3, 3]
-    slope = np.where(visible[..., None], translation[..., :2] - observed * translation[..., 2:], 0.0)
-    offset = np.where(visible[..., None], observed * turned[..., 2:] - turned[..., :2], 0.0)
-    return (slope * offset).sum(axis=(0, 2)) / np.maximum((slope**2).sum(axis=(0, 2)), 1e-12)
+    a = np.where(visible[..., None], translation[..., :2] - observed * translation[..., 2:], 0.0)
+    b = np.where(visible[..., None], observed * turned[..., 2:] - turned[..., :2], 0.0)
+    return (a * b).sum(axis=(0, 2)) / np.maximum((a**2).sum(axis=(0, 2)), 1e-12)  # of a rho = b

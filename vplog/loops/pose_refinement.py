@@ -1,4 +1,4 @@
-"""The pose that fits matches best, by least squares, and which of them it explains: match after match, compiled.
+"""Least-squares refinement of a relative pose, and the reprojection errors by which its inliers are selected.
 
 A landmark (x, y, rho) of the match's frame, normalised image coordinates and inverse depth in 1/m, is observed by the
 query as another such triple; poses move as match_from_query exp(d), d rotation first.
@@ -20,33 +20,33 @@ _CONVERGED = 1e-3
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def agreement(match_from_query, points, covariance, rays, sigma):
-    """Squared Mahalanobis distance (K,) and length (K,) of the image errors of landmarks (K, 3) with `covariance`
-    (K, 3, 3), observed at (K, 2) with standard deviation `sigma`; NaN behind the query."""
+def agreement(match_from_query, points, covariance, rays, noise):
+    """Squared Mahalanobis distances (K,) of the image errors of landmarks (K, 3), observed at (K, 2) with covariance
+    `noise` (K, 2, 2): with the landmarks' `covariance` (K, 3, 3), and without it. NaN behind the query."""
     K = points.shape[0]
-    squared, length = np.full(K, np.nan), np.full(K, np.nan)
+    squared, alone = np.full(K, np.nan), np.full(K, np.nan)
     rotation, shift = _inverse(match_from_query)
     predicted, by_point, by_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
     for k in range(K):
         if not _predict(rotation, shift, points[k], predicted, by_point, by_pose):
             continue
-        a, b, c = sigma * sigma, 0.0, sigma * sigma
+        a, b, c = noise[k, 0, 0], noise[k, 0, 1], noise[k, 1, 1]
+        x, y = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1]
+        alone[k] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
         for i in range(3):
             for j in range(3):
                 a += by_point[0, i] * covariance[k, i, j] * by_point[0, j]
                 b += by_point[0, i] * covariance[k, i, j] * by_point[1, j]
                 c += by_point[1, i] * covariance[k, i, j] * by_point[1, j]
-        x, y = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1]
         squared[k] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
-        length[k] = math.sqrt(x * x + y * y)
-    return squared, length
+    return squared, alone
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fit(match_from_query, points, covariance, rays, rho, variance, sigma):
+def fit(match_from_query, points, covariance, rays, rho, variance, noise):
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation.
 
-    Landmarks (K, 3) with covariance (K, 3, 3) were observed at (K, 2) with standard deviation `sigma`, and where the
+    Landmarks (K, 3) with covariance (K, 3, 3) were observed at (K, 2) with covariance `noise` (K, 2, 2), and where the
     query measured them too at inverse depths `rho` (K,) with `variance` (K,), NaN elsewhere.
     """
     K = points.shape[0]
@@ -63,11 +63,11 @@ def fit(match_from_query, points, covariance, rays, rho, variance, sigma):
             size = 3 if np.isfinite(rho[k]) else 2
             freedom += size
             if not _predict(rotation, shift, points[k], predicted, by_point, by_pose):
-                continue  # a step took it behind the query: it says nothing
+                continue  # a step took it behind the query
             residual[0], residual[1], residual[2] = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1], 0.0
             if size == 3:
                 residual[2] = predicted[2] - rho[k]
-            _weigh(by_point, covariance[k], sigma * sigma, variance[k], size, weight)
+            _weigh(by_point, covariance[k], noise[k], variance[k], size, weight)
             cost += _add(residual, weight, by_pose, size, gradient, hessian)
         excess = cost / max(freedom - 6.0, 1.0)
         if not _solve(hessian, gradient, step):
@@ -76,14 +76,14 @@ def fit(match_from_query, points, covariance, rays, rho, variance, sigma):
         for p in range(6):
             step[p] = -step[p]
             length -= step[p] * gradient[p]
-        pose = _moved(pose, step)
+        pose = _retract(pose, step)
         if length < _CONVERGED:
             break
     return pose, hessian, excess
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(by_point, covariance, square, variance, size, weight):
+def _weigh(by_point, covariance, noise, variance, size, weight):
     """Write the inverse covariance of a residual: the landmark's through `by_point`, the pixels' and rho's."""
     total = np.empty((3, 3))
     for i in range(size):
@@ -93,8 +93,9 @@ def _weigh(by_point, covariance, square, variance, size, weight):
                 for b in range(3):
                     s += by_point[i, a] * covariance[a, b] * by_point[j, b]
             total[i, j] = s
-    total[0, 0] += square
-    total[1, 1] += square
+    for i in range(2):
+        for j in range(2):
+            total[i, j] += noise[i, j]
     if size == 3:
         total[2, 2] += variance
     _invert(total, size, weight)
@@ -214,15 +215,15 @@ def _solve(hessian, gradient, step):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moved(pose, step):
+def _retract(pose, step):
     """pose exp(step): Rodrigues' formula and the left Jacobian."""
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-5:  # the quotients lose their digits
         a, b, c = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0
     else:
-        half = math.sin(0.5 * angle) / (0.5 * angle)
-        a, b, c = math.sin(angle) / angle, 0.5 * half * half, (angle - math.sin(angle)) / angle**3
+        sinc = math.sin(0.5 * angle) / (0.5 * angle)
+        a, b, c = math.sin(angle) / angle, 0.5 * sinc * sinc, (angle - math.sin(angle)) / angle**3
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     turn, along = np.eye(3), np.eye(3)
     for i in range(3):

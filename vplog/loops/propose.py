@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 class ProposeSettings(Settings):
-    """Which earlier keyframes are worth a look. The gaps count keyframes, whose spacing follows the drive's own scale:
+    """Which earlier keyframes become candidates. The gaps count keyframes, whose spacing follows the drive's own scale:
     a car's is metres, a hand-held camera's centimetres."""
 
     per_query: int = Field(default=10, ge=1)
     """Candidates kept for each keyframe."""
     gap_keyframes: int = Field(default=30, ge=0)
     """A match is at least this many keyframes earlier, but never more than a quarter of the drive: until then much of
-    the view is still the same, and a closure tells odometry nothing new."""
+    the view is still the same, and a closure adds nothing to odometry."""
     gap_steps: float = Field(default=30.0, ge=0)
     """And at least this many times the drive's median keyframe spacing earlier along the path, so that standing still
     makes no closures, however long it takes."""
@@ -83,7 +83,7 @@ def candidate_stops(keyframes: Keyframes, settings: ProposeSettings) -> Ints:
 def propose(rankings: Iterable[tuple[Ranking, Int32s]], settings: ProposeSettings) -> Proposals:
     """Candidates from every keyframe's ranking of the rows below its stop, in order, with the support of each row.
 
-    A ranking holds `settings.ranked` rows, or fewer where no more are worth a look.
+    A ranking holds `settings.ranked` rows, or fewer where no more score above chance.
     """
     found = []
     for ranking, support in rankings:

@@ -11,7 +11,7 @@ from vplog.data import Closures, Verdict
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
-from vplog.loops.candidate import Drive, Row, VerifySettings, check_back, check_queries
+from vplog.loops.candidate import Drive, Row, VerifySettings, check_queries, check_reverse
 from vplog.loops.landmarks import for_stereo
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Drive", "VerifySettings", "calibration_share", "drive_of", "verify_between"]
 _LOG = logging.getLogger(__name__)
-_SUSPICIOUS_SHARE = 0.05
-"""Disagreement of camera and odometry that is worth a word: five times a careful calibration's error."""
+_WARNED_SHARE = 0.05
+"""Relative disagreement of camera and odometry that is warned of: five times a careful calibration's error."""
 
 
 def drive_of(
@@ -31,20 +31,19 @@ def drive_of(
     camera: Camera,
     features: FeaturesOf,
     settings: VerifySettings,
-    baseline_m: float | None = None,
 ) -> Drive:
     """A drive as its candidates are checked.
 
-    `features` gives the features of a keyframe row and is called from any thread. `baseline_m` says that the features'
-    depths are those of a stereo pair with this baseline, whose error is in the disparity. Raises LogError for a
-    calibrated camera with an unknown distortion model.
+    `features` gives the features of a keyframe row and is called from any thread. With a stereo camera their depths are
+    of the pair, whose error is in the disparity. Raises LogError for a calibrated camera with an unknown distortion
+    model.
     """
     if camera.matrix is not None:
         focal_px = undistort.focal_px(camera)  # refuse an unknown lens before the work, not within it
-        if baseline_m is not None:
-            stereo = for_stereo(settings.landmarks, focal_px, baseline_m)
+        if camera.baseline_m is not None:
+            stereo = for_stereo(settings.landmarks, focal_px, camera.baseline_m)
             settings = settings.model_copy(update={"landmarks": stereo})
-    return Drive(keyframes, camera, features, settings, baseline_m is not None)
+    return Drive(keyframes, camera, features, settings)
 
 
 def verify_between(
@@ -52,26 +51,22 @@ def verify_between(
     later: Drive,
     earlier: Drive,
     execution: Execution,
-    share: float | None = None,
+    share: float,
 ) -> Closures:
     """The ledger of proposals whose queries are rows of `later` and whose matches are rows of `earlier`, in order.
 
     Both may be the same drive. Progress counts candidates. They are verified by map frame, whose landmarks are made
     once, and only when some query shares enough features with it; those accepted are then checked in reverse.
-    `share` is the larger `calibration_share` of the two drives, where it is known already.
+    `share` is the larger `calibration_share` of the two drives, 0 without calibration.
     """
     total = len(proposals.query)
-    if share is None:
-        calibrated = total and later.camera.matrix is not None and earlier.camera.matrix is not None
-        drives = [later] if later is earlier else [later, earlier]
-        share = max(calibration_share(drive, execution) for drive in drives) if calibrated else 0.0
 
     def check(group: Ints) -> list[Row]:
         return check_queries(later, earlier, int(proposals.match[group[0]]), proposals.query[group].tolist())
 
-    def back(group: Ints) -> list[Row]:
+    def reverse(group: Ints) -> list[Row]:
         query, matches = int(proposals.query[group[0]]), proposals.match[group].tolist()
-        return check_back(later, earlier, query, matches, [rows[at] for at in group.tolist()], share)
+        return check_reverse(later, earlier, query, matches, [rows[at] for at in group.tolist()], share)
 
     rows: dict[int, Row] = {}
     groups = _by(proposals.match, proposals.query, np.arange(total))
@@ -81,7 +76,7 @@ def verify_between(
     if later.settings.both_ways:
         accepted = np.flatnonzero([rows[at].pairs is not None for at in range(total)])
         groups = _by(proposals.query, proposals.match, accepted)
-        for group, found in zip(groups, list(execution.map(back, groups)), strict=True):
+        for group, found in zip(groups, list(execution.map(reverse, groups)), strict=True):
             rows.update(zip(group.tolist(), found, strict=True))
     return _ledger(proposals, [rows[at] for at in range(total)], later, earlier, share)
 
@@ -93,29 +88,30 @@ def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
 
 
 def calibration_share(drive: Drive, execution: Execution) -> float:
-    """By what share the rotations of a calibrated camera disagree with the odometry's, over turning pairs."""
+    """Relative disagreement of a calibrated camera's rotations with the odometry's, over turning pairs."""
     keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
     pairs = turning_pairs(keyframes, settings)
     turns = execution.map(lambda pair: check_queries(drive, drive, pair[0], pair[1:]), pairs.tolist())
     poses = [row.pose for (row,) in turns]
     good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
     earlier, later = pairs[good].T
-    driven = se3.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
-    observed = np.array(
-        [_of_body(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
+    odometry_motion = se3.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
+    image_motion = np.array(
+        [body_pose(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
     )
-    share = rotation_share(driven, observed, settings)
-    if share > _SUSPICIOUS_SHARE:
+    share = rotation_share(odometry_motion, image_motion, settings)
+    if share > _WARNED_SHARE:
         _LOG.warning(
-            "Camera %r and odometry disagree by %.0f %% about rotations: closures claim less. Check the focal length.",
+            "Camera %r and odometry disagree by %.0f %% on rotations, so closures get a larger covariance. "
+            "Check the focal length.",
             camera.name,
             100.0 * share,
         )
     return share
 
 
-def _of_body(match_from_query: Floats, query: Camera, match: Camera) -> Floats:
-    """The pose of the query's camera in the match's as that of the bodies."""
+def body_pose(match_from_query: Floats, query: Camera, match: Camera) -> Floats:
+    """match_from_query (4, 4) of the bodies, from that of their cameras."""
     return match.body_from_camera @ match_from_query @ se3.inverse(query.body_from_camera)
 
 
@@ -130,7 +126,7 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
         found, covariance = row.pose.match_from_query, row.pose.covariance
         if found is None:
             continue
-        pose[at] = _of_body(found, camera, earlier.camera)
+        pose[at] = body_pose(found, camera, earlier.camera)
         if covariance is not None:
             total = body_from_camera @ (covariance + motion_covariance(found, share)) @ body_from_camera.T
             speeds = twists[0][proposals.match[at]], twists[1][proposals.query[at]]
@@ -149,6 +145,7 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
         match_from_query=pose,
         information=information,
         verdict=[row.pose.verdict for row in rows],
+        p_false=np.full(count, np.nan),
         residual_before=np.full(count, np.nan),
         residual_after=np.full(count, np.nan),
         weight=np.full(count, np.nan),
@@ -161,6 +158,6 @@ def no_closures() -> Closures:
     return Closures(
         query=rows, match=rows, rank=rows, score=shares, support=rows, shared_references=[], shared_overlap=[],
         matches=rows, landmarks=rows, inliers=rows, spread=shares, reverse_inliers=rows, scale=[],
-        match_from_query=np.empty((0, 4, 4)), information=np.empty((0, 6, 6)), verdict=[], residual_before=none,
-        residual_after=none, weight=none,
+        match_from_query=np.empty((0, 4, 4)), information=np.empty((0, 6, 6)), verdict=[], p_false=none,
+        residual_before=none, residual_after=none, weight=none,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Whether two images of an uncalibrated camera agree by epipolar geometry. No pose comes of it."""
+"""Epipolar verification of a candidate without calibration, which estimates no pose."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MODELS = 3
 
 
 class EpipolarSettings(Settings):
-    """When two uncalibrated images are said to show one place."""
+    """When two uncalibrated images are accepted as views of one place."""
 
     min_inliers: int = Field(default=20, ge=8)
     """Matches that must agree; a line is a weak test, so no fewer than for a pose."""
@@ -38,24 +38,24 @@ class EpipolarSettings(Settings):
 
 def solve(query: Float32s, match: Float32s, width: int, height: int, settings: EpipolarSettings) -> Pose:
     """The verdict on matched pixels (K, 2) of two images of `width` x `height` px: at best `no_calibration`."""
-    inlier, by_chance = agreeing(query, match, width, height, settings)
+    inlier, is_chance = epipolar_inliers(query, match, width, height, settings)
     count = int(inlier.sum())
-    if by_chance or count < settings.min_inliers:
+    if is_chance or count < settings.min_inliers:
         return Pose(Verdict.TOO_FEW_INLIERS, count, 0.0)
     spread = float(np.prod(np.ptp(query[inlier] / [width, height], axis=0)))
     verdict = Verdict.NO_CALIBRATION if spread >= settings.min_spread else Verdict.POOR_SPREAD
     return Pose(verdict, count, spread)
 
 
-def agreeing(
+def epipolar_inliers(
     query: Float32s, match: Float32s, width: int, height: int, settings: EpipolarSettings
 ) -> tuple[Bools, bool]:
     """(K,) which matches agree with the epipolar geometry of most, and whether so many may do so by chance."""
     mask = None
     if len(query) > _SAMPLE:
         _, mask = cv2.findFundamentalMat(match, query, cv2.USAC_MAGSAC, settings.max_error_px, 0.99, settings.rounds)
-    agrees = np.zeros(len(query), bool) if mask is None else np.asarray(mask).ravel().astype(bool)
+    inlier = np.zeros(len(query), bool) if mask is None else np.asarray(mask).ravel().astype(bool)
     # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
     share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)
-    alarms = log10_false_alarms(len(query), int(agrees.sum()), _SAMPLE, _MODELS, share)
-    return agrees, alarms > settings.log10_false_alarms
+    alarms = log10_false_alarms(len(query), int(inlier.sum()), _SAMPLE, _MODELS, share)
+    return inlier, alarms > settings.log10_false_alarms

@@ -20,11 +20,13 @@ from vplog.loops import pose_refinement, undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vplog.data import Camera, Floats
     from vplog.loops.landmarks import Landmarks, LandmarkSettings
 
 _SAMPLE = 3
-"""Points that fix a calibrated camera's pose: P3P; one more tells its up to four poses apart."""
+"""Points that determine a calibrated camera's pose: P3P; a fourth selects among its up to four solutions."""
 _MODELS = 4
 """Poses that three points allow: Gao et al. 2003."""
 _CONFIDENCE = 0.99
@@ -32,7 +34,7 @@ _CONFIDENCE = 0.99
 _CHI2_2 = 9.210
 """Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
 _ROUNDS = 8
-"""Most times that the pose and who agrees with it are decided by each other."""
+"""Most rounds of refitting the pose to its inliers and selecting inliers by the pose."""
 _SINGULAR = 1e12
 """Condition of the Hessian beyond which its inverse has no digit left that a sensor could have measured."""
 
@@ -61,7 +63,7 @@ class MetricSettings(Settings):
     53-degree view, and half the depth ahead doubles every size."""
     max_distance_m: float = Field(default=5.0, gt=0)
     """Longest translation in m: a place is as wide as the paper's widest spacing of views (1-5 m, section IV). Beyond
-    it the pose may well be right, but its error grows with the distance, and a nearer keyframe says the same."""
+    it the pose may well be right, but its error grows with the distance, and a nearer keyframe constrains it better."""
     scale_share: float = Field(default=0.02, ge=0)
     """Standard deviation of the translation's length as a share of it, where odometry gave landmarks their scale."""
     systematic_px: float = Field(default=1.0, ge=0)
@@ -103,8 +105,10 @@ def solve(
     focal_px, area_px = undistort.focal_px(camera), float(camera.width * camera.height)
     points = np.column_stack([landmarks.rays[rows], landmarks.rho[rows]])
     bearing = np.column_stack([points[:, :2], np.ones(len(points))])
-    sigma = noise.pixel_sigma / focal_px
-    cloud, near = bearing / points[:, 2:], settings.ransac_px / focal_px
+    by_pixel = undistort.noise_of_rays(camera, observed, noise.pixel_sigma)
+    cloud = bearing / points[:, 2:]
+    # as long in rays as for most matches: what is nearer to the centre of a wide view is sorted out next
+    near = settings.ransac_px / noise.pixel_sigma * float(np.median(np.linalg.det(by_pixel))) ** 0.25
     inlier = np.zeros(len(rows), bool)
     if start is not None:
         inlier = inliers(se3.inverse(start), cloud, observed, near)
@@ -113,23 +117,8 @@ def solve(
         if found is None:
             return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
         start, inlier = se3.inverse(found[0]), found[1]
-    covariance = landmarks.covariance[rows]
-    match_from_query, hessian, excess = start, np.eye(6), 1.0
-    for _ in range(_ROUNDS):  # the pose decides who agrees, those decide the pose; it settles in two or three
-        if inlier.sum() < _SAMPLE + 1:
-            break
-        chosen = (
-            points[inlier],
-            covariance[inlier],
-            observed[inlier],
-            observed_rho[0][inlier],
-            observed_rho[1][inlier],
-        )
-        match_from_query, hessian, excess = pose_refinement.fit(match_from_query, *chosen, sigma)
-        distance, error = pose_refinement.agreement(match_from_query, points, covariance, observed, sigma)
-        before, inlier = inlier, (distance < _CHI2_2) & (error < settings.max_error_px / focal_px)
-        if np.array_equal(inlier, before):
-            break
+    matches = points, landmarks.covariance[rows], observed, *observed_rho, by_pixel
+    match_from_query, hessian, excess, inlier = refit(start, inlier, matches, settings.max_error_px / noise.pixel_sigma)
     count = int(inlier.sum())
     radius = settings.max_error_px
     alarms = log10_false_alarms(len(rows), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
@@ -158,6 +147,24 @@ def solve(
         along = match_from_query[:3, :3].T @ moved * settings.scale_share
         pose_covariance[3:, 3:] += np.outer(along, along)
     return Pose(Verdict.ACCEPTED, count, spread, match_from_query, pose_covariance)
+
+
+def refit(
+    match_from_query: Floats, inlier: np.ndarray, matches: Sequence[Floats], most_sigmas: float
+) -> tuple[Floats, Floats, float, np.ndarray]:
+    """The pose refitted to its inliers (K,) bool, its Hessian, the residual variance over its expectation, and its
+    inliers, which lie within `most_sigmas` of the pixels' noise. `matches` are those of `pose_refinement.fit`."""
+    points, covariance, observed, _, _, by_pixel = matches
+    hessian, excess = np.eye(6), 1.0
+    for _ in range(_ROUNDS):  # refit to the inliers, select inliers by the refit pose; converges in two or three
+        if inlier.sum() < _SAMPLE + 1:
+            break
+        match_from_query, hessian, excess = pose_refinement.fit(match_from_query, *(one[inlier] for one in matches))
+        distance, alone = pose_refinement.agreement(match_from_query, points, covariance, observed, by_pixel)
+        before, inlier = inlier, (distance < _CHI2_2) & (alone < most_sigmas**2)
+        if np.array_equal(inlier, before):
+            break
+    return match_from_query, hessian, excess, inlier
 
 
 def find_pose(points: Floats, rays: Floats, radius: float, rounds: int) -> tuple[Floats, np.ndarray] | None:

@@ -1,1 +1,1 @@
-"""Maps of many drives: data sets that grow drive by drive, and what is asked of them."""
+"""Maps of many drives: storage, search, joining, merging, export and removal."""

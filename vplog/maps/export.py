@@ -10,12 +10,12 @@ import numpy as np
 
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.geo_bounds import earth_as_plain, earth_of_run, inside
+from vplog.maps.geo_bounds import earth_of_run, earth_record, in_box
 from vplog.maps.storage import map_store
-from vplog.maps.storage.contents import left_out, without_damaged
+from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.results import tables
 from vplog.results.geo import on_earth
-from vplog.results.places_map import about_run, names_of, read_places, write_map, write_places
+from vplog.results.places_map import drive_header, names_of, read_places, write_map, write_places
 from vplog.results.run_record import read_single_run
 from vplog.storage.remote_path import local_copy
 
@@ -38,12 +38,12 @@ class _Source:
     """The drives that may be written, each read alone."""
 
     drives: dict[str, dict[str, Any]]
-    """By ID, with its entry in the file's header."""
+    """Entries of the file's header, by ID."""
     earth: Callable[[str], Earth | None]
-    """Where on earth a drive is."""
+    """Georeference of a drive."""
     read: Callable[[str, Callable[[Path], Any], Sequence[str]], Any]
     """Calls a function with a drive's run folder, which has the files of these names."""
-    forget: Callable[[str], None]
+    evict: Callable[[str], None]
     box: Box | None
     kind: str
 
@@ -62,7 +62,7 @@ def export_map(
         raise SettingsError(f"{maps[0]} is a map: export it alone, or put maps together first with `vplog map merge`.")
     if maps:
         with map_store.reading(maps[0]) as store:
-            return without_damaged(store, lambda: _export_drives(store, path, drives, box, kind, execution))
+            return skip_damaged(store, lambda: _export_drives(store, path, drives, box, kind, execution))
     if drives:
         raise SettingsError("--drive chooses among the drives of a map, and what is given are runs. Leave it out.")
     with ExitStack() as stack:
@@ -73,7 +73,7 @@ def export_map(
             return {**write_map(path, folders), "left_out": []}
         run = dict(zip(names_of(folders), folders, strict=True))
         source = _Source(
-            {drive: about_run(folder) for drive, folder in run.items()}, lambda drive: earth_of_run(run[drive]),
+            {drive: drive_header(folder) for drive, folder in run.items()}, lambda drive: earth_of_run(run[drive]),
             lambda drive, of, _: of(run[drive]), lambda _: None, box, kind,
         )  # fmt: skip
         return _write(path, source, execution)
@@ -82,7 +82,7 @@ def export_map(
 def _export_drives(
     store: Store, path: Path, drives: Sequence[str], box: Box | None, kind: str, execution: Execution
 ) -> dict[str, Any]:
-    _, known = map_store.one_library(store)
+    _, known = map_store.common_library(store)
     unknown = [drive for drive in drives if drive not in known and drive not in store.damaged]
     if unknown:
         raise SettingsError(f"{store} has no drive {unknown[0]!r}. Drives: {', '.join(known)}.")
@@ -92,8 +92,8 @@ def _export_drives(
         for drive, record in known.items()
         if drive in drives or not drives
     }
-    source = _Source(chosen, store.earth, store.read, store.forget, box, kind)
-    return {**_write(path, source, execution), "warnings": left_out(store)}
+    source = _Source(chosen, store.earth, store.read, store.evict, box, kind)
+    return {**_write(path, source, execution), "warnings": damage_warnings(store)}
 
 
 def _write(path: Path, source: _Source, execution: Execution) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def _write(path: Path, source: _Source, execution: Execution) -> dict[str, Any]:
             return on_earth(earth, tables.read_keyframes(run / "keyframes.parquet")[1])
 
         where = source.read(drive, points, _PLACES[:1])
-        where = where if box is None else where[inside(where, box)]
+        where = where if box is None else where[in_box(where, box)]
         if len(where):
             written[drive] = earth
             low, high = np.minimum(low, where.min(0)), np.maximum(high, where.max(0))
@@ -120,7 +120,7 @@ def _write(path: Path, source: _Source, execution: Execution) -> dict[str, Any]:
         wanted = "in the box" if box is not None else "to write"
         raise ResultError(f"There is no place {wanted}, so {path} is not written.{nowhere}")
     nowhere = np.empty((0, 4, 4))
-    drives = {drive: {"earth": earth_as_plain(at, nowhere), **source.drives[drive]} for drive, at in written.items()}
+    drives = {drive: {"earth": earth_record(at, nowhere), **source.drives[drive]} for drive, at in written.items()}
     places = _places(source, written, execution)
     return {**write_places(path, drives, places, (low, high) if geo else None), "left_out": unplaced}
 
@@ -134,7 +134,7 @@ def _places(source: _Source, earths: dict[str, Earth], execution: Execution) -> 
             where = on_earth(earths[drive], places.world_from_body)
             places = replace(places, where=where)
             if source.box is not None:
-                places = places.of(np.flatnonzero(inside(where, source.box)))
+                places = places.of(np.flatnonzero(in_box(where, source.box)))
         yield places
-        source.forget(drive)
+        source.evict(drive)
         execution.progress("export", number, len(drives))

@@ -1,4 +1,4 @@
-"""Where on earth the drives of a map are."""
+"""Georeferences of the drives of a map, and boxes in degrees."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 _DECIMALS = 7
-"""Of a degree: a centimetre."""
+"""Decimals of a degree, the last of which is a centimetre."""
 
 
 def earth_of_run(folder: Path) -> Earth | None:
-    """As the solve found it where the run used GPS, else by the fixes that result.mcap keeps; None without three.
+    """The georeference of a run: of its solve where it used GPS, else of the fixes in result.mcap; None without three.
 
     Raises ResultError where a file of the run is damaged.
     """
@@ -41,8 +41,8 @@ def earth_of_run(folder: Path) -> Earth | None:
     return earth_of(trajectory, fixes, known)
 
 
-def earth_as_plain(earth: Earth | None, world_from_body: Floats) -> dict[str, Any] | None:
-    """As drive.json has it; with the bounds of a drive's poses (N, 4, 4), south, west, north, east in degrees."""
+def earth_record(earth: Earth | None, world_from_body: Floats) -> dict[str, Any] | None:
+    """Field `earth` of drive.json, with the bounds of poses (N, 4, 4): south, west, north, east in degrees."""
     if earth is None:
         return None
     record = {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
@@ -50,12 +50,6 @@ def earth_as_plain(earth: Earth | None, world_from_body: Floats) -> dict[str, An
         return record
     where = on_earth(earth, world_from_body)[:, [1, 0]]
     return {**record, "bounds": np.round([*where.min(0), *where.max(0)], _DECIMALS).tolist()}
-
-
-def earth_of_made(folder: Path) -> dict[str, Any] | None:
-    """The field `earth` of drive.json for a finished run folder. Raises ResultError."""
-    earth = earth_of_run(folder)
-    return None if earth is None else earth_as_plain(earth, tables.read_keyframes(folder / "keyframes.parquet")[1])
 
 
 def bounds_of(record: Any) -> list[float] | None:
@@ -69,8 +63,8 @@ def is_finite(value: Any) -> bool:
     return isinstance(value, float | int) and abs(value) <= sys.float_info.max
 
 
-def earth_from_plain(record: Any) -> Earth | None:
-    """The way back; None where the record is none."""
+def earth_from_record(record: Any) -> Earth | None:
+    """Inverse of `earth_record`; None where the record is not one."""
     try:
         origin, enu_from_world = np.array(record["origin"], np.float64), np.array(record["enu_from_world"], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
@@ -80,7 +74,7 @@ def earth_from_plain(record: Any) -> Earth | None:
     return Earth((float(origin[0]), float(origin[1]), float(origin[2])), enu_from_world)
 
 
-def inside(where: Floats, box: Box) -> NDArray[np.bool_]:
+def in_box(where: Floats, box: Box) -> NDArray[np.bool_]:
     """(N,) which of the longitudes and latitudes (N, 2+) in degrees are in the box, its edges included."""
     south, west, north, east = box
     longitude, latitude = where[:, 0], where[:, 1]

@@ -16,11 +16,11 @@ from vplog.data import EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Traje
 from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.loops.verify import no_closures
-from vplog.maps.geo_bounds import earth_as_plain, earth_from_plain
+from vplog.maps.geo_bounds import earth_from_record, earth_record
 from vplog.maps.storage import layout, map_store
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
-from vplog.results.places_map import about_map, read_drives
+from vplog.results.places_map import read_drives, read_places_header
 from vplog.storage.remote_path import original
 
 if TYPE_CHECKING:
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from vplog.maps.storage.map_store import Store
-    from vplog.results.places_map import AboutMap, DrivePlaces
+    from vplog.results.places_map import DrivePlaces, PlacesHeader
 
-ALONE = "places_of"
+PLACES_ONLY = "places_of"
 """Field in drive.json of such a drive: the file that it is from."""
 
 
 def library_of_file(path: Path) -> str:
     """The hash of the library that an exported file's places are described with. Raises ResultError."""
-    return about_map(path).library
+    return read_places_header(path).library
 
 
 def drives_of_file(path: Path) -> dict[str, dict[str, Any]]:
     """drive.json of each drive in an exported file, but for its key, in order. Raises ResultError."""
-    about = about_map(path)
+    about = read_places_header(path)
     return {drive: _record(path, about, drive) for drive in about.drives}
 
 
-def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[str]:
+def import_places_of(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[str]:
     """Put the places of the drives that are `wanted`, by their IDs in the file, into the map under the IDs given; each
     by its ID in the file when it is in. Raises ResultError."""
-    about, kind = about_map(path), _kind(store, path)
+    about, kind = read_places_header(path), _kind(store, path)
     number = 0
     for places in read_drives(path, kind):
         if places.drive not in wanted:
@@ -61,14 +61,14 @@ def take_places(store: Store, path: Path, wanted: dict[str, str]) -> Iterator[st
         made.mkdir()
         record = _record(path, about, places.drive)
         _write_run(made, places, taken, about)
-        earth = earth_as_plain(earth_from_plain(record["earth"]), places.world_from_body)
+        earth = earth_record(earth_from_record(record["earth"]), places.world_from_body)
         record = {**record, "drive": taken, "earth": earth}
         run_record.write_run_json(made / "drive.json", {**record, "key": layout.key_of(record | {"earth": None})})
         map_store.publish(store, taken, made)
         yield places.drive
 
 
-def _record(path: Path, about: AboutMap, drive: str) -> dict[str, Any]:
+def _record(path: Path, about: PlacesHeader, drive: str) -> dict[str, Any]:
     entry = about.drives.get(drive, {})
     inputs, topics = entry.get("inputs"), entry.get("topics")
     return {
@@ -79,7 +79,7 @@ def _record(path: Path, about: AboutMap, drive: str) -> dict[str, Any]:
         "settings": layout.key_of(about.settings),
         "library": about.library,
         "earth": entry.get("earth"),
-        ALONE: path.name,
+        PLACES_ONLY: path.name,
     }
 
 
@@ -100,29 +100,38 @@ def _kind(store: Store, path: Path) -> pa.DataType:
     return pipeline.places.load(store.library(library), Execution()).arrow_type
 
 
-def _write_run(folder: Path, places: DrivePlaces, drive: str, about: AboutMap) -> None:
+def _write_run(folder: Path, places: DrivePlaces, drive: str, about: PlacesHeader) -> None:
     """Write the run folder of a drive of which the places alone are known."""
     stamps, poses = places.stamp_ns, places.world_from_body
     if not np.isfinite(poses).all() or np.any(np.diff(stamps) <= 0):
         raise ResultError(f"{places.source}: {drive} has poses that are not finite, or stamps that do not increase.")
-    header, keyframes = tables.TableMetadata(about.settings, about.library), Keyframes(drive, stamps, poses)
+    account = {
+        "log": f"{_where(places.source)}#{drive}",
+        "library": {"hash": about.library, "from": _where(places.source)},
+        "warnings": [f"Places alone, from {places.source.name}."],
+    }
+    header = tables.TableMetadata(about.settings, about.library)
+    write_places_run(folder, Keyframes(drive, stamps, poses), places.descriptors, header, account)
+
+
+def write_places_run(
+    folder: Path, keyframes: Keyframes, descriptors: pa.Array, header: tables.TableMetadata, account: dict[str, Any]
+) -> dict[str, Any]:
+    """Write the run folder of keyframes and descriptors that can be found again, with neither closures nor edges, and
+    its run.json: `account`, and what all runs have."""
+    stamps, poses = keyframes.stamp_ns, keyframes.odom_from_body
     none, kinds = np.empty(0), list[EdgeKind]()
     rows = none.astype(np.int32)
     graph = PoseGraph(poses, rows, rows, np.empty((0, 4, 4)), np.empty((0, 6, 6)), kinds)
     solution = Solution(poses, none, 0.0, 0.0, 0, True, "Places alone were taken.")
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header)
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, places.descriptors, header)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, descriptors, header)
     tables.write_closures(folder / "closures.parquet", no_closures(), keyframes, header)
     tables.write_edges(folder / "edges.parquet", graph, solution, none, header)
     tables.write_trajectory(
         folder / "trajectory.parquet", Trajectory(stamps, poses), Odometry(stamps, poses, None), header
     )
-    account = {
-        "log": f"{_where(places.source)}#{drive}",
-        "finished": True,
-        "settings": about.settings,
-        "library": {"hash": about.library, "from": _where(places.source)},
-        "counts": {"keyframes": len(stamps), "candidates": 0, "verdicts": {}},
-        "warnings": [f"Places alone, from {places.source.name}."],
-    }
-    run_record.write_run_json(folder / "run.json", account)
+    counts = {"keyframes": len(stamps), "candidates": 0, "verdicts": {}}
+    record = {"finished": True, "settings": header.settings, "counts": counts, **account}
+    run_record.write_run_json(folder / "run.json", record)
+    return record

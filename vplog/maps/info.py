@@ -9,10 +9,10 @@ import pyarrow as pa
 
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
-from vplog.maps.import_places import ALONE
+from vplog.maps.import_places import PLACES_ONLY
 from vplog.maps.joining.joint_record import components_in, replaced_since
 from vplog.maps.storage import layout, map_store
-from vplog.maps.storage.contents import left_out, other_library, without_damaged
+from vplog.maps.storage.contents import damage_warnings, library_mismatch, skip_damaged
 from vplog.maps.storage.damage import damaged_files
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
@@ -36,12 +36,12 @@ def describe_map(root: Path, check: bool = False) -> dict[str, Any]:
     Raises ResultError.
     """
     with map_store.reading(root) as store:
-        found = without_damaged(store, lambda: _describe(store))
+        found = skip_damaged(store, lambda: _describe(store))
         return {**found, "damaged_files": _damaged_files(store) if check else []}
 
 
 def _damaged_files(store: Store) -> list[str]:
-    """A line for each; of a map on an object store every file is held against its manifest as it is fetched."""
+    """A line for each damaged file; on an object store every file is checked against its manifest as it is fetched."""
     folders = sorted(path.parent for path in store.root.glob("runs/drive=*/drive.json"))
     if store.mirror is None:
         lines = [line for folder in folders for line in damaged_files(folder)]
@@ -50,10 +50,10 @@ def _damaged_files(store: Store) -> list[str]:
     wrong = list(store.mirror.damaged.values())
     for drive in list(store.mirror.manifests):
         try:
-            store.whole(drive)
+            store.full_run(drive)
         except ResultError as error:
             wrong.append(str(error))
-        store.forget(drive)
+        store.evict(drive)
     return wrong
 
 
@@ -70,8 +70,8 @@ def _describe(store: Store) -> dict[str, Any]:
     now, other = (layout.key_of(head.settings), layout.code_hash()), []
     for drive, about in abouts.items():
         if about["library"] != head.library:
-            problems.append(other_library(store, drive, about["library"], head.library))
-        if (about.get("settings"), about.get("code")) != now and ALONE not in about:
+            problems.append(library_mismatch(store, drive, about["library"], head.library))
+        if (about.get("settings"), about.get("code")) != now and PLACES_ONLY not in about:
             other.append(about["log"])
     with ThreadPoolExecutor(_READ_AT_ONCE if store.mirror else 1) as pool:
         drives = list(pool.map(lambda drive: _drive(store, drive, abouts[drive]), abouts))
@@ -80,7 +80,7 @@ def _describe(store: Store) -> dict[str, Any]:
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
             f"another version of vplog. `vplog batch` with their logs computes them again; the first is {other[0]}."
         )
-    problems += left_out(store) + _left_behind(store, [*abouts, *store.damaged])
+    problems += damage_warnings(store) + _unused_folders(store, [*abouts, *store.damaged])
     places = sum(one["keyframes"] for one in drives)
     stored = sum(one["descriptor_bytes"] for one in drives)
     library = {}
@@ -159,8 +159,8 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
     return found
 
 
-def _left_behind(store: Store, drives: list[str]) -> list[str]:
-    """Warnings about folders that are of no drive in the map."""
+def _unused_folders(store: Store, drives: list[str]) -> list[str]:
+    """Warnings about folders of drives that the map does not have."""
     if store.mirror is not None:
         return []  # a writer there removes them
     known, root = {map_store.folder_name(drive) for drive in drives}, store.root

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.import_places import ALONE, drives_of_file, library_of_file, take_places
-from vplog.maps.joining.drive_pairs import KEPT
+from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of, library_of_file
+from vplog.maps.joining.drive_pairs import DRIVE_FILES
 from vplog.maps.storage import layout, map_store
-from vplog.maps.storage.contents import left_out
+from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.damage import DamagedDriveError, damaged_files
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
@@ -49,22 +49,27 @@ def merge_maps(
 def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: Sequence[str]) -> dict[str, Any]:
     library = _check_libraries(sources, target)
     _check_chosen(sources, chosen)
-    fate, warnings = list[dict[str, Any]](), list[str]()
+    outcomes, warnings = list[dict[str, Any]](), list[str]()
     with map_store.writing(target) as store:
-        there = _There(store.drives())
+        target_drives = _TargetDrives(store.drives())
         for number, source in enumerate(sources, start=1):
             if source.is_file():
-                fate += _take_file(store, source, there, chosen)
+                outcomes += _merge_places(store, source, target_drives, chosen)
                 continue
             with map_store.reading(source) as other:
-                _, drives = map_store.one_library(other)
-                _take_library(store, other, library)
-                for drive in in_order(drives.keys() & set(chosen) if chosen else drives):
-                    taken = _take(store, other, drives[drive], there, f"{os.getpid()}-{len(fate)}")
-                    fate += [] if taken is None else [taken]
-                    execution.progress(f"merge {number} of {len(sources)}", len(fate), len(fate))
-                warnings += left_out(other)
-        return {"map": str(store), "library": library, "drives": fate, "warnings": left_out(store) + warnings}
+                _, drives = map_store.common_library(other)
+                _copy_library(store, other, library)
+                for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
+                    taken = _merge_drive(store, other, drives[drive], target_drives, f"{os.getpid()}-{len(outcomes)}")
+                    outcomes += [] if taken is None else [taken]
+                    execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
+                warnings += damage_warnings(other)
+        return {
+            "map": str(store),
+            "library": library,
+            "drives": outcomes,
+            "warnings": damage_warnings(store) + warnings,
+        }
 
 
 def _check_libraries(sources: Sequence[Path], target: Path) -> str:
@@ -72,7 +77,7 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
     wanted, whose = None, str(target)
     if (target / "map.json").exists():
         with map_store.reading(target) as store:
-            wanted = map_store.one_library(store)[0] if store.drives() else store.head().library
+            wanted = map_store.common_library(store)[0] if store.drives() else store.head().library
     for source in sources:
         if not source.exists():
             raise ResultError(f"There is neither a map nor an exported file at {source}.")
@@ -81,7 +86,7 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
             again = "Describe its map again (vplog map redescribe), and export that."
         else:
             with map_store.reading(source) as other:
-                found, name = map_store.one_library(other)[0], source
+                found, name = map_store.common_library(other)[0], source
             again = f"Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
         if wanted is None and source.is_file():
             raise LibraryError(
@@ -107,10 +112,10 @@ def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
         with map_store.reading(source) as other:
             known |= other.drives().keys() | other.damaged.keys()
     if unknown := [drive for drive in chosen if drive not in known]:
-        raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(in_order(known))}.")
+        raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(natural_order(known))}.")
 
 
-def _take_library(store: Store, other: Store, library: str) -> None:
+def _copy_library(store: Store, other: Store, library: str) -> None:
     """The library and the settings of the first map are those of a new one."""
     if (store.root / "map.json").exists() and store.head().library is not None:
         return
@@ -123,7 +128,7 @@ def _take_library(store: Store, other: Store, library: str) -> None:
     store.write_head(map_store.Head(library, settings))
 
 
-class _There:
+class _TargetDrives:
     """The drives of the target, and those that come."""
 
     def __init__(self, records: Mapping[str, dict[str, Any]]) -> None:
@@ -134,7 +139,7 @@ class _There:
 
     def add(self, drive: str, record: dict[str, Any]) -> None:
         self._by_content[_content(record)] = drive
-        self._alone[drive] = ALONE in record
+        self._alone[drive] = PLACES_ONLY in record
 
     def same(self, record: dict[str, Any]) -> tuple[str | None, bool]:
         """The drive of this content, and whether places alone are known of it."""
@@ -145,46 +150,48 @@ class _There:
         return layout.free_name(drive, log, self._alone)
 
 
-def _take(store: Store, other: Store, record: dict[str, Any], there: _There, staged: str) -> dict[str, Any] | None:
+def _merge_drive(
+    store: Store, other: Store, record: dict[str, Any], target_drives: _TargetDrives, staged: str
+) -> dict[str, Any] | None:
     """Take one drive; its fate, None where it is damaged. A whole one replaces its places alone."""
     drive = record["drive"]
     entry = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
-    same, alone = there.same(record)
-    if same is not None and (not alone or ALONE in record):
+    same, alone = target_drives.same(record)
+    if same is not None and (not alone or PLACES_ONLY in record):
         return {**entry, "as": same, "state": "there already"}
     try:
-        whole = other.whole(drive)  # of a store, files that have their sha256
+        whole = other.full_run(drive)  # of a store, files that have their sha256
         wrong = damaged_files(whole) if other.mirror is None else []
     except DamagedDriveError as error:
         wrong = [str(error)]
     if wrong:
         other.damaged[drive] = wrong[0]
         return None
-    taken, made = same or there.free_name(drive, record["log"]), store.staging / staged
+    taken, made = same or target_drives.free_name(drive, record["log"]), store.staging / staged
 
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
         try:
             ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-            shutil.copytree(other.whole(drive), made, symlinks=True, copy_function=layout.link, ignore=ignored)
+            shutil.copytree(other.full_run(drive), made, symlinks=True, copy_function=layout.link, ignore=ignored)
         except (OSError, shutil.Error) as error:
             raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
 
     other.read(drive, copied, ())
     if taken != drive:
-        layout.name_keyframes(made / "keyframes.parquet", taken)
+        layout.set_drive_id(made / "keyframes.parquet", taken)
     run_record.write_run_json(made / "drive.json", record if taken == drive else layout.renamed(record, taken))
-    _link_kept(other, drive, store, taken)
+    _link_join_inputs(other, drive, store, taken)
     map_store.publish(store, taken, made)
-    other.forget(drive)
-    there.add(taken, record)
+    other.evict(drive)
+    target_drives.add(taken, record)
     return {**entry, "as": taken, "state": "taken"}
 
 
-def _link_kept(other: Store, drive: str, store: Store, taken: str) -> None:
+def _link_join_inputs(other: Store, drive: str, store: Store, taken: str) -> None:
     """Link what later closures are verified by, so that these need the logs no more than in the source."""
     source, target = (one.root / "joins" / folder_name(name) for one, name in ((other, drive), (store, taken)))
-    for name in KEPT:
+    for name in DRIVE_FILES:
         if (source / name).is_file():
             try:
                 target.mkdir(parents=True, exist_ok=True)
@@ -194,24 +201,26 @@ def _link_kept(other: Store, drive: str, store: Store, taken: str) -> None:
                 raise ResultError(f"Cannot copy {source / name}: {error.strerror or error}.") from None
 
 
-def _take_file(store: Store, source: Path, there: _There, chosen: Sequence[str]) -> list[dict[str, Any]]:
+def _merge_places(
+    store: Store, source: Path, target_drives: _TargetDrives, chosen: Sequence[str]
+) -> list[dict[str, Any]]:
     """Take the places of an exported file; the fate of each drive. More places of a drive replace fewer."""
-    fate, wanted, counts = [], dict[str, str](), places_by_drive(source)
+    outcomes, wanted, counts = [], dict[str, str](), places_by_drive(source)
     for drive, record in drives_of_file(source).items():
         if chosen and drive not in chosen:
             continue
-        same, alone = there.same(record)
+        same, alone = target_drives.same(record)
         more = same is None or (alone and counts.get(drive, 0) > store.rows("descriptors", same))
-        taken = same or there.free_name(drive, drive)
+        taken = same or target_drives.free_name(drive, drive)
         entry = {"from": str(original(source)), "drive": drive, "as": taken, "log": record["log"]}
-        fate.append({**entry, "state": "places taken" if more else "there already"})
+        outcomes.append({**entry, "state": "places taken" if more else "there already"})
         if more:
             wanted[drive] = taken
-            there.add(taken, record)
-    done = set(take_places(store, source, wanted))
+            target_drives.add(taken, record)
+    done = set(import_places_of(store, source, wanted))
     if lost := [drive for drive in wanted if drive not in done]:
         raise ResultError(f"{source} has no place of {lost[0]}, which its header names; export it again.")
-    return fate
+    return outcomes
 
 
 def _content(record: dict[str, Any]) -> str:
@@ -222,8 +231,8 @@ def _content(record: dict[str, Any]) -> str:
     return run_record.canonical_json({name: value for name, value in record.items() if name not in own})
 
 
-def in_order(drives: Iterable[str]) -> list[str]:
-    """As they were numbered: drive, drive-2, drive-10."""
+def natural_order(drives: Iterable[str]) -> list[str]:
+    """IDs in natural order: drive, drive-2, drive-10."""
 
     def numbered(drive: str) -> tuple[str, int]:
         named = re.fullmatch(r"(.+)-(\d{1,9})", drive)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.storage import map_store
-from vplog.maps.storage.contents import left_out
+from vplog.maps.storage.contents import damage_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,7 @@ def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:
             "removed": list(dict.fromkeys(drives)),
             "drives": list(store.drives()),
             "still_joined": _still_joined(store, drives),
-            "warnings": left_out(store),
+            "warnings": damage_warnings(store),
         }
 
 

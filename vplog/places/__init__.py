@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 from pydantic import Field
 
@@ -12,7 +12,10 @@ from vplog.places.bovf import BovfSettings
 from vplog.places.fabmap import FabmapSettings
 from vplog.places.gist import GistSettings
 from vplog.places.hybrid import HybridSettings
+from vplog.places.network_vector import OnnxSettings
+from vplog.places.plugin import PluginSettings
 from vplog.places.thumbnail import ThumbnailSettings
+from vplog.places.vectors import VectorsSettings
 from vplog.places.vlad import VladSettings
 
 PlaceSettings = Annotated[
@@ -22,8 +25,13 @@ PlaceSettings = Annotated[
     | FabmapSettings
     | GistSettings
     | HybridSettings
+    | OnnxSettings
+    | PluginSettings
     | ThumbnailSettings
+    | VectorsSettings
     | VladSettings,
     Field(discriminator="kind"),
 ]
 """Every recogniser, by its `kind`."""
+KINDS: dict[str, Any] = {one.model_fields["kind"].default: one for one in get_args(get_args(PlaceSettings)[0])}
+"""The members of the union by kind."""

@@ -7,7 +7,7 @@ I boxes: each where the features of one window of the image are found again (sec
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numba
 import numpy as np
@@ -37,6 +37,7 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
 
     kind: Literal["bobb_paper"] = "bobb_paper"
     """Name of the recogniser."""
+    l1_range: Literal[1, 2] = 1
     references: int = Field(default=4, ge=1)
     """J: reference images that explain an image."""
     boxes: int = Field(default=4, ge=1)
@@ -78,22 +79,7 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
         return PaperBobbState(self, library, patterns)
 
 
-class _Pattern(NamedTuple):
-    """One reference, ready for discovery: its words, and what `rvp.vote` takes."""
-
-    words: Int32s
-    """(U,) its words, increasing."""
-    posting_start: Int32s
-    posting: Int32s
-    patches: np.ndarray
-    totals: Int32s
-    x_cuts: Int32s
-    y_cuts: Int32s
-    grid_x: Int32s
-    grid_y: Int32s
-
-
-def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> _Pattern:
+def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> rvp.Pattern:
     """Histograms of all patches of all partitions of one reference (Alg. 3 lines 6-9), as postings and totals."""
     first, last = library.start[row], library.start[row + 1]
     starts = library.words.start[first : last + 1]
@@ -105,7 +91,7 @@ def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> _Pa
     rng = np.random.default_rng([settings.seed, 1, row])
     x_cuts, y_cuts = rvp.draw_partitions(width, height, settings.partitions, settings.columns, settings.rows, rng)
     patches = rvp.patches_of(library.points[first:last], x_cuts, y_cuts)
-    return _Pattern(
+    return rvp.Pattern(
         words=words.astype(np.int32),
         posting_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
         posting=owners[order],
@@ -121,7 +107,7 @@ def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> _Pa
 class PaperBobbState(ReferencesState):
     """A library, indexed and partitioned. Shared freely between threads."""
 
-    def __init__(self, settings: PaperBobbSettings, library: lib.Library, patterns: list[_Pattern]) -> None:
+    def __init__(self, settings: PaperBobbSettings, library: lib.Library, patterns: list[rvp.Pattern]) -> None:
         s = self.settings = settings
         self.library, self.references, self.patterns = library, library.references, patterns
         # Alg. 1 line 4 draws windows at random; one draw serves all images, so that no image's noise can change it
@@ -170,10 +156,10 @@ class PaperBobbState(ReferencesState):
         self, words: lib.Words, points: Float32s, size: tuple[int, int], reference: int, window: Floats
     ) -> Floats:
         """(G, G) votes that the features inside a window (x0 y0 x1 y1, shares of the image) give a reference."""
-        vocabulary, *pattern = self.patterns[reference]
+        pattern = self.patterns[reference]
         shares = (points + 0.5) / np.array(size, points.dtype)
         inside = ((shares >= window[:2]) & (shares < window[2:])).all(axis=1)
-        return rvp.vote(*_histogram(words.start, words.values, inside, vocabulary), *pattern)
+        return rvp.vote(*_histogram(words.start, words.values, inside, pattern.words), pattern)
 
     def windows(self, rank: int) -> Floats:
         """(I, 4) windows that are searched on the reference of that rank."""

@@ -94,6 +94,7 @@ class BovfState(ReferencesState):
     vocabulary: Vocabulary
     idf: Float32s
     """(V,)."""
+    arrow_type = _PLACE
 
     @property
     def _most_words(self) -> int:
@@ -105,10 +106,6 @@ class BovfState(ReferencesState):
     def bits(self) -> int:
         """Size of the largest place: as many words as there may be. Images with fewer features take less."""
         return 8 * (_PLACE_BYTES + _WORD_BYTES * self._most_words)
-
-    @property
-    def arrow_type(self) -> pa.DataType:
-        return _PLACE
 
     def describe(self, features: Features) -> WordCounts:
         """WordCounts with their counts; those of all references weigh nothing and are left out."""

@@ -91,8 +91,9 @@ def build_lists(references: Uint16s, weights: Bytes, boxes: Bytes, library_size:
     offset, weight = np.empty(entries, np.uint16), np.empty(entries, np.uint8)
     share, coded = np.empty(entries, np.uint8), np.empty((entries, windows), np.uint8)
     square = np.empty(count, np.uint32)
-    _fill(references, weights, boxes, block, start, offset, weight, share, coded, square)
-    return CodeLists(start, offset, weight, share, coded, square, block)
+    lists = CodeLists(start, offset, weight, share, coded, square, block)
+    _fill(references, weights, boxes, block, lists.parts)
+    return lists
 
 
 def check_lists(lists: CodeLists) -> None:
@@ -111,9 +112,9 @@ class CodeIndex:
 
     def __init__(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
         """`overlap` (256, 256) is the cells that two boxes share."""
-        self._lists, self._overlap, self._pairing = lists, overlap, _PAIRINGS[pairing]
-        self._windows = (0,) * lists.boxes.shape[1]
-        self._whole = int(overlap.max(initial=1)) * sum(self._pairing) * len(self._windows)
+        self._lists, self._overlap, self._windows = lists, overlap, lists.boxes.shape[1]
+        self._comparison = (0,) * self._windows, _PAIRINGS[pairing], lists.block
+        self._whole = int(overlap.max(initial=1)) * sum(_PAIRINGS[pairing]) * self._windows
         self._longest = int(np.diff(lists.start).max(initial=0))
         for part in lists.parts:
             part.flags.writeable = False  # a kernel is compiled once, for lists in memory and for those of a file
@@ -135,8 +136,7 @@ class CodeIndex:
     def scores(self, descriptor: Place, stop: int | None = None) -> Float32s:
         """(stop,) 0..1: mean overlap of the boxes, weighted by the references' weights as unit vectors; 1 is equal."""
         result = np.zeros(self._end(stop), np.float32)
-        query, lists = self._query(descriptor), self._lists
-        _score_all(*query, self._windows, self._pairing, lists.block, *lists.parts, result)
+        _score_all(self._query(descriptor), self._comparison, self._lists.parts, result)
         return result
 
     def query(self, descriptor: Place, k: int, stop: int | None = None) -> Ranking:
@@ -155,11 +155,10 @@ class CodeIndex:
         elsewhere may set. `runs` are the first rows (D,) of drives, rising from 0, and whether each counts."""
         lists = self._lists
         first, last = (0, self.blocks) if blocks is None else blocks
-        last = min(last, -(-self._end(stop) // lists.block))
+        extent = first, min(last, -(-self._end(stop) // lists.block)), self._end(stop)
         rows, score = _find_best(
-            *self._query(descriptor), self._windows, self._pairing, lists.block, *lists.parts, self._longest,
-            first, last, self._end(stop), k, np.float32(least), *runs,
-        )  # fmt: skip
+            self._query(descriptor), self._comparison, lists.parts, self._longest, extent, (k, np.float32(least)), runs
+        )
         order = np.lexsort((rows, -score))
         return Ranking(rows[order], score[order])
 
@@ -172,7 +171,7 @@ class CodeIndex:
         the length of the place's own weights."""
         weights = descriptor.weights.astype(np.int64)
         used = np.flatnonzero(descriptor.references < len(self._lists.start))
-        cells = _cells(self._overlap, descriptor.boxes[used], -(-len(self._windows) // _LANES) * _LANES)
+        cells = _cells(self._overlap, descriptor.boxes[used], -(-self._windows // _LANES) * _LANES)
         scale = np.sqrt(max(int((weights**2).sum()), 1)) * self._whole
         return descriptor.references[used].astype(np.int64), weights[used], cells, cells.view(np.uint64), scale
 
@@ -195,8 +194,9 @@ def _count_entries(references, library_size, block):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(references, weights, boxes, block, start, offset, weight, share, coded, square):
-    """Write the lists: by reference, then by row."""
+def _fill(references, weights, boxes, block, lists):
+    """Write the lists, `CodeLists.parts`: by reference, then by row."""
+    start, offset, weight, share, coded, square = lists
     N, J, windows = boxes.shape
     at = start[:, 0].copy()
     for row in range(N):
@@ -278,11 +278,11 @@ def _entries(start, offset, b, reference, rows):
 
 
 @numba.njit(cache=True, nogil=True)
-def _score_all(
-    references, weights, cells, words, scale, windows, pairing, block,
-    start, offset, weight, share, coded, square, result,
-):  # fmt: skip
-    """Write the scores of the first rows into `result`."""
+def _score_all(query, comparison, lists, result):
+    """Write the scores of the first rows into `result`; `comparison` is windows, pairing and rows of a block."""
+    references, weights, cells, words, scale = query
+    windows, pairing, block = comparison
+    start, offset, weight, _, coded, square = lists
     stop = result.shape[0]
     total = np.zeros(MOST_ROWS, np.int64)  # an offset of a damaged file may be beyond the block
     for b in range((stop + block - 1) // block):
@@ -314,11 +314,14 @@ def _reach(weights, cells, pairing, scale):
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_best(
-    references, weights, cells, words, scale, windows, pairing, block,
-    start, offset, weight, share, coded, square, longest, begin, end, stop, k, floor, runs, counts,
-):  # fmt: skip
+def _find_best(query, comparison, lists, longest, extent, wanted, drives):
     """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach `floor`, in no order."""
+    references, weights, cells, words, scale = query
+    windows, pairing, block = comparison
+    start, offset, weight, share, coded, square = lists
+    begin, end, stop = extent
+    k, floor = wanted
+    runs, counts = drives
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
     reach = _reach(weights, cells, pairing, scale)
     bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores

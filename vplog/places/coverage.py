@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vplog.places.library import Library, Words
 
 STRONGEST = 200
-"""Features of a frame that the choice looks at: a quarter of what describes a place tells who explains whom."""
+"""Features of a frame that the choice is made by: a quarter of what describes a place is enough."""
 _CANDIDATES_A_REFERENCE = 4
 """Candidates a requested reference: neighbours a quarter of the references' distance apart hardly differ."""
 _LEAST_CANDIDATES = 256
@@ -33,21 +33,21 @@ _LEAST_CANDIDATES = 256
 _FRAMES_A_CANDIDATE = 2
 """Frames to be explained for each candidate, so that half of them are no candidates themselves."""
 _NEIGHBOURS = 10
-"""Nearest features looked at for each feature: the default of a library's own words."""
+"""Nearest neighbours of each feature: the default of a library's own words."""
 _MAX_L1 = 0.4
 """L1 distance of two descriptors of unit length that are the same (Tanaka et al. 2014, section III-B)."""
 _ENOUGH = 0.5
 """Share of what a frame's best candidate explains that is enough. By R@1 and ANR on Gardens Point with 20 and 50
 references, half is better than the plain sum of shares, its root, or fixed caps of 4 and 8 %."""
 
-_SHOWN = 200
+_MEASURED_FRAMES = 200
 """Frames that the figure of a run is measured on, evenly along it: one standard error is 3.5 % at most."""
-_FIRST = 48
+_FIRST_FRAMES = 48
 """Frames measured first: one standard error is 7 % at most, and where `POOR` is three away the others do not matter."""
-_MEASURED = 400
+_MEASURED_FEATURES = 400
 """Strongest features of a frame that are translated: half of what describes a place, for half of the time."""
-_BEST = 4
-"""References with most matches that are looked at: the paper's J."""
+_BEST_REFERENCES = 4
+"""References with most matches that are checked: the paper's J."""
 _NEAR = 0.2
 """Two matches are neighbours within this share of the image's sides: a view shifts and scales little across it."""
 _AGREE = 0.03
@@ -94,7 +94,7 @@ def choose_by_coverage(
     most, least = (PAPER_SIZE, LEAST_SIZE) if settings.size is None else (settings.size, settings.size)
     chosen = greedy_cover(found, min(most, len(candidates)))
     if settings.size is None:
-        chosen = chosen[: max(_enough(found, chosen, settings.least_gain), least)]
+        chosen = chosen[: max(_needed_count(found, chosen, settings.least_gain), least)]
     others = np.setdiff1d(np.arange(len(candidates)), chosen)  # where nothing explains more, what is missing, evenly
     chosen = np.concatenate([chosen, others[evenly(len(others), max(least - len(chosen), 0))]])
     return np.sort(frames[candidates[chosen]])
@@ -190,7 +190,7 @@ def _greedy(start, candidate, worth, by_start, by_frame, by_worth, size):
     return chosen
 
 
-def _enough(found: Explanations, chosen: Ints, least_gain: float) -> int:
+def _needed_count(found: Explanations, chosen: Ints, least_gain: float) -> int:
     """Number of the chosen that are needed: the last of them still adds `least_gain` of what is explained."""
     turn = np.full(found.candidates, -1)
     turn[chosen] = np.arange(len(chosen))
@@ -211,11 +211,11 @@ class Coverage:
     """The part of a drive that a library explains."""
 
     explained: float
-    """Share of the frames looked at that are explained, 0..1."""
+    """Share of the measured frames that are explained, 0..1."""
     median: float
     """Median over the frames of the share of features that the best reference explains beyond chance."""
     frames: int
-    """Frames looked at."""
+    """Measured frames."""
 
 
 def measure_coverage(
@@ -228,12 +228,14 @@ def measure_coverage(
 
     def share(row: int) -> float:
         features = features_of(row)
-        words = library.translate(features.descriptors[:_MEASURED])
+        words = library.translate(features.descriptors[:_MEASURED_FEATURES])
         size = features.width, features.height
-        return explained_share(words, features.points[:_MEASURED], size, library, itself.get(int(stamp_ns[row]), -1))
+        return explained_share(
+            words, features.points[:_MEASURED_FEATURES], size, library, itself.get(int(stamp_ns[row]), -1)
+        )
 
-    rows = evenly(len(stamp_ns), _SHOWN)
-    first = evenly(len(rows), _FIRST)
+    rows = evenly(len(stamp_ns), _MEASURED_FRAMES)
+    first = evenly(len(rows), _FIRST_FRAMES)
     shares = np.array(list(execution.map(share, rows[first].tolist())))
     doubt = 3.0 * np.sqrt(POOR * (1.0 - POOR) / max(len(first), 1))
     if abs(float((shares >= EXPLAINED).mean()) - POOR) < doubt:
@@ -260,7 +262,7 @@ def explained_share(
     owner, feature, values = owner[keep], feature[keep], words.values[keep]
     counts = np.bincount(np.unique(owner * len(points) + feature) // len(points), minlength=len(library))
     best = 0.0
-    for reference in np.argsort(-counts, kind="stable")[:_BEST]:
+    for reference in np.argsort(-counts, kind="stable")[:_BEST_REFERENCES]:
         of = owner == reference
         here = (points[feature[of]] + 0.5) / np.array(size)
         there = (library.points[values[of]] + 0.5) / sizes[reference]
@@ -306,13 +308,15 @@ def _arranged(here, there, feature, value, shift):
 def coverage_warning(coverage: Coverage, frames: int, given: bool, size: int) -> str | None:
     """One line on what to do where the library explains too little of a drive of `frames` frames; None where it does.
 
-    `given` says that the library was not made from the drive; `size` is its L.
+    `given`: the library was not made from the drive; `size` is its L.
     """
     if coverage.explained >= POOR:
         return None
-    says = f"The library explains {100 * coverage.explained:.0f} % of the {frames} keyframes, so few returns are found."
+    reason = (
+        f"The library explains {100 * coverage.explained:.0f} % of the {frames} keyframes, so few returns are found."
+    )
     if given:
-        return f"{says} Build one from this drive, or one in the same light: vplog library LOG -o LIB."
+        return f"{reason} Build one from this drive, or one in the same light: vplog library LOG -o LIB."
     if 2 * size <= frames // 2:
-        return f"{says} Take a larger one: --set library.size={2 * size}."
-    return f"{says} The views share too little: more keyframes may help, --set keyframes.distance_m lower."
+        return f"{reason} Take a larger one: --set library.size={2 * size}."
+    return f"{reason} The views share too little: more keyframes may help, --set keyframes.distance_m lower."

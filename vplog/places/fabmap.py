@@ -120,19 +120,12 @@ class FabmapState(ReferencesState):
     """Exponent of the likelihood, 1 for the papers' own."""
     new_place_nats: float
     """Added to the log likelihood of a new place, 0 for the papers' own."""
-
-    @property
-    def _most_words(self) -> int:
-        return min(self.settings.features, len(self.vocabulary))
+    arrow_type = _PLACE
 
     @property
     def bits(self) -> int:
         """Size of the largest place: as many words as there may be. Images with fewer features take less."""
-        return 8 * (_PLACE_BYTES + _WORD_BYTES * self._most_words)
-
-    @property
-    def arrow_type(self) -> pa.DataType:
-        return _PLACE
+        return 8 * (_PLACE_BYTES + _WORD_BYTES * min(self.settings.features, len(self.vocabulary)))
 
     def describe(self, features: Features) -> Words:
         """(K,) uint16: the words present, increasing."""

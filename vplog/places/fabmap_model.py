@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _FIXED_POINT = 2**32
 """Steps of 1 / 2^32 nats: sums of whole numbers are exact, so equal information ties in any order of the sum."""
-_HALF = 0.5
+_JEFFREYS = 0.5
 """Images with and without a word that are added to the counted ones: Jeffreys' prior of a share."""
 _ABSENT, _PRESENT, _AVERAGE = 0, 1, 2
 """States of a word at a place: its one image lacks it, has it, or there is no image."""
@@ -68,7 +68,7 @@ def learn_tree(images: Sequence[NDArray[np.integer]], words: int, independence: 
     parent, both = _span(image_start, values, start, owner, _times_log(len(images)))
     holders = np.diff(start)
     N = len(images)
-    present = (holders + _HALF).astype(np.float64) / (N + 2 * _HALF)
+    present = (holders + _JEFFREYS).astype(np.float64) / (N + 2 * _JEFFREYS)
     parent_holders = np.where(parent < 0, 0, holders[parent])
     counts = np.stack([holders - both, both], axis=1)
     given = (counts + independence * present[:, None]) / (
@@ -176,16 +176,16 @@ class Evidence:
 
     def __call__(self, words: Words, stop: int) -> tuple[Floats, Bools]:
         """(stop,) ln p(Z | L), and whether the place has a word of the image."""
-        model = self._model
-        return _evidence(
-            words, model.tree.parent, model.child_start, model.children, model.table,
-            self._list_start, self._list_place, self._base[:stop],
-        )  # fmt: skip
+        model, lists = self._model, (self._list_start, self._list_place)
+        tree = model.tree.parent, model.child_start, model.children
+        return _evidence(words, tree, model.table, lists, self._base[:stop])
 
 
 @numba.njit(cache=True, nogil=True)
-def _evidence(words, parent, child_start, children, table, list_start, list_place, base):
+def _evidence(words, tree, table, lists, base):
     """(stop,) float64 log likelihood and bool: starts from `base`, a sum per place; `words` increase."""
+    parent, child_start, children = tree
+    list_start, list_place = lists
     V, stop = parent.shape[0], base.shape[0]
     present = np.zeros(V, np.bool_)
     for word in words:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-import numba
 import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
 from vplog.data import THUMBNAIL_SIDE
-from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
+from vplog.places.dense import VectorIndex, VectorState, nearness, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ class GistState(VectorState):
         return np.fft.ifft2(np.fft.fft2(image) * self._low_pass).real.astype(np.float32)
 
     def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(self.matrix(descriptors, np.float32), _nearness)
+        return VectorIndex(self.matrix(descriptors, np.float32), nearness)
 
 
 def _low_pass(side: int) -> Float32s:
@@ -110,16 +109,3 @@ def gabor_filters(side: int, scales: int, orientations: int) -> Float32s:
             turn = (turn + np.pi) % (2 * np.pi) - np.pi
             filters.append(np.exp(-radial - 2 * np.pi * falloff * turn**2))
     return np.array(filters, np.float32)
-
-
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc"})
-def _nearness(vectors, query):
-    """(N,) float32: 1 / (1 + L2 distance) of (N, D) to (D,)."""
-    result = np.zeros(vectors.shape[0], np.float32)
-    for row in range(vectors.shape[0]):
-        total = 0.0
-        for d in range(vectors.shape[1]):
-            difference = np.float64(vectors[row, d]) - np.float64(query[d])
-            total += difference * difference
-        result[row] = 1 / (1 + np.sqrt(total))
-    return result

@@ -109,7 +109,10 @@ class BinaryVlad:
 def _features_of(features: Features, settings: HybridSettings) -> Described:
     """Patches and keypoints of an image, RootSIFT in steps of 1/512."""
     wanted = settings.bobb.model_copy(update={"features": settings.features, "root_sift": True})
-    values, points = map(np.concatenate, zip(keypoints_of(features, wanted), patches_of(features, wanted), strict=True))
+    found, patches = keypoints_of(features, wanted), patches_of(features, wanted)
+    if found[0].shape[1] != patches[0].shape[1]:  # keypoints of a network, of another length than SIFT's and patches'
+        return found
+    values, points = map(np.concatenate, zip(found, patches, strict=True))
     return values, points
 
 

@@ -7,7 +7,7 @@ that are its near neighbours and close enough: several words per feature (sectio
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import faiss
 import numpy as np
@@ -32,7 +32,11 @@ class WordSettings(Settings):
     neighbours: int = Field(default=10, ge=1)
     """Nearest library features looked at for each feature."""
     max_l1: float = Field(default=0.4, ge=0)
-    """Largest L1 distance of two descriptors of unit L1 length (0..2) that are the same word: the paper's check."""
+    """Normalised L1 distance below which two descriptors are the same word: the paper's check."""
+    l1_range: Literal[1, 2] = 2
+    """The largest distance that two descriptors can have: the paper does not say how its distance is normalised. 2: the
+    descriptors have unit L1 length. 1: their distance is a share of the largest as well, so that twice as far is still
+    the same word. The paper's measure, ANR, comes nearer to what it claims with 1 (docs/guides/compare.md)."""
     hnsw_links: int = Field(default=16, ge=2)
     """Links of a node in the HNSW graph (Malkov & Yashunin 2018); recall of the first neighbour .94 at ef 16."""
     hnsw_ef_construction: int = Field(default=40, ge=1)
@@ -135,7 +139,7 @@ def _translate(
         return Words(np.zeros(1, np.int32), np.zeros(0, np.int32))
     none = np.iinfo(np.int64).max
     neighbours = index.search(descriptors.astype(np.float32), settings.neighbours)[1]
-    close = l1_distance(descriptors, library, neighbours) < settings.max_l1
+    close = l1_distance(descriptors, library, neighbours) < settings.max_l1 * 2 / settings.l1_range
     neighbours = np.where(close & (neighbours >= 0), neighbours, none)
     if first is not None:
         own = first + np.arange(len(descriptors))[:, None]

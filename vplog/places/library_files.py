@@ -33,12 +33,28 @@ _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
 
+_MAX_DESCRIPTOR = 4096
+"""Bytes: above those of any local features in use."""
+
+
+def check_descriptors(references: Sequence[Reference], features: Features) -> None:
+    """Raises LibraryError where the library's descriptors have another length than a drive's."""
+    made, own = {one.features.descriptors.shape[1] for one in references}, features.descriptors.shape[1]
+    if made != {own}:
+        raise LibraryError(
+            f"The library's descriptors have {max(made)} bytes and this drive's {own}: they are of other local "
+            "features. Build the library with these settings of features: vplog library."
+        )
+
+
 class RelearnedSettings(Settings):
     """Settings of a recogniser that is saved as its references."""
 
     def load(self, folder: Path, execution: Execution) -> Any:
-        """A library saved by its state. Raises LibraryError where it is damaged or gives another hash."""
-        return relearn(type(self), folder, execution)
+        """A library saved by its state, whose own settings count, but for where files are now. Raises LibraryError
+        where it is damaged or gives another hash."""
+        here = {name: place for name in self.LOCATIONS if (place := getattr(self, name))}
+        return relearn(type(self), folder, execution, lambda own, *rest: own.model_copy(update=here).learn(*rest))
 
 
 class ReferencesState:
@@ -56,7 +72,7 @@ class ReferencesState:
         return references_hash(self.references, self.settings)
 
     def save(self, folder: Path) -> None:
-        save_references(self.references, self.settings, folder)
+        save_references(self.references, self.settings, folder, self.hash)
 
 
 def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:
@@ -82,7 +98,7 @@ def relearn(settings: Any, folder: Path, execution: Execution, learn: Callable[.
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:
     """sha256 over the settings, every feature: what descriptors depend on."""
-    digest = hashlib.sha256(json.dumps(settings.model_dump(mode="json"), sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(settings.identity(), sort_keys=True).encode())
     features = [reference.features for reference in references]
     start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype("<i4")
     digest.update(np.array([(f.width, f.height) for f in features], "<i4").tobytes())
@@ -93,15 +109,8 @@ def references_hash(references: Sequence[Reference], settings: Settings) -> str:
     return digest.hexdigest()
 
 
-_FEATURES = pa.schema(
-    [
-        ("reference", pa.int32()),
-        ("x", pa.float32()),
-        ("y", pa.float32()),
-        ("size", pa.float32()),
-        ("descriptor", pa.binary(128)),
-    ]
-)
+_FEATURES = pa.schema([("reference", pa.int32()), ("x", pa.float32()), ("y", pa.float32()), ("size", pa.float32())])
+"""And `descriptor`, of as many bytes as the features' own."""
 _REFERENCES = pa.schema(
     [
         ("drive", pa.string()),
@@ -113,8 +122,11 @@ _REFERENCES = pa.schema(
 )
 
 
-def save_references(references: Sequence[Reference], settings: Settings, folder: Path) -> None:
-    """Write references.parquet (images as PNG), features.parquet and library.json, the last one last."""
+def save_references(
+    references: Sequence[Reference], settings: Settings, folder: Path, digest: str | None = None
+) -> None:
+    """Write references.parquet (images as PNG), features.parquet and library.json, the last one last; `digest` is the
+    state's hash, where more than references and settings is in it."""
     check_regular(folder, "library.json")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -123,9 +135,11 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         owners = np.repeat(np.arange(len(references), dtype=np.int32), [len(f) for f in features])
         points = np.concatenate([f.points for f in features])
         sizes = np.concatenate([f.sizes for f in features])
-        descriptors = pa.py_buffer(np.ascontiguousarray(np.concatenate([f.descriptors for f in features])))
-        packed = pa.FixedSizeBinaryArray.from_buffers(pa.binary(128), len(owners), [None, descriptors])
-        _write(folder / "features.parquet", _FEATURES, [owners, *points.T, sizes, packed], compression="zstd")
+        descriptors = np.ascontiguousarray(np.concatenate([f.descriptors for f in features]))
+        column = pa.field("descriptor", pa.binary(descriptors.shape[1]))
+        packed = pa.FixedSizeBinaryArray.from_buffers(column.type, len(owners), [None, pa.py_buffer(descriptors)])
+        schema = _FEATURES.append(column)
+        _write(folder / "features.parquet", schema, [owners, *points.T, sizes, packed], compression="zstd")
         images = [cv2.imencode(".png", r.image)[1].tobytes() for r in references]
         entries = [(r.drive, r.stamp_ns, f.width, f.height) for r, f in zip(references, features, strict=True)]
         columns = [*zip(*entries, strict=True), images]
@@ -133,7 +147,7 @@ def save_references(references: Sequence[Reference], settings: Settings, folder:
         record = {
             "format": _FORMAT,
             "vplog": vplog.__version__,
-            "hash": references_hash(references, settings),
+            "hash": digest or references_hash(references, settings),
             "references": len(references),
             "features": len(owners),
             "settings": settings.model_dump(mode="json"),
@@ -189,7 +203,7 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
     ResultError where something in the folder is not its own file."""
     check_regular(folder, "library.json")
     try:
-        features = _table(folder / "features.parquet", _FEATURES)
+        features = _table(folder / "features.parquet", _FEATURES, "descriptor")
         references = _table(folder / "references.parquet", _REFERENCES)
         if any(column.null_count for table in (features, references) for column in table.columns):
             raise LibraryError(f"{folder}: the tables have empty cells; build it again with `vplog library`.")
@@ -206,7 +220,8 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
         )
     points = np.column_stack([features["x"].to_numpy(), features["y"].to_numpy()]).astype(np.float32)
     sizes = features["size"].to_numpy()
-    descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, 128)
+    values = features.schema.field("descriptor").type.byte_width
+    descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, values)
 
     def reference(row: int) -> Reference:
         entry = entries[row]
@@ -229,13 +244,19 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
     return list(execution.map(reference, range(len(entries))))
 
 
-def _table(path: Path, schema: pa.Schema) -> pa.Table:
+def _table(path: Path, schema: pa.Schema, descriptor: str = "") -> pa.Table:
+    """The columns of the schema and, where it is named, one of descriptors."""
     with open_table(path) as file:
         try:
             check_columns(file.schema_arrow, (column.with_nullable(False) for column in schema))
+            if descriptor:
+                kind = file.schema_arrow.field(descriptor).type
+                if not pa.types.is_fixed_size_binary(kind) or not 1 <= kind.byte_width <= _MAX_DESCRIPTOR:
+                    raise ValueError(f"descriptors of type {kind}")
+                schema = schema.append(pa.field(descriptor, kind))
             if file.metadata.num_rows > _MAX_FEATURES:
                 raise ValueError(f"{file.metadata.num_rows} rows")
-        except ValueError as error:
+        except (ValueError, KeyError) as error:
             raise LibraryError(
                 f"{path.parent}: the tables are not those of a library ({error}); build it again with `vplog library`."
             ) from None

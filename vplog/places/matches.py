@@ -198,7 +198,7 @@ def _itself(distance, entry, owner, L):
 def _weigh(distance, entry, owner, L, itself, reach):
     """(feature, library feature, weight) of every match; the weights of a feature share it between its references.
 
-    A feature matched on d references is divided by the root of d: it tells less, as a frequent word does.
+    A feature matched on d references is divided by the root of d, as a frequent word is less distinctive.
     """
     F, K = distance.shape
     feature, library = np.empty(F * K, np.int32), np.empty(F * K, np.int32)

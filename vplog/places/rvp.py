@@ -7,7 +7,7 @@ similarity times the pixels it shares with the cell, which is the per-pixel algo
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -16,6 +16,22 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vplog.data import Floats, Int32s
+
+
+class Pattern(NamedTuple):
+    """One reference, ready for discovery: its words, and the features and patches that have them."""
+
+    words: Int32s
+    """(U,) its words, increasing."""
+    posting_start: Int32s
+    """Features with word u are posting[posting_start[u]:posting_start[u + 1]]."""
+    posting: Int32s
+    patches: NDArray
+    totals: Int32s
+    x_cuts: Int32s
+    y_cuts: Int32s
+    grid_x: Int32s
+    grid_y: Int32s
 
 
 def draw_partitions(width: int, height: int, K: int, M: int, N: int, rng: np.random.Generator) -> tuple[Int32s, Int32s]:
@@ -63,13 +79,14 @@ def patch_totals(patches, words_per_feature, count):
 
 
 @numba.njit(cache=True, nogil=True)
-def vote(H, H_size, posting_start, posting, patches, totals, x_cuts, y_cuts, grid_x, grid_y):
+def vote(H, H_size, pattern):
     """Sum of the voting map V over each cell of the grid (Alg. 3 lines 1-16): (G, G) float64, rows are y.
 
     H (U,) int32 counts of the reference's words in the window, `H_size` the count of all its words, known here or
-    not. Features with the reference's word u are posting[posting_start[u]:posting_start[u + 1]].
+    not; `pattern` is the reference's Pattern.
     The similarity is normalised histogram intersection, sum(min) / sum(max) (Jiang, Meng, Yuan, CVPR 2012).
     """
+    _, posting_start, posting, patches, totals, x_cuts, y_cuts, grid_x, grid_y = pattern
     K, F = patches.shape
     M, N, G = x_cuts.shape[1] - 1, y_cuts.shape[1] - 1, grid_x.shape[0] - 1
     features, weights, bound = _split_words(H, posting_start, posting, F)

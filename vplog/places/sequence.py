@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 _BLOCK = 64
 """Queries worked on at once: enough for every thread, and few enough that memory is that of a few rows."""
-_USUAL_VIEWS = 256
-"""Queries that tell how alike a row is to anything: their mean is then 1/16 of one view's spread off."""
+_MEAN_VIEWS = 256
+"""Queries that a row's mean score is estimated from: its standard error is then 1/16 of one view's spread."""
 _AGREE_ROWS, _AGREE_SHARE = 10, 0.1
 """A view agrees with a row among its ten best, as many as `vplog run` keeps of a query, of few rows the best tenth."""
 
@@ -58,12 +58,17 @@ class SequenceSettings(Settings):
 
     def offsets(self) -> Ints:
         """(V, length) int64: by how many rows each view of the window is off, for each ratio tried."""
-        half = self.length // 2
+        half_window = self.length // 2
         rounding = 1e-9  # 10 x 1.1 must not miss 11
-        ends = range(math.ceil(half * self.slowest - rounding), math.floor(half * self.fastest + rounding) + 1)
-        nearest = round(half * (self.slowest + self.fastest) / 2)
-        views = np.arange(-half, half + 1)
-        lines = [(2 * np.abs(views) * end + half) // max(2 * half, 1) * np.sign(views) for end in ends or [nearest]]
+        ends = range(
+            math.ceil(half_window * self.slowest - rounding), math.floor(half_window * self.fastest + rounding) + 1
+        )
+        nearest = round(half_window * (self.slowest + self.fastest) / 2)
+        views = np.arange(-half_window, half_window + 1)
+        lines = [
+            (2 * np.abs(views) * end + half_window) // max(2 * half_window, 1) * np.sign(views)
+            for end in ends or [nearest]
+        ]
         return np.array(lines, np.int64)
 
 
@@ -86,28 +91,28 @@ def sequence_rows(
     Holds some 64 + length rows at a time. The same bytes for any number of threads.
     """
     stops = np.ascontiguousarray(stops, np.int64)
-    half, offsets, count = settings.length // 2, settings.offsets(), len(stops)
+    half_window, offsets, count = settings.length // 2, settings.offsets(), len(stops)
     width = int(stops.max(initial=0))
-    x = np.zeros((_BLOCK + 2 * half, width), np.float32)
+    x = np.zeros((_BLOCK + 2 * half_window, width), np.float32)
     agrees = np.zeros(x.shape, np.bool_)
 
     with _mapping(threads) as mapped:
-        usual = _usual(row_of_scores, stops, settings.length, mapped)
+        row_means = _row_means(row_of_scores, stops, settings.length, mapped)
 
         def fill(query: int) -> None:
-            row, stop = query - first + half, stops[query]
+            row, stop = query - first + half_window, stops[query]
             if stop:
-                x[row, :stop] = _centred(row_of_scores(query)) - usual[:stop]
-                agrees[row, :stop] = _among_best(x[row, :stop])
+                x[row, :stop] = _centred(row_of_scores(query)) - row_means[:stop]
+                agrees[row, :stop] = _best_mask(x[row, :stop])
 
         def match(query: int) -> tuple[Float32s, Int32s]:
-            return _match(x, agrees, stops, query, query - first + half, offsets)
+            return _match(x, agrees, stops, query, query - first + half_window, offsets)
 
         for first in range(0, count, _BLOCK):  # row half of the buffers is query `first`
             if first:
-                x[: 2 * half], agrees[: 2 * half] = x[_BLOCK:].copy(), agrees[_BLOCK:].copy()
-            filled = first + half if first else 0
-            list(mapped(fill, range(filled, min(first + _BLOCK + half, count))))
+                x[: 2 * half_window], agrees[: 2 * half_window] = x[_BLOCK:].copy(), agrees[_BLOCK:].copy()
+            filled = first + half_window if first else 0
+            list(mapped(fill, range(filled, min(first + _BLOCK + half_window, count))))
             yield from list(mapped(match, range(first, min(first + _BLOCK, count))))
 
 
@@ -140,13 +145,13 @@ def _mapping(threads: int) -> Iterator[Mapping]:
         yield pool.map
 
 
-def _usual(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, mapped: Mapping) -> Float32s:
+def _row_means(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, mapped: Mapping) -> Float32s:
     """(W,) mean score of each row over views spread evenly over the drive.
 
     Shrunk towards 0 as by `length` more views, so that the only return to a row does not cancel itself.
     """
     queries = np.flatnonzero(stops > 0)
-    queries = queries[np.unique(np.linspace(0, len(queries) - 1, min(_USUAL_VIEWS, len(queries))).round().astype(int))]
+    queries = queries[np.unique(np.linspace(0, len(queries) - 1, min(_MEAN_VIEWS, len(queries))).round().astype(int))]
     total, count = np.zeros(stops.max(initial=0)), np.zeros(stops.max(initial=0), np.int64)
     for first in range(0, len(queries), _BLOCK):
         block = queries[first : first + _BLOCK].tolist()
@@ -164,7 +169,7 @@ def _centred(row: Float32s) -> Float32s:
     return (row - row.mean(dtype=np.float64)).astype(np.float32)
 
 
-def _among_best(row: Float32s) -> np.ndarray:
+def _best_mask(row: Float32s) -> np.ndarray:
     """(stop,) bool: the rows that one view by itself would have ranked best."""
     most = min(_AGREE_ROWS, math.ceil(_AGREE_SHARE * len(row)))
     return (row >= np.partition(row, len(row) - most)[len(row) - most]) & (row > 0)
@@ -173,7 +178,7 @@ def _among_best(row: Float32s) -> np.ndarray:
 @numba.njit(cache=True, nogil=True)
 def _match(x, agrees, stops, query, at, offsets):
     """(stop,) float32 scores and (stop,) int32 support of one query, which is row `at` of `x` and `agrees`."""
-    stop, length, half = stops[query], offsets.shape[1], offsets.shape[1] // 2
+    stop, length, half_window = stops[query], offsets.shape[1], offsets.shape[1] // 2
     score = np.full(stop, -np.inf, np.float32)
     line = np.zeros(stop, np.int32)
     root = np.zeros(length + 1, np.float32)
@@ -183,15 +188,15 @@ def _match(x, agrees, stops, query, at, offsets):
         past, ahead = np.zeros(stop, np.float32), np.zeros(stop, np.float32)  # both without the query itself
         past_n, ahead_n = np.zeros(stop, np.int32), np.zeros(stop, np.int32)
         for w in range(length):
-            other = query + w - half
-            if w == half or other < 0 or other >= stops.shape[0]:
+            other = query + w - half_window
+            if w == half_window or other < 0 or other >= stops.shape[0]:
                 continue
             off = offsets[v, w]
             low, high = max(0, -off), min(stop, stops[other] - off)
             if high <= low:
                 continue
-            cells = x[at + w - half, low + off : high + off]
-            if w < half:
+            cells = x[at + w - half_window, low + off : high + off]
+            if w < half_window:
                 past[low:high] += cells
                 past_n[low:high] += 1
             else:
@@ -210,13 +215,13 @@ def _match(x, agrees, stops, query, at, offsets):
 @numba.njit(cache=True, nogil=True)
 def _support(agrees, stops, query, at, offsets, line):
     """(stop,) int32: the other views that agree, along the line chosen for each row."""
-    support, half = np.zeros(len(line), np.int32), offsets.shape[1] // 2
+    support, half_window = np.zeros(len(line), np.int32), offsets.shape[1] // 2
     for w in range(offsets.shape[1]):
-        other = query + w - half
-        if w == half or other < 0 or other >= stops.shape[0]:
+        other = query + w - half_window
+        if w == half_window or other < 0 or other >= stops.shape[0]:
             continue
         for m in range(len(line)):
             cell = m + offsets[line[m], w]
-            if cell >= 0 and cell < stops[other] and agrees[at + w - half, cell]:
+            if cell >= 0 and cell < stops[other] and agrees[at + w - half_window, cell]:
                 support[m] += 1
     return support

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-import numba
 import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
 from vplog.errors import LibraryError
-from vplog.places.dense import VectorIndex, VectorState
+from vplog.places.dense import VectorIndex, VectorState, products, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift, spread_rows
 
@@ -85,7 +84,7 @@ class VladState(VectorState):
         return self.whitening.apply(raw).astype(np.float16)
 
     def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(self.matrix(descriptors, np.float32), _products)
+        return VectorIndex(self.matrix(descriptors, np.float32), products)
 
 
 def aggregate(features: Features, count: int, vocabulary: Vocabulary) -> Float32s:
@@ -100,7 +99,7 @@ def aggregate(features: Features, count: int, vocabulary: Vocabulary) -> Float32
     parts = np.zeros_like(vocabulary.centres)
     parts[words[order[first]]] = np.add.reduceat(difference[order], first)
     parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), np.float32(1e-9))
-    return _unit(parts.reshape(-1))
+    return unit(parts.reshape(-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,21 +129,4 @@ class Whitening:
 
     def apply(self, raw: Float32s) -> Float32s:
         """(D,) of unit length of (V,)."""
-        return _unit(_products(self.projection, raw - self.mean))
-
-
-def _unit(vector: Float32s) -> Float32s:
-    return vector / np.maximum(np.linalg.norm(vector), np.float32(1e-9))
-
-
-# no BLAS: its threads would compete with ours. Between halves, multiples of 2^-24, float64 sums are exact in any order
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc"})
-def _products(vectors, query):
-    """(N,) float32 products of (N, D) and (D,); of unit vectors, their cosines."""
-    result = np.zeros(vectors.shape[0], np.float32)
-    for row in range(vectors.shape[0]):
-        total = 0.0
-        for d in range(vectors.shape[1]):
-            total += np.float64(vectors[row, d]) * np.float64(query[d])
-        result[row] = total
-    return result
+        return unit(products(self.projection, raw - self.mean))

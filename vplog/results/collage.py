@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog.results.report.charts import evenly
+from vplog.results.report.charts import subsampled
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Bytes, Floats
@@ -19,7 +19,7 @@ _AGREES, _OTHER = (111, 224, 53), (61, 77, 255)
 _QUERY, _MATCH = (46, 157, 255), (255, 195, 76)
 """Boxes of either frame: orange and blue, as blue, green, red."""
 _MOST_LINES = 80
-"""Lines of either kind, evenly chosen: more hide so small a picture."""
+"""Lines of either kind, subsampled: more hide so small a picture."""
 _WIDE = 2.0
 """Images wider than this, against their height, are laid one above the other."""
 _GAP_PX = 6
@@ -32,7 +32,7 @@ _TEXT = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Half:
+class FramePanel:
     """One of the two frames."""
 
     image: Bytes
@@ -43,7 +43,7 @@ class Half:
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class ReferencePanel:
     """One reference image."""
 
     image: Bytes
@@ -56,22 +56,22 @@ class Panel:
     """(rows, columns) 0..1, drawn as heat."""
 
 
-def collage(query: Half, match: Half, agrees: Bools, panels: list[Panel]) -> Bytes:
+def collage(query: FramePanel, match: FramePanel, agrees: Bools, panels: list[ReferencePanel]) -> Bytes:
     """(H, W, 3) blue, green, red."""
     height, width = query.image.shape
     stacked = width > _WIDE * height
     offset = np.array([0, height + _GAP_PX]) if stacked else np.array([width + _GAP_PX, 0])
     whole = np.maximum([width, height], offset + match.image.shape[::-1])
     canvas = np.full((whole[1], whole[0], 3), 24, np.uint8)
-    for half, at in ((query, np.zeros(2, np.int64)), (match, offset)):
-        high, wide = half.image.shape
-        canvas[at[1] : at[1] + high, at[0] : at[0] + wide] = half.image[..., None]
+    for panel, at in ((query, np.zeros(2, np.int64)), (match, offset)):
+        high, wide = panel.image.shape
+        canvas[at[1] : at[1] + high, at[0] : at[0] + wide] = panel.image[..., None]
     here, there = (
-        np.round(half.points * half.image.shape[::-1] + at).astype(np.int64)
-        for half, at in ((query, np.zeros(2)), (match, offset))
+        np.round(panel.points * panel.image.shape[::-1] + at).astype(np.int64)
+        for panel, at in ((query, np.zeros(2)), (match, offset))
     )
     for wanted, colour in ((False, _OTHER), (True, _AGREES)):
-        for row in evenly(np.flatnonzero(agrees == wanted), _MOST_LINES).tolist():
+        for row in subsampled(np.flatnonzero(agrees == wanted), _MOST_LINES).tolist():
             cv2.line(canvas, here[row].tolist(), there[row].tolist(), colour, 1, cv2.LINE_AA)
     _write(canvas, query.title, (0, 0))
     _write(canvas, match.title, (int(offset[0]), int(offset[1])))
@@ -81,7 +81,7 @@ def collage(query: Half, match: Half, agrees: Bools, panels: list[Panel]) -> Byt
     return np.vstack([canvas, *rows])
 
 
-def _row(panels: list[Panel], width: int, many: int) -> Bytes:
+def _row(panels: list[ReferencePanel], width: int, many: int) -> Bytes:
     """(h, width, 3): references side by side, in the places for so many."""
     each = (width - (many - 1) * _GAP_PX) // many
     drawn = [_panel(panel, each) for panel in panels]
@@ -92,7 +92,7 @@ def _row(panels: list[Panel], width: int, many: int) -> Bytes:
     return row
 
 
-def _panel(panel: Panel, width: int) -> Bytes:
+def _panel(panel: ReferencePanel, width: int) -> Bytes:
     height = max(1, round(panel.image.shape[0] * width / panel.image.shape[1]))
     grey = cv2.resize(panel.image, (width, height), interpolation=cv2.INTER_AREA)
     image = np.repeat(np.asarray(grey, np.uint8)[..., None], 3, axis=2)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from vplog.results import kept_features, messages, places_map, tables
+from vplog.results import feature_table, landmark_table, localized_table, messages, places_map, tables
 from vplog.results.mcap import TOPICS
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.storage.scratch import replacing
@@ -55,19 +55,26 @@ LAYOUTS: dict[str, list[tuple[str, str, str]]] = {
     "fabmap": [("descriptor", "uint16[]", "Words that are there, increasing.")],
     "vlad": [("descriptor", "float16[D]", "Of unit length; compared by the scalar product.")],
     "gist": [("descriptor", "float16[D]", "Mean energy by scale, orientation, then block, row by row.")],
+    "onnx": [("descriptor", "float16[D]", "The network's vector at unit length; compared by the scalar product.")],
+    "vectors": [("descriptor", "float16[D]", "At unit length, compared by the scalar product; by L2, float32[D].")],
     "thumbnail": [("descriptor", "uint8[2048]", "Patch-normalised pixels, row by row.")],
 }
 """By recogniser: name, type and meaning of the parts of `descriptor`, which become columns of a map. J references
 with I boxes or windows on each, W words of B bits: settings under `places`, which the header of every table holds."""
 _OF_TABLE: dict[str, dict[str, Any]] = {
-    "features": {"file": "MAP/joins/drive=ID/features.parquet", "metadata": kept_features.HEADER},
+    "features": {"file": "MAP/joins/drive=ID/features.parquet", "metadata": feature_table.HEADER},
     "joins": {
         "file": "joins.parquet, MAP/joins/drive=ID/match=ID.parquet, MAP/joint/component=KEY/joins.parquet",
     },
+    "landmarks": {
+        "file": "RUN/landmarks.parquet, MAP/joins/drive=ID/landmarks.parquet",
+        "metadata": landmark_table.HEADER,
+    },
+    "localized": {"file": "named by `vplog localize -o`"},
     "placed": {"file": "named by `vplog map query -o`"},
     "map": {"file": "named by `vplog map export -o`", "metadata": {**_HEADER, **_MAP_HEADER}},
 }
-"""What the contract of a table says otherwise than those of most."""
+"""Fields of the contract of a table that differ from those of most."""
 
 
 def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
@@ -97,7 +104,9 @@ def table_schemas() -> dict[str, pa.Schema]:
         "edges": tables.EDGES,
         "trajectory": tables.TRAJECTORY,
         "placed": tables.PLACED,
-        "features": kept_features.FEATURES,
+        "features": feature_table.FEATURES,
+        "landmarks": landmark_table.LANDMARKS,
+        "localized": localized_table.LOCALIZED,
         "map": pa.schema([*places_map.PLACE, tables.descriptors_schema(pa.binary()).field("descriptor")]),
     }
 
@@ -130,4 +139,4 @@ def _kind(kind: pa.DataType) -> str:
         return f"{_kind(kind.value_type)}[]"
     if pa.types.is_dictionary(kind):
         return _kind(kind.value_type)
-    return {"float": "float32", "double": "float64"}.get(str(kind), str(kind))
+    return {"halffloat": "float16", "float": "float32", "double": "float64"}.get(str(kind), str(kind))

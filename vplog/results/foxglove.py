@@ -47,7 +47,7 @@ _HUES: tuple[Rgba, ...] = (
 )  # fmt: skip
 """One for each window, apart from each other and bright on grey pictures; a tenth window has the first."""
 _DISTORTION = {"plumb_bob": "plumb_bob", "rational_polynomial": "rational_polynomial", "equidistant": "kannala_brandt"}
-"""Our names of distortion models, as Foxglove's schema has them (ROS says equidistant for Kannala and Brandt's)."""
+"""Our names of distortion models, as Foxglove's schema has them (equidistant in ROS is Kannala and Brandt's)."""
 
 
 def parts(poses: Floats) -> list[Part]:

@@ -18,7 +18,7 @@ from vplog.storage.scratch import replacing
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Floats, Int32s, Ints
+    from vplog.data import Bools, Floats, Int32s, Ints
 
 _MOST_BYTES = 1 << 30
 """Largest file read: a million poses with as many edges, at 500 to 770 bytes of each. Arrays take up to 14 times the
@@ -70,14 +70,20 @@ class _Lines:
     ids: list[str] = field(default_factory=list)
     numbers: list[str] = field(default_factory=list)
 
+    def only(self, wanted: Bools) -> _Lines:
+        """Those wanted (L,), without the ids."""
+        rows = np.flatnonzero(wanted).tolist()
+        return _Lines([self.line[row] for row in rows], [], [self.numbers[row] for row in rows])
+
 
 def read_g2o(path: Path) -> GraphFile:
     """The pose graph of a g2o file.
 
     Ids may come in any order, with gaps, up to 2^63 - 1 (GTSAM's symbols are such). Edges between consecutive ids are
     odometry, the first of several; all others are loop closures. Where ids are thinned out, so that fewer than half
-    of the neighbours have consecutive ids, neighbours in order of ids count as consecutive. Poses that only edges
-    name are placed along the edges, odometry first. Information is that of the rotation vector, as GTSAM reads it.
+    of the neighbours have consecutive ids, neighbours in order of ids count as consecutive. Edges from a pose to itself
+    are left out, with a warning. Poses that only edges name are placed along the edges, odometry first. Information is
+    that of the rotation vector, as GTSAM reads it.
 
     Raises GraphError with file and line where that is not a graph of poses.
     """
@@ -99,25 +105,25 @@ def read_g2o(path: Path) -> GraphFile:
     if again is not None:
         before = vertices.line[int(np.argmax(known == known[again]))]
         raise _at(path, vertices.line[again], f"vertex {known[again]} was already given in line {before}")
-    itself = np.flatnonzero(ends[:, 0] == ends[:, 1])
-    if len(itself):
-        raise _at(path, edges.line[itself[0]], f"an edge joins vertex {ends[itself[0], 0]} to itself")
     ids = np.unique(np.concatenate([known, ends.ravel()]))
+    itself = ends[:, 0] == ends[:, 1]
+    warnings = _about_self_edges(edges, ends, itself)
+    edges, ends = edges.only(~itself), ends[~itself]
     a, b = (np.searchsorted(ids, ends[:, side]).astype(np.int32) for side in (0, 1))
 
     places = _numbers(path, vertices, layout.pose)
-    half = _numbers(path, edges, layout.pose + len(layout.axes) * (len(layout.axes) + 1) // 2)
-    measured = _poses(path, edges, half[:, : layout.pose])
+    values = _numbers(path, edges, layout.pose + len(layout.axes) * (len(layout.axes) + 1) // 2)
+    measured = _poses(path, edges, values[:, : layout.pose])
     kind = _kinds(ids, a, b)
     poses, given = np.tile(np.eye(4), (len(ids), 1, 1)), np.zeros(len(ids), bool)
     at = np.searchsorted(ids, known)
     poses[at], given[at] = _poses(path, vertices, places), True
-    warnings = [f"{count} lines of {name} were left out: only poses are solved." for name, count in left_out.items()]
+    warnings += [f"{count} lines of {name} were left out: only poses are solved." for name, count in left_out.items()]
     if not given.all():
         if given.any():
             warnings.append(f"{int((~given).sum())} of {len(ids)} poses have no VERTEX line; edges place them.")
         _place(poses, given, a, b, measured, kind)
-    information = _information(path, edges, half[:, layout.pose :], layout)
+    information = _information(path, edges, values[:, layout.pose :], layout)
     held = 0
     for line, name in fixed:
         if name not in ids:
@@ -128,6 +134,14 @@ def read_g2o(path: Path) -> GraphFile:
             warnings.append(f"{len(fixed)} poses are fixed; only the first, {fixed[0][1]}, is held.")
     graph = PoseGraph(poses, a, b, measured, information, kind, dimension)
     return GraphFile(graph, ids, held, warnings)
+
+
+def _about_self_edges(edges: _Lines, ends: Ints, itself: Bools) -> list[str]:
+    """What to say of the edges (L, 2) that join a pose to `itself` (L,): they do not tell where it is."""
+    if not itself.any():
+        return []
+    line, name = edges.line[int(np.argmax(itself))], ends[itself][0, 0]
+    return [f"{int(itself.sum())} edges of a pose to itself were left out (first: line {line}, vertex {name})."]
 
 
 def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:
@@ -186,9 +200,9 @@ def _ids(path: Path, lines: _Lines, named: int) -> Ints:
     ).reshape(-1, named)
 
 
-def _first(kept: Ints, count: int) -> int | None:
-    """The first of `count` rows that is not among those kept."""
-    missing = np.setdiff1d(np.arange(count), kept)
+def _first(first_rows: Ints, count: int) -> int | None:
+    """The first of `count` rows that is not among these."""
+    missing = np.setdiff1d(np.arange(count), first_rows)
     return int(missing[0]) if len(missing) else None
 
 

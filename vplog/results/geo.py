@@ -1,4 +1,5 @@
-"""The trajectory on the earth: GeoJSON (RFC 7946) and GeoParquet 1.1, both WGS84, longitude before latitude."""
+"""The trajectory on the earth, WGS84: GeoJSON (RFC 7946), GeoParquet 1.1 and KML (OGC 12-007r2), longitude before
+latitude; and in metres of UTM."""
 
 from __future__ import annotations
 
@@ -6,13 +7,14 @@ import json
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow as pa
 
 from vplog.data import Verdict
 from vplog.geometry import se3
-from vplog.geometry.geodesy import geodetic
+from vplog.geometry.geodesy import geodetic, utm, utm_zone
 from vplog.storage.parquet_limits import write_table
 from vplog.storage.scratch import replacing
 
@@ -62,10 +64,40 @@ def write_geojson(path: Path, tree: dict[str, Any]) -> None:
         stream.write((json.dumps(tree, separators=(",", ":"), allow_nan=False) + "\n").encode())
 
 
+def write_kml(path: Path, earth: Earth, world_from_body: Floats, closures: Closures, name: str) -> None:
+    """The lines of `feature_collection`, on the ground: a map's heights are not those of the ellipsoid."""
+    where = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in on_earth(earth, world_from_body).tolist()]
+    kml = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
+    document = ElementTree.SubElement(kml, "Document")
+    rows = np.flatnonzero(closures.of(Verdict.ACCEPTED)).tolist()
+    ends = [(f"closure {row}", [where[closures.match[row]], where[closures.query[row]]]) for row in rows]
+    for title, points in [(name, where), *ends]:
+        mark = ElementTree.SubElement(document, "Placemark")
+        ElementTree.SubElement(mark, "name").text = title
+        line = ElementTree.SubElement(mark, "LineString")
+        ElementTree.SubElement(line, "tessellate").text = "1"
+        ElementTree.SubElement(line, "coordinates").text = " ".join(points)
+    with replacing(path) as stream:
+        stream.write(ElementTree.tostring(kml, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def write_utm(path: Path, trajectory: Trajectory, earth: Earth) -> None:
+    """`stamp_ns,easting_m,northing_m,altitude_m,zone`, every sample in the zone of the first, as `33N`."""
+    where = on_earth(earth, trajectory.world_from_body)
+    zone = utm_zone(*where[0, :2]) if len(where) else 1
+    metres = utm(where[:, 1], where[:, 0], zone)
+    letter = "N" if not len(where) or where[0, 1] >= 0 else "S"
+    with replacing(path) as stream:
+        stream.write(b"stamp_ns,easting_m,northing_m,altitude_m,zone\n")
+        rows = zip(trajectory.stamp_ns.tolist(), metres.tolist(), where[:, 2].tolist(), strict=True)
+        for stamp_ns, (east, north), up in rows:
+            stream.write(f"{stamp_ns},{east:.3f},{north:.3f},{up:.3f},{zone}{letter}\n".encode())
+
+
 def write_geoparquet(path: Path, trajectory: Trajectory, earth: Earth, header: dict[str, str]) -> None:
     """One point with altitude for every sample, as GeoParquet 1.1 (geoparquet.org/releases/v1.1.0).
 
-    `header` is what the run's own tables say of it.
+    `header` is that of the run's own tables.
     """
     where = on_earth(earth, trajectory.world_from_body)
     low, high = (where.min(0), where.max(0)) if len(where) else (np.zeros(3), np.zeros(3))
@@ -84,7 +116,7 @@ def points(where: Floats) -> pa.Array:
 
 
 def geo_header(low: Floats, high: Floats) -> dict[str, str]:
-    """What GeoParquet asks of the header of a table with such points; `low` and `high` (3,) are those of the box."""
+    """The GeoParquet header of a table with such points; `low` and `high` (3,) are those of the box."""
     column = {"encoding": "WKB", "geometry_types": ["Point Z"], "bbox": [*low.tolist(), *high.tolist()]}
     return {"geo": json.dumps({"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}})}
 

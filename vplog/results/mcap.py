@@ -7,19 +7,11 @@ from __future__ import annotations
 
 import heapq
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.GeoJSON_pb2 import GeoJSON
-from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
-from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.writer import CompressionType, Writer
 
 import vplog
@@ -36,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from google.protobuf.message import Message
 
     from vplog.data import Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph
@@ -83,14 +76,14 @@ TOPICS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
+class ReferenceBoxes:
     """Where the parts of one keyframe were found on the reference that explains it best.
 
     All places are shares of an image's sides, x0 y0 x1 y1.
     """
 
     references: Sequence[int]
-    """Those that explain it, best first; the boxes are on the first."""
+    """References that explain it, best first; the boxes are on the first."""
     windows: Floats
     """(I, 4) parts of the keyframe."""
     boxes: Floats
@@ -98,14 +91,15 @@ class Explained:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """What result.mcap shows beside the tables, all of it optional."""
+class McapExtras:
+    """Content of result.mcap beside the tables, all of it optional."""
 
+    camera: Camera | None = None
     image: Callable[[int], bytes] | None = None
     """JPEG of a keyframe by its row."""
     image_size: tuple[int, int] = (0, 0)
     """Width and height in px of these JPEGs."""
-    explained: Callable[[int], Explained | None] | None = None
+    explained: Callable[[int], ReferenceBoxes | None] | None = None
     """By row of the keyframe."""
     references: Mapping[int, bytes] = field(default_factory=dict)
     """JPEG of a reference of the library by its number."""
@@ -114,7 +108,7 @@ class Shown:
     gps: Gps | None = None
     earth: Earth | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
-    """Versions, input hashes: what the file's metadata says beside the settings, as plain values by name."""
+    """Versions, input hashes: metadata of the file beside the settings, as plain values by name."""
 
 
 def camera_topic(camera: Camera) -> str:
@@ -129,36 +123,33 @@ def write_mcap(
     graph: PoseGraph,
     closures: Closures,
     metadata: TableMetadata,
-    camera: Camera | None = None,
-    shown: Shown | None = None,
+    extras: McapExtras = McapExtras(),
 ) -> None:
     """Write the run; `world_from_body` (N, 4, 4) are the solved poses of the keyframes.
 
     Messages are in the order of their log time, which is the stamp of the keyframe or fix they are about; what is
     about the whole drive stands at its start, and the solved path once more at its end.
     """
-    shown = shown or Shown()
     with replacing(path) as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=f"vplog {vplog.__version__}")
         header = {key.removeprefix("vplog."): text for key, text in metadata.record().items()}
-        about = {name: canonical_json(value) for name, value in shown.about.items()}
+        about = {name: canonical_json(value) for name, value in extras.about.items()}
         writer.add_metadata("vplog", {**header, "drive": keyframes.drive, **about})
         if len(keyframes.stamp_ns):
             start_ns = int(keyframes.stamp_ns[0])
-            for number, data in sorted(shown.references.items()):
+            for number, data in sorted(extras.references.items()):
                 writer.add_attachment(start_ns, start_ns, f"reference-{number}.jpg", "image/jpeg", data)
-        channels = _Channels(writer, camera)
-        solved = _solved(keyframes, world_from_body, graph, closures, camera, shown)
-        pictured = _camera_messages(keyframes, closures, camera, shown) if camera is not None else iter(())
-        for stamp_ns, topic, message in heapq.merge(solved, pictured, _fixes(shown), key=lambda timed: timed[0]):
+        channels = _Channels(writer)
+        solved = _solved(keyframes, world_from_body, graph, closures, extras)
+        pictured = _camera_messages(keyframes, closures, extras.camera, extras) if extras.camera else iter(())
+        for stamp_ns, topic, message in heapq.merge(solved, pictured, _fixes(extras), key=lambda timed: timed[0]):
             channels.write(stamp_ns, topic, message)
         writer.finish()
 
 
 def _solved(
-    keyframes: Keyframes, world_from_body: Floats, graph: PoseGraph, closures: Closures, camera: Camera | None,
-    shown: Shown,
+    keyframes: Keyframes, world_from_body: Floats, graph: PoseGraph, closures: Closures, extras: McapExtras
 ) -> Iterator[Timed]:  # fmt: skip
     """Paths, graph, transforms and ledger."""
     loop_closure = loop_closure_class()
@@ -177,11 +168,12 @@ def _solved(
             yield stamp_ns, "/graph", _graph(stamp_ns, world_from_body, graph, closures)
             yield stamp_ns, "/graph/rejected", _rejected(stamp_ns, world_from_body, closures)
             fixed = [(foxglove.RERUN_ROOT, foxglove.MAP, foxglove.AT_REST)]
-            if camera is not None:
-                fixed.append((foxglove.BODY, foxglove.CAMERA, foxglove.parts(camera.body_from_camera[None])[0]))
+            if extras.camera is not None:
+                mount = foxglove.parts(extras.camera.body_from_camera[None])[0]
+                fixed.append((foxglove.BODY, foxglove.CAMERA, mount))
             yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
-            if shown.earth is not None:
-                tree = geo.feature_collection(shown.earth, world_from_body, keyframes.stamp_ns, closures)
+            if extras.earth is not None:
+                tree = geo.feature_collection(extras.earth, world_from_body, keyframes.stamp_ns, closures)
                 yield stamp_ns, EARTH, foxglove.geojson(tree)
         yield stamp_ns, "/tf", foxglove.transforms(stamp_ns, [(foxglove.MAP, foxglove.BODY, bodies[node])])
         for row in rows[first_row[node] : first_row[node + 1]].tolist():
@@ -191,89 +183,81 @@ def _solved(
             yield stamp_ns, "/path/optimised", foxglove.path(stamp_ns, bodies)
 
 
-def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, shown: Shown) -> Iterator[Timed]:
+def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, extras: McapExtras) -> Iterator[Timed]:
     """The camera's pictures with what was found in them, at their exact stamps, and the pictures of closures."""
-    topic, size = camera_topic(camera), shown.image_size
-    if shown.image is None:
+    topic, size = camera_topic(camera), extras.image_size
+    if extras.image is None:
         size = camera.width, camera.height  # annotations then are drawn on the log's own images
-    sizes = {number: image_size(data) or (0, 0) for number, data in shown.references.items()}
-    pictures = sorted(shown.pictures, key=lambda row: (int(closures.query[row]), row))
+    sizes = {number: image_size(data) or (0, 0) for number, data in extras.references.items()}
+    pictures = sorted(extras.pictures, key=lambda row: (int(closures.query[row]), row))
     for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
-        if shown.image is not None or shown.explained is not None:
+        if extras.image is not None or extras.explained is not None:
             yield stamp_ns, f"{topic}/calibration", foxglove.calibration(stamp_ns, camera, size)
-        if shown.image is not None:
-            yield stamp_ns, f"{topic}/image", foxglove.image(stamp_ns, foxglove.CAMERA, shown.image(node))
-        found = shown.explained(node) if shown.explained is not None else None
+        if extras.image is not None:
+            yield stamp_ns, f"{topic}/image", foxglove.image(stamp_ns, foxglove.CAMERA, extras.image(node))
+        found = extras.explained(node) if extras.explained is not None else None
         if found is not None and len(found.references):
             first = int(found.references[0])
             title = f"explained by {', '.join(f'reference {number}' for number in found.references[:3])}"
             windows = np.where(np.isfinite(found.boxes), found.windows, np.nan)
             yield stamp_ns, f"{topic}/annotations", foxglove.boxes(stamp_ns, windows, size, title)
             if first in sizes:
-                data = foxglove.image(stamp_ns, f"reference_{first}", shown.references[first])
+                data = foxglove.image(stamp_ns, f"reference_{first}", extras.references[first])
                 yield stamp_ns, REFERENCE, data
                 named = foxglove.boxes(stamp_ns, found.boxes, sizes[first], f"reference {first}")
                 yield stamp_ns, "/reference/annotations", named
         while pictures and int(closures.query[pictures[0]]) == node:
             row = pictures.pop(0)
-            yield stamp_ns, PICTURES, foxglove.image(stamp_ns, f"closure_{row}", shown.pictures[row])
+            yield stamp_ns, PICTURES, foxglove.image(stamp_ns, f"closure_{row}", extras.pictures[row])
 
 
-def _fixes(shown: Shown) -> Iterator[Timed]:
-    if shown.gps is not None:
-        for row, stamp_ns in enumerate(shown.gps.stamp_ns.tolist()):
-            yield stamp_ns, FIXES, foxglove.fix(shown.gps, row)
+def _fixes(extras: McapExtras) -> Iterator[Timed]:
+    if extras.gps is not None:
+        for row, stamp_ns in enumerate(extras.gps.stamp_ns.tolist()):
+            yield stamp_ns, FIXES, foxglove.fix(extras.gps, row)
 
 
 class _Channels:
     """The topics of the file, each with the schema of its messages, from its first message on."""
 
-    def __init__(self, writer: Writer, camera: Camera | None) -> None:
+    def __init__(self, writer: Writer) -> None:
         self._writer = writer
-        known = (
-            *(CameraCalibration, CompressedImage, FrameTransforms, GeoJSON, ImageAnnotations, LocationFix, PointCloud),
-            *(PosesInFrame, SceneUpdate, loop_closure_class()),
-        )
-        classes: dict[str, type[Message]] = {message.DESCRIPTOR.full_name: message for message in known}
-        name = _CAMERA if camera is None else camera_topic(camera)
-        self._classes = {topic.replace(_CAMERA, name): classes[kind] for topic, (kind, _) in TOPICS.items()}
         self._schemas: dict[str, int] = {}
         self._ids: dict[str, int] = {}
-        self._sequence = dict.fromkeys(self._classes, 0)
+        self._sequence: Counter[str] = Counter()
 
     def write(self, stamp_ns: int, topic: str, message: Message) -> None:
         if topic not in self._ids:
-            kind = self._classes[topic]
-            name = kind.DESCRIPTOR.full_name
+            name = message.DESCRIPTOR.full_name
             if name not in self._schemas:
-                self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(kind))
+                self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(type(message)))
             self._ids[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
         data, sequence = message.SerializeToString(deterministic=True), self._sequence[topic]
         self._writer.add_message(self._ids[topic], stamp_ns, data, publish_time=stamp_ns, sequence=sequence)
-        self._sequence[topic] = sequence + 1
+        self._sequence[topic] += 1
 
 
-_FATES = {
+_VERDICT_COLOURS = {
     "closures accepted": (Verdict.ACCEPTED, foxglove.GREEN),
     "closures taken without metres": (Verdict.DIRECTION_ONLY, foxglove.AMBER),
     "closures rejected by the solver": (Verdict.REJECTED_BY_SOLVER, foxglove.RED),
 }
-"""What the solver was given, by what became of it."""
+"""Closures given to the solver: name, verdict and colour."""
 
 
 def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: Closures) -> SceneUpdate:
-    """Odometry edges grey, closures in the colour of their fate."""
+    """Odometry edges grey, closures in the colour of their verdict."""
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
     ends = world_from_body[:, :3, 3]
     named = [("odometry", np.stack([ends[graph.a[odometry]], ends[graph.b[odometry]]], 1), foxglove.GREY)]
-    for name, (fate, color) in _FATES.items():
-        named.append((name, closures.lines(ends, closures.of(fate)), color))
+    for name, (verdict, color) in _VERDICT_COLOURS.items():
+        named.append((name, closures.lines(ends, closures.of(verdict)), color))
     return foxglove.lines(stamp_ns, named)
 
 
 def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
     """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
-    given = closures.of(*(fate for fate, _ in _FATES.values()))
+    given = closures.of(*(verdict for verdict, _ in _VERDICT_COLOURS.values()))
     ends = closures.lines(world_from_body[:, :3, 3], ~given)
     return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
 

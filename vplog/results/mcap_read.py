@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class McapContent:
     """Empty where the run was written without."""
 
     pictures: dict[int, bytes] = field(default_factory=dict)
@@ -53,10 +53,10 @@ class CameraPicture:
     matrix: Floats | None
     """(3, 3) px at the picture's size, None where the camera is not calibrated."""
     size: tuple[int, int]
-    """Width and height in px, as the calibration says."""
+    """Width and height in px, by the calibration."""
 
 
-def read_pictures(path: Path) -> Found:
+def read_pictures(path: Path) -> McapContent:
     """The pictures, references and fixes of a result.mcap. Raises ResultError where it is missing or damaged."""
     pictures, references, fixes = {}, {}, []
     with _reading(path) as reader:
@@ -70,7 +70,7 @@ def read_pictures(path: Path) -> Found:
             picture = CompressedImage.FromString(message.data)
             if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):
                 pictures[int(named[1])] = picture.data
-    return Found(pictures, references, _gps(fixes) if fixes else None)
+    return McapContent(pictures, references, _gps(fixes) if fixes else None)
 
 
 def read_fixes(path: Path) -> Gps | None:

@@ -2,7 +2,7 @@
 
 A descriptor becomes one column for each of its parts, and a part that is a list of fixed length becomes as many bytes
 (little endian): a fixed width without levels, which reads more than ten times as fast as a list and is smaller. The
-header says how the bytes are to be taken.
+header has the type of the bytes.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class DrivePlaces:
     header: dict[str, str]
     """Header of the table of descriptors; it names the library."""
     where: Floats | None = None
-    """(P, 3) longitude and latitude in degrees and altitude in m; None where nothing says so."""
+    """(P, 3) longitude and latitude in degrees and altitude in m; None where not known."""
 
     def of(self, rows: Ints) -> DrivePlaces:
         """Some of them."""
@@ -92,12 +92,12 @@ def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:
     Raises ResultError where the descriptors were not made with one library, and so do not compare, or where two
     drives bear one name.
     """
-    drives = {name: about_run(folder) for name, folder in zip(names_of(folders), folders, strict=True)}
+    drives = {name: drive_header(folder) for name, folder in zip(names_of(folders), folders, strict=True)}
     return write_places(path, drives, (read_places(folder) for folder in folders))
 
 
-def about_run(folder: Path) -> dict[str, Any]:
-    """What the header says of a drive: the content of its log, the topics that were requested, and where it is, as
+def drive_header(folder: Path) -> dict[str, Any]:
+    """The entry of a drive in the header: the content of its log, the topics that were requested, and where it is, as
     drive.json has it in a map; of a run elsewhere the first two, by run.json."""
     records = [folder / name for name in ("drive.json", "run.json") if (folder / name).is_file()]
     account = run_record.read_run_json(records[0]) if records else {}
@@ -174,18 +174,18 @@ def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
 
 
 @dataclass(frozen=True)
-class AboutMap:
-    """What the header of a map of places says."""
+class PlacesHeader:
+    """The header of a map of places."""
 
     library: str
     settings: dict[str, Any]
     descriptor: str
-    """How its columns are to be taken, as JSON."""
+    """Names and types of its columns, as JSON."""
     drives: dict[str, dict[str, Any]]
     """What is known of each drive, in order: `inputs`, `topics`, `earth`."""
 
 
-def about_map(path: Path) -> AboutMap:
+def read_places_header(path: Path) -> PlacesHeader:
     """The header of a map of places. Raises ResultError where it is none."""
     with _reading(path):
         header = {key.decode(): value.decode() for key, value in (read_schema(path).metadata or {}).items()}
@@ -197,7 +197,7 @@ def about_map(path: Path) -> AboutMap:
         raise ResultError(
             f"{path} is not a file of places with its drives. Write one: vplog map export MAP -o FILE.parquet"
         )
-    return AboutMap(header.get("vplog.library", ""), settings, header.get("vplog.descriptor", ""), drives)
+    return PlacesHeader(header.get("vplog.library", ""), settings, header.get("vplog.descriptor", ""), drives)
 
 
 def places_by_drive(path: Path) -> dict[str, int]:
@@ -214,7 +214,7 @@ def places_by_drive(path: Path) -> dict[str, int]:
 def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
     """The places of a map drive by drive, one of them in memory at a time. Raises ResultError where it is damaged, of
     another recogniser, or where a drive comes twice."""
-    parts, about = list(_parts(kind, "")), about_map(path)
+    parts, about = list(_parts(kind, "")), read_places_header(path)
     if about.descriptor != json.dumps([_described(*part) for part in parts]):
         raise ResultError(f"{path} is not a map of places of this recogniser.")
     schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])

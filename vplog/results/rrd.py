@@ -17,18 +17,15 @@ from vplog.storage.scratch import put_in_place
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Closures, Floats, Keyframes, Trajectory
-    from vplog.results.geo import Earth
+    from vplog.data import Closures
+    from vplog.results.report.page import Tracks
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
 _AMBER = (240, 180, 30)
 _APPLICATION = "vplog"
 
 
-def write_rrd(
-    path: Path, keyframes: Keyframes, world_from_body: Floats, closures: Closures, before: Trajectory,
-    after: Trajectory, earth: Earth | None, result: Path,
-) -> None:  # fmt: skip
+def write_rrd(path: Path, tracks: Tracks, closures: Closures, result: Path) -> None:
     """Write with rerun's own SDK; the camera's pictures are those of the run's result.mcap, `result`.
 
     Raises ResultError where the SDK is not installed, a file cannot be read, or this one not be written.
@@ -40,10 +37,10 @@ def write_rrd(
             "The .rrd format is written by rerun's SDK, which is not installed: pip install rerun-sdk"
         ) from None
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    recording = rr.RecordingStream(_APPLICATION, recording_id=f"vplog-{keyframes.drive}")
+    recording = rr.RecordingStream(_APPLICATION, recording_id=f"vplog-{tracks.keyframes.drive}")
     try:
         recording.save(part)
-        _log(recording, rr, keyframes, world_from_body, closures, before, after, earth)
+        _log(recording, rr, tracks, closures)
         _log_camera(recording, rr, result)
         recording.disconnect()
         put_in_place(part, path)
@@ -53,15 +50,12 @@ def write_rrd(
         part.unlink(missing_ok=True)
 
 
-def _log(
-    recording: Any, rr: Any, keyframes: Keyframes, world_from_body: Floats, closures: Closures, before: Trajectory,
-    after: Trajectory, earth: Earth | None,
-) -> None:  # fmt: skip
+def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
     recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for name, trajectory, colour in (("odometry", before, _GREY), ("optimised", after, _BLUE)):
+    for name, trajectory, colour in (("odometry", tracks.before, _GREY), ("optimised", tracks.after, _BLUE)):
         strip = rr.LineStrips3D([trajectory.world_from_body[:, :3, 3]], colors=[colour])
         recording.log(f"map/path/{name}", strip, static=True)
-    ends = world_from_body[:, :3, 3]
+    ends = tracks.world_from_body[:, :3, 3]
     for name, verdict, colour in (
         ("accepted", Verdict.ACCEPTED, _GREEN),
         ("without_metres", Verdict.DIRECTION_ONLY, _AMBER),
@@ -69,13 +63,13 @@ def _log(
     ):
         lines = rr.LineStrips3D(closures.lines(ends, closures.of(verdict)), colors=[colour])
         recording.log(f"map/closures/{name}", lines, static=True)
-    if earth is not None:
-        where = on_earth(earth, after.world_from_body)[:, [1, 0]]
+    if tracks.earth is not None:
+        where = on_earth(tracks.earth, tracks.after.world_from_body)[:, [1, 0]]
         recording.log("earth/optimised", rr.GeoLineStrings(lat_lon=[where], colors=[_BLUE]), static=True)
-    quaternions = se3.quaternion(world_from_body[:, :3, :3])
+    quaternions = se3.quaternion(tracks.world_from_body[:, :3, :3])
     recording.send_columns(
         "map/body",
-        indexes=[rr.TimeColumn("stamp", timestamp=keyframes.stamp_ns.astype("datetime64[ns]"))],
+        indexes=[rr.TimeColumn("stamp", timestamp=tracks.keyframes.stamp_ns.astype("datetime64[ns]"))],
         columns=rr.Transform3D.columns(translation=ends, quaternion=quaternions),
     )
 

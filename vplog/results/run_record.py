@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 """Version of the records of runs and maps, as `format` in them. A new value does not raise it, another meaning does."""
 CACHE = ".cache"
-"""Where a run folder keeps what its stages came to, unless another place is named."""
+"""Folder of the stage results in a run folder, unless another place is named."""
 REQUEST = f"{CACHE}/run.json"
 """Request of a run that is not finished; run.json of its folder is that of the finished run before, if any."""
 CHECKSUM = "record_sha256"
@@ -32,10 +32,11 @@ _MOST_DEPTH = 100
 
 
 def write_run_json(path: Path, record: dict[str, Any], checksum: bool = True) -> None:
-    """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null."""
+    """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null. The folder
+    is made where it is not there."""
     record = with_checksum(record) if checksum else plain(record)
     text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    with replacing(path) as stream:
+    with replacing(path, parents=True) as stream:
         stream.write(text.encode())
 
 
@@ -69,7 +70,7 @@ def _drop_retired(settings: Any) -> None:
     settings.pop("cross_check", None)
     verify, refine = settings.get("verify"), settings.get("refine")
     if isinstance(refine, dict):
-        for name in ("least_redundancy", "most_change"):
+        for name in ("least_redundancy", "most_change", "closure_significance"):
             refine.pop(name, None)
     direction = verify.get("direction") if isinstance(verify, dict) else None
     if isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False:
@@ -92,7 +93,7 @@ def _sha256(record: dict[str, Any]) -> str:
 
 
 def _sound_json(text: str) -> Any:
-    """What a text says, if it can be written again. Raises ValueError or RecursionError."""
+    """The value of a JSON text, if it can be written again. Raises ValueError or RecursionError."""
     tree = json.loads(text)
     if "\\u" in text:  # half a character that takes two, which no file or terminal can hold
         json.dumps(tree, ensure_ascii=False).encode()
@@ -120,7 +121,7 @@ def read_finished_run(folder: Path) -> dict[str, Any]:
 
 
 def read_single_run(folder: Path) -> dict[str, Any]:
-    """The same, of one drive. Raises ResultError where the folder holds several, too."""
+    """The record of a finished run of one drive. Raises ResultError, also where the folder holds several drives."""
     record = read_finished_run(folder)
     drives = record.get("drives")
     if "maps" in record and isinstance(drives, list) and drives and isinstance(drives[0], dict):

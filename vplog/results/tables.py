@@ -68,14 +68,14 @@ def column(name: str, kind: pa.DataType, unit: str, description: str, nullable: 
     return pa.field(name, kind, nullable, metadata={"unit": unit, "description": description})
 
 
-def _pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Field]:
+def pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Field]:
     return [
         *(column(f"{prefix}t{axis}", pa.float64(), "m", f"{text}: position, {axis}.", nullable) for axis in "xyz"),
         *(column(f"{prefix}q{axis}", pa.float64(), "1", f"{text}: quaternion, {axis}.", nullable) for axis in "xyzw"),
     ]
 
 
-_MATRIX = pa.list_(pa.field("element", pa.float64(), nullable=False), 36)
+MATRIX = pa.list_(pa.field("element", pa.float64(), nullable=False), 36)
 _POSE = pa.list_(pa.field("element", pa.float64(), nullable=False), 16)
 _NUMBERS = pa.list_(pa.field("element", pa.uint16(), nullable=False))
 FLOAT32_LIST = pa.list_(pa.field("element", pa.float32(), nullable=False))
@@ -89,10 +89,10 @@ KEYFRAMES = pa.schema(
         column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
         column("drive", pa.string(), "", "Name of the drive."),
         column("stamp_ns", pa.int64(), "ns", "Stamp of the frame, in the log's clock."),
-        *_pose_columns("odom_", "odom_from_body, as the odometry has it"),
-        *_pose_columns("world_", "world_from_body, optimised"),
+        *pose_columns("odom_", "odom_from_body, as the odometry has it"),
+        *pose_columns("world_", "world_from_body, optimised"),
         column(
-            "covariance", _MATRIX, "rad^2, rad m, m^2",
+            "covariance", MATRIX, "rad^2, rad m, m^2",
             "6x6 of world_from_body in the body frame, by the solved graph: relative to the first keyframe, or to "
             "earth with GPS; null where not known.", True,
         ),
@@ -115,11 +115,18 @@ CLOSURES = pa.schema(
         column("spread", pa.float32(), "1", "Share of the query image that the inliers' bounding box covers."),
         column("reverse_inliers", pa.int32(), "features", "Inliers from match to query, -1 where not tried."),
         column("scale", pa.string(), "", "Where the metres come from: `odometry`, `depth`, `stereo` or `none`."),
-        *_pose_columns("", "match_from_query between body frames, null where no pose was found", nullable=True),
-        column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of match_from_query, in the query's body frame.", True),
-        column("covariance", _MATRIX, "rad^2, rad m, m^2", "The inverse of the information.", True),
+        *pose_columns("", "match_from_query between body frames, null where no pose was found", nullable=True),
+        column("information", MATRIX, _INFORMATION_UNIT, "6x6 of match_from_query, in the query's body frame.", True),
+        column("covariance", MATRIX, "rad^2, rad m, m^2", "The inverse of the information.", True),
         column("verdict", pa.string(), "", "What became of the candidate."),
         column("reason", pa.string(), "", "The verdict in one sentence."),
+        column(
+            "p_false",
+            pa.float64(),
+            "1",
+            "Expected share of false closures among it and all that are surer; null where geometry found none.",
+            True,
+        ),
         column("residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True),
         column("residual_after", pa.float64(), "sigma", "Mahalanobis distance to the solution, null if unused.", True),
         column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
@@ -137,8 +144,8 @@ EDGES = pa.schema(
         column("a", pa.int32(), "row", "Keyframe."),
         column("b", pa.int32(), "row", "Keyframe."),
         column("kind", pa.string(), "", "`odometry` or `loop`. GPS fixes are no edges: see run.json."),
-        *_pose_columns("", "a_from_b, as measured"),
-        column("information", _MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
+        *pose_columns("", "a_from_b, as measured"),
+        column("information", MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
         column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1."),
         column("residual", pa.float64(), "sigma", "Mahalanobis distance of the measurement to the solution."),
     ]
@@ -146,8 +153,8 @@ EDGES = pa.schema(
 TRAJECTORY = pa.schema(
     [
         column("stamp_ns", pa.int64(), "ns", "Stamp of the odometry sample, in the log's clock."),
-        *_pose_columns("", "world_from_body, optimised"),
-        *_pose_columns("odom_", "odom_from_body, as logged"),
+        *pose_columns("", "world_from_body, optimised"),
+        *pose_columns("odom_", "odom_from_body, as logged"),
     ]
 )
 
@@ -254,7 +261,7 @@ def _ledger_columns(closures: Closures, query: Keyframes, match: Keyframes) -> d
 
 _PLAIN_LEDGER = (
     *("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread", "reverse_inliers"),
-    *("residual_before", "residual_after", "weight"),
+    *("p_false", "residual_before", "residual_after", "weight"),
 )
 """Fields of the ledger that are one column as they are."""
 
@@ -468,7 +475,7 @@ def _array(values: Any, column: pa.Field) -> pa.Array:
         offsets = np.cumsum([0, *map(len, values)], dtype=np.int32)
         flat = pa.array(np.concatenate([*values, np.empty(0)]), column.type.value_type)
         return pa.ListArray.from_arrays(offsets, flat, type=column.type)
-    if column.type not in (_MATRIX, _POSE):
+    if column.type not in (MATRIX, _POSE):
         return pa.array(values, column.type, mask=np.isnan(values) if column.nullable else None)
     rows = np.ascontiguousarray(values, np.float64).reshape(-1, column.type.list_size)
     unknown = pa.array(np.isnan(rows).all(1)) if column.nullable else None
@@ -490,7 +497,7 @@ def _read(path: Path, name: str, schema: pa.Schema) -> pa.Table:
 def _check_name(path: Path, name: str, schema: pa.Schema) -> None:
     found = (schema.metadata or {}).get(b"vplog.table", b"").decode()
     if found != name:
-        raise ResultError(f"{path} is not a {name} table of vplog (it says {found!r}). Give the folder of a run.")
+        raise ResultError(f"{path} is not a {name} table of vplog (its name is {found!r}). Give the folder of a run.")
 
 
 @contextmanager

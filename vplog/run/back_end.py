@@ -1,4 +1,4 @@
-"""From odometry and verified closures to the trajectory: build, solve, hold against the odometry, refine, judge."""
+"""Pose graph optimisation of one drive: build, robust solve, refine, and the closures' verdicts."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vplog.cache.steps import step
-from vplog.data import EdgeKind, Verdict
+from vplog.data import EdgeKind, Solution, Verdict
 from vplog.errors import GraphError
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import cost_of_fixes, fixes_on, with_fixes, with_noise_of
-from vplog.graph.hypotheses import claimed_times
+from vplog.graph.gps_factors import cost_of_fixes, fixes_on, noisier, with_fixes
+from vplog.graph.hypotheses import bounded
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import pose_covariances
-from vplog.graph.noise import edge_covariance
-from vplog.graph.refine import refine
+from vplog.graph.noise import broken_edges, edge_covariance
+from vplog.graph.pieces import pieces_placed
+from vplog.graph.refine import Scale, refine, rescaled
 from vplog.graph.solve import decided
+from vplog.graph.variance_components import Sigmas
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -51,13 +53,13 @@ class BackEnd(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """What came of a drive's constraints."""
+    """Result of the back end."""
 
     closures: Closures
     """The ledger, judged."""
     refined: Refined
     fixes: Fixes | None
-    """Of GPS, with `gps.use`."""
+    """GPS fixes, with `gps.use`."""
     trajectory: Trajectory
     noise_source: str
     """Source of the odometry's noise, as `edge_covariance` names it."""
@@ -66,33 +68,51 @@ class Solved:
 
 @step("solve")
 def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
-    """The best trajectory of a drive; fixes are used with `gps.use` alone. Raises GraphError where there is none."""
-    covariance, doubts, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
-    graph, rows, repairs = build.build_graph(keyframes, covariance, closures)
-    fixes = fixes_on(gps, odometry, keyframes, settings.gps) if settings.gps.use else None
-    if fixes is None:
-        decision = decided(graph, settings.solve)
-    else:
-        alone = np.where(is_loop(graph), 0.0, 1.0)
-        fixes = with_noise_of(Factors.of(graph), alone, graph.world_from_body, fixes, settings.gps)
-        decision = decided(graph, settings.solve, partial(cost_of_fixes, fixes=fixes, settings=settings.gps))
-    solution = decision.solution
-    if fixes is not None:
-        present = Factors.of(claimed_times(decision.graph, decision.sigmas))
-        fixes = with_noise_of(present, solution.weight, solution.world_from_body, fixes, settings.gps)
+    """The best trajectory of a drive; fixes are used with `gps.use`, and where they are the odometry. Raises GraphError
+    where there is none."""
+    covariance, noise_warnings, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
+    graph, rows, build_warnings = build.build_graph(keyframes, covariance, closures)
+    broken = broken_edges(odometry, keyframes.stamp_ns)
+    graph = pieces_placed(graph, broken)
     of_odometry = by_odometry(graph, closures, rows)
-    refined = refine(decision.graph, solution, of_odometry, settings.refine, fixes, settings.gps, decision.sigmas)
-    warnings = doubts + repairs + (fixes.warnings if fixes else [])
+    fixes, cost, scale, present = None, None, 1.0, graph
+    if settings.gps.use or not odometry.drifts:
+        fixes = fixes_on(gps, odometry, keyframes, settings.gps)
+        odometry_alone = Solution(graph.world_from_body, np.where(is_loop(graph), 0.0, 1.0), 0.0, 0.0, 0, True, "")
+        # with the odometry's noise as claimed, or it would follow errors of satellites that closures then contradict
+        stiff = settings.refine.model_copy(update={"noise": False})
+        by_gps = refine(graph, odometry_alone, of_odometry, stiff, fixes)
+        fixes, scale = noisier(fixes, by_gps.fixes), by_gps.scale
+        present = rescaled(graph, [Scale("odometry", of_odometry, 0.0, 0.0, scale)], Sigmas())
+        cost = partial(cost_of_fixes, fixes=fixes)
+    decision = decided(present, settings.solve, cost)
+    refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
+    warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
+    warnings += _apart(broken, keyframes, graph, refined.solution)
     for warning in warnings:
         _log.warning(warning)
     return Solved(
-        judge(closures, graph, refined, rows),
+        judged_ledger(closures, graph, refined, rows),
         refined,
-        fixes,
+        refined.fixes,
         correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body),
         source,
         warnings,
     )
+
+
+def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
+    """A warning of the breaks of the odometry (edges) that no closure kept spans."""
+    kept = is_loop(graph) & (solution.weight > 0.5)
+    begin, end = (np.sort(rows[kept]) for rows in (graph.a, graph.b))
+    open_ = begin.searchsorted(broken, "right") == end.searchsorted(broken, "right")  # as many ended as had begun
+    if not open_.any():
+        return []
+    seconds = (keyframes.stamp_ns[broken[open_] + 1] - keyframes.stamp_ns[0]) / 1e9
+    return [
+        f"No closure leads across {int(open_.sum())} of {len(broken)} breaks of the odometry, the first at "
+        f"{seconds[0]:.1f} s: how what comes behind lies to what comes before is not known."
+    ]
 
 
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
@@ -103,7 +123,7 @@ def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.
 
 
 def about_gps(solved: Solved) -> dict[str, Any] | None:
-    """What run.json says of GPS: how many fixes were kept, and where on earth the trajectory's frame is."""
+    """Field `gps` of run.json: number of inlier fixes, and the georeference of the trajectory's frame."""
     fixes, refined = solved.fixes, solved.refined
     if fixes is None or refined.world_from_enu is None:
         return None
@@ -131,10 +151,10 @@ def keyframe_covariances(solved: Solved) -> Floats | None:
         return None
 
 
-def judge(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) -> Closures:
-    """The ledger with what the solve made of the closures in the graph: residuals, weights, verdicts.
+def judged_ledger(closures: Closures, graph: PoseGraph, refined: Refined, rows: Ints) -> Closures:
+    """The ledger with residuals, weights and verdicts of the solve.
 
-    Residuals before are to the odometry as it was assumed to be, those after to the odometry as it turned out.
+    Residuals before are relative to the assumed odometry noise, those after to the estimated one.
     """
     solution = refined.solution
     loops = is_loop(graph)

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 
     from vplog.cache.stage_cache import Inputs
     from vplog.cache.steps import Steps
-    from vplog.data import Camera, Features, Frame, Odometry
-    from vplog.features.sift import SiftSettings
+    from vplog.data import Features, Frame
+    from vplog.features.extractors import FeatureSettings
     from vplog.features.stereo_depth import StereoSettings
     from vplog.results.previews import PictureSettings
     from vplog.run.keyframes import KeyframeSettings
@@ -62,10 +62,6 @@ if TYPE_CHECKING:
     """Stamp, frame, features, and why there are none, as `extract_frames` gives them."""
 
 _log = logging.getLogger(__name__)
-_UNCALIBRATED = (
-    "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
-    "Record its camera_info, or name it with --camera-info-topic."
-)
 
 PART_KEYFRAMES = 64
 """Keyframes of a part: about 6 s of one core and 20 MB. A kill costs at most one part, and who computes one elsewhere
@@ -78,7 +74,7 @@ class Extraction(Protocol):
     @property
     def keyframes(self) -> KeyframeSettings: ...
     @property
-    def features(self) -> SiftSettings: ...
+    def features(self) -> FeatureSettings: ...
     @property
     def stereo(self) -> StereoSettings: ...
     @property
@@ -113,18 +109,20 @@ def parts_of(
     topics: logs.TopicChoice | None = None,
     cache: Path | None = None,
 ) -> list[Part]:
-    """What a run of this drive has to extract. With its cache, a log that was only touched is known by its content.
+    """The parts that a run of this drive extracts. With its cache, a log that was only touched is known by its content.
 
     Raises LogError where there is no such log, or nothing to extract in it.
     """
     log = logs.open_drive(files_of(path), topics)
-    keyframes, _ = select_keyframes(log.name, log.stamps(), odometry_of(log), pipeline.keyframes)
-    return cut(path, topics, pipeline, keyframes, inputs_of(path, cache))
+    if (odometry := log.odometry()) is None:
+        raise LogError(f"{log.name} has no odometry of its own, by which its keyframes are selected. Run it whole.")
+    keyframes, _ = select_keyframes(log.name, log.stamps(), odometry, pipeline.keyframes)
+    return split_keyframes(path, topics, pipeline, keyframes, inputs_of(path, cache))
 
 
 def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
     """The parts that the cache does not hold, or not whole."""
-    return [part for part in parts if not _is_held(cache, part)]
+    return [part for part in parts if not _is_cached(cache, part)]
 
 
 def compute_part(part: Part, execution: Execution = Execution()) -> bytes:
@@ -145,11 +143,7 @@ def put_part(cache: Path, part: Part, data: bytes) -> None:
         content_of(data, part.key)
     except DamagedError as error:
         raise ResultError(f"Part {part.number} of {shown(part.log[0])} arrived damaged: {error}. Run again.") from None
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"Cannot make the folder {cache}: {error.strerror}.") from None
-    with replacing(cache / part.file) as stream:
+    with replacing(cache / part.file, parents=True) as stream:
         stream.write(data)
 
 
@@ -165,7 +159,7 @@ def stored_features(cache: Path) -> Extracted | None:
     return found if names else None
 
 
-def cut(
+def split_keyframes(
     drive: Path | Sequence[Path],
     topics: logs.TopicChoice | None,
     settings: Extraction,
@@ -182,8 +176,8 @@ def cut(
     topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files_of(drive))
     alike = {
         "inputs": inputs.token,
-        "topics": images_topics(topics),
-        "features": settings.features.model_dump(mode="json"),
+        "topics": image_topics(topics),
+        "features": settings.features.identity(),
         "stereo": settings.stereo.model_dump(mode="json"),
         "pictures": settings.pictures.model_dump(mode="json", include={"megapixels", "quality"}),
         **code_of(__name__, type(settings.features).__module__),
@@ -195,7 +189,7 @@ def cut(
     ]
 
 
-def images_topics(topics: logs.TopicChoice) -> dict[str, Any]:
+def image_topics(topics: logs.TopicChoice) -> dict[str, Any]:
     """The choice of topics as far as images depend on it; files beside the log by their content."""
     named = topics.model_dump(mode="json", exclude={"gps"})
     for name, file in (("odometry_file", topics.odometry_file), ("calibration_file", topics.calibration_file)):
@@ -203,29 +197,6 @@ def images_topics(topics: logs.TopicChoice) -> dict[str, Any]:
             with file.open("rb") as stream:
                 named[name] = hashlib.file_digest(stream, "sha256").hexdigest()
     return named
-
-
-@step("read")
-def read(log: Log, settings: KeyframeSettings) -> tuple[Odometry, Camera, Keyframes]:
-    """Odometry, camera and selected keyframes of a drive. Raises LogError where there is no odometry."""
-    odometry = odometry_of(log)
-    selected, doubts = select_keyframes(log.name, log.stamps(), odometry, settings)
-    for doubt in doubts:
-        _log.warning(doubt)
-    if (camera := log.camera()).matrix is None:
-        _log.warning(_UNCALIBRATED, camera.name)
-    return odometry, camera, selected
-
-
-def odometry_of(log: Log) -> Odometry:
-    """Raises LogError where there is none."""
-    odometry = log.odometry()
-    if odometry is None or len(odometry.stamp_ns) < 2:
-        raise LogError(
-            f"{log.name} has no odometry, and a trajectory is built on it. "
-            "`vplog info` lists the topics; choose one with --odometry-topic."
-        )
-    return odometry
 
 
 @step("extract", items=lambda log, topics, keyframes, settings: len(keyframes.stamp_ns))
@@ -243,8 +214,8 @@ def extract(
     Raises LogError where fewer than two keyframes decode, and ResultError where the disk is full.
     """
     cache = steps.cache
-    parts = cut(cache.drive, topics, settings, keyframes, cache.inputs)
-    missing = [part for part in parts if not (cache.keep and _is_held(cache.folder, part, cache.damaged))]
+    parts = split_keyframes(cache.drive, topics, settings, keyframes, cache.inputs)
+    missing = [part for part in parts if not (cache.keep and _is_cached(cache.folder, part, cache.damaged))]
     total = sum(len(part.stamp_ns) for part in parts)
     done = total - sum(len(part.stamp_ns) for part in missing)
     # one stream over all that is missing: workers do not wait at the end of a part
@@ -256,7 +227,7 @@ def extract(
     for part in parts:
         found.add(cache.folder / part.file)
         cache.use(part.file)
-    _count(log, found.undecodable)
+    _count_losses(log, found.undecodable)
     if len(found) < 2:
         why = f" The first: {found.lost[0]}" if found.lost else ""
         raise LogError(f"{log.name}: {len(found)} of {total} keyframes could be decoded, and a graph needs two.{why}")
@@ -272,7 +243,7 @@ def decoded(keyframes: Keyframes, found: Extracted) -> Keyframes:
     return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows])
 
 
-def _is_held(
+def _is_cached(
     cache: Path, part: Part, damaged: Callable[[Path, Exception], object] = lambda _path, _error: None
 ) -> bool:
     """Whether the cache holds the part whole; `damaged` gets the file that is not."""
@@ -291,7 +262,7 @@ def _is_held(
 
 
 def _content(log: Log, part: Part, frames: Iterable[Decoded]) -> bytes:
-    """What the file of a part holds; `frames` gives its keyframes in order, and maybe more."""
+    """Content of the file of a part; `frames` gives its keyframes in order, and maybe more."""
     found, lost = [], []
     for stamp_ns, frame, features, why in islice(frames, len(part.stamp_ns)):
         if frame is None or features is None:
@@ -302,7 +273,7 @@ def _content(log: Log, part: Part, frames: Iterable[Decoded]) -> bytes:
     return packed(found, lost, [] if account is None else account.undecodable(part.stamp_ns))
 
 
-def _count(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:
+def _count_losses(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:
     """Losses that were found when a part was computed are those of this run too; counted twice they count once."""
     account = getattr(log, "account", None)
     if account is not None:

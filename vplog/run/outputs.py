@@ -1,4 +1,4 @@
-"""What comes of a run, and the files of its folder."""
+"""Result of a run, and the files of its folder."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import hashlib
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vplog.cache.steps import step
 from vplog.data import EdgeKind, Verdict
-from vplog.figures.run_figures import ClosureInputs, earth_of, finished_picture, reference_use
+from vplog.figures.run_figures import ClosureInputs, earth_of, mcap_extras, reference_use
 from vplog.geometry import tum
 from vplog.graph import consistency
 from vplog.graph.certificate import certify
+from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import about_gps, keyframe_covariances
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """All that a finished run knows."""
+    """Inputs, intermediate results and record of a finished run."""
 
     log: Log
     odometry: Odometry
@@ -54,7 +53,7 @@ class Run:
     """Descriptors of the keyframes."""
     solved: Solved
     record: dict[str, Any] = field(default_factory=dict)
-    """What run.json holds."""
+    """Content of run.json."""
 
     @property
     def closures(self) -> Closures:
@@ -86,11 +85,13 @@ def write(
     inputs = ClosureInputs(
         lambda row: decode_image(picture(row)), run.features.__getitem__, run.camera, run.state, run.places
     )
-    shown = finished_picture(
-        inputs, picture if run.features.has_pictures else None, run.closures, run.references, verify, pictures, gps=gps,
+    previews = picture if run.features.has_pictures else None
+    extras = replace(
+        mcap_extras(inputs, previews, run.closures, run.references, verify, pictures, execution),
+        gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
-        about={"versions": provenance.versions(), "inputs": steps.cache.hashes()}, execution=execution,
-    )  # fmt: skip
+        about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
+    )
     tables.write_descriptors(folder / "descriptors.parquet", keyframes, run.state.to_arrow(run.places), header)
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, keyframe_covariances(run.solved))
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
@@ -99,7 +100,7 @@ def write(
     tables.write_trajectory(folder / "trajectory.parquet", trajectory, run.odometry, header)
     tum.write_tum(folder / "trajectory.tum", trajectory)
     g2o.write_g2o(folder / "graph.g2o", run.graph, poses)
-    mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, run.camera, shown)
+    mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, extras)
     if run.library is None:
         run.state.save(folder / "library")
     steps.cache.finish(run.features.files)
@@ -108,21 +109,22 @@ def write(
 @step("report")
 def report(folder: Path, run: Run, head: dict[str, Any], *, steps: Steps) -> dict[str, Any]:
     """Write report.html of the run in `folder`; the record for its run.json, but for the time that this step takes."""
-    account = {**head, **_account(run), "inputs": steps.cache.hashes(), "warnings": run.log.warnings + steps.warnings}
-    account["graph_sha256"] = hashlib.sha256((folder / "graph.g2o").read_bytes()).hexdigest()
-    write_report(folder, {**account, **steps.account()})
-    return account
+    warnings = run.log.warnings + steps.warnings
+    record = {**head, **_results_record(run), "inputs": steps.cache.hashes(), "warnings": warnings}
+    record["graph_sha256"] = hashlib.sha256((folder / "graph.g2o").read_bytes()).hexdigest()
+    write_report(folder, {**record, **steps.record()})
+    return record
 
 
-def finish(folder: Path, run: Run, account: dict[str, Any], steps: Steps) -> Run:
+def finish(folder: Path, run: Run, record: dict[str, Any], steps: Steps) -> Run:
     """Write run.json, the last file of a run, and give the run with its content."""
-    account = {**account, **steps.account(), "finished": True}
-    run_record.write_run_json(folder / "run.json", account)
-    return replace(run, record=account)
+    record = {**record, **steps.record(), "finished": True}
+    run_record.write_run_json(folder / "run.json", record)
+    return replace(run, record=record)
 
 
-def _account(run: Run) -> dict[str, Any]:
-    """What run.json says of the results."""
+def _results_record(run: Run) -> dict[str, Any]:
+    """Fields of run.json about the results."""
     solution, refined, verdicts = run.solution, run.solved.refined, run.closures.verdict
     constrained = EdgeKind.LOOP in run.graph.kind or run.solved.fixes
     return {
@@ -151,6 +153,6 @@ def _account(run: Run) -> dict[str, Any]:
             "reason": solution.reason if constrained else "No closure passed verification.",
         },
         "certificate": certify(run.graph, solution.weight, solution.world_from_body).record(),
-        "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
+        "odometry": about_odometry(refined),
         "gps": about_gps(run.solved),
     }

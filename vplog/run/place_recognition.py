@@ -1,4 +1,4 @@
-"""Place recognition of a drive by a learned recogniser: descriptors of all keyframes, and which may be returns."""
+"""Place recognition of a drive by a learned recogniser: descriptors of all keyframes, and candidate closures."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from vplog.cache.steps import step
 from vplog.data import SharedReferences
 from vplog.loops.propose import Proposals, candidate_stops, propose
 from vplog.places.sequence import rank_places
+from vplog.places.views import views_of
 from vplog.stages import BoxState
 
 if TYPE_CHECKING:
@@ -22,19 +23,19 @@ if TYPE_CHECKING:
     from vplog.execution.execution import Execution
     from vplog.loops.propose import ProposeSettings
     from vplog.places.sequence import SequenceSettings
-    from vplog.stages import PlaceState
+    from vplog.stages import Log, PlaceState
 
 
 @step(
     "describe",
-    lambda state, features: descriptors_codec(state, len(features)),
-    items=lambda state, features: len(features),
+    lambda state, log, features: descriptors_codec(state, len(features)),
+    items=lambda state, log, features: len(features),
+    without=("log",),  # the features stand for the log's images
 )
-def describe(state: PlaceState, features: Extracted, *, execution: Execution) -> Sequence[Any]:
+def describe(state: PlaceState, log: Log, features: Extracted, *, execution: Execution) -> Sequence[Any]:
     """A descriptor for every keyframe, in order."""
-    count = len(features)
-    described = execution.map(lambda row: state.describe(features[row]), range(count))
-    return list(execution.counted("describe", described, count))
+    views = views_of(state, log, np.array(features.stamp_ns, np.int64), features.__getitem__)
+    return list(execution.counted("describe", views.described(execution), len(features)))
 
 
 @step("propose", lambda *_: columns_codec(Proposals), items=lambda state, descriptors, *_: len(descriptors))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import vplog
 from vplog import logs
-from vplog.cache.input_hashes import bytes_of, files_of, look_of
+from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
 from vplog.storage.remote_path import local_copy, located, original, reason
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 OWN_LIBRARY = "the drive's own keyframes"
-"""Where the library of a run is from to which none was given."""
+"""`library.from` of a run to which no library was given."""
 
 _NO_QUERY = " URLs are kept without their query, which may hold a token."
 
@@ -44,16 +44,16 @@ def stored_log(text: str, name: str, again: str) -> Path:
 
 
 def reopened(
-    account: dict[str, Any],
+    record: dict[str, Any],
     log: Path | None,
     topics: logs.TopicChoice | None,
     again: str = "Say where it is: --log LOG.",
 ) -> Log:
-    """The log of a run by its run.json, or the one given in its place. Raises LogError, which says how to give it
-    `again`, or ResultError where none is."""
-    if log is None and not isinstance(account.get("log"), str):
+    """The log of a run by its run.json, or the one given in its place. Raises LogError, with `again` as the remedy, or
+    ResultError where none is."""
+    if log is None and not isinstance(record.get("log"), str):
         raise ResultError("The run's run.json lacks log. Run `vplog run` again.")
-    parts = account.get("parts") or [account.get("log")]
+    parts = record.get("parts") or [record.get("log")]
     known = [log] if log is not None else [stored_log(str(part), "The log of the run", again) for part in parts]
     if log is not None and not log.exists():
         raise LogError(f"There is no log at {log}. {again}")
@@ -62,26 +62,26 @@ def reopened(
 
 def stat_of(files: Sequence[Path]) -> dict[str, Any]:
     """Length of the files of a log, and a sha256 over their paths, lengths and times: unchanged means the same log."""
-    look = run_record.canonical_json(look_of(files)).encode()
+    look = run_record.canonical_json(stat_signature(files)).encode()
     return {"bytes": bytes_of(files), "sha256": hashlib.sha256(look).hexdigest()}
 
 
 def library_of(library: Path | None) -> str:
-    """What run.json says of where a library is from."""
+    """Field `library.from` of run.json."""
     return OWN_LIBRARY if library is None else str(original(library).resolve())
 
 
 def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
-    """What run.json says of the logs of several drives."""
+    """Fields of run.json about the logs of several drives."""
     return {"logs": [str(path.resolve()) for path in drives], "log_stat": stat_of(drives)}
 
 
 @contextmanager
-def library_at(folder: Path, account: dict[str, Any]) -> Iterator[Path]:
+def library_at(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
     """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
     library = folder / "library"
     if not (library / "library.json").is_file():
-        about = account.get("library")
+        about = record.get("library")
         if not isinstance(about, dict) or not isinstance(about.get("from"), str):
             raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
         library = located(about["from"])

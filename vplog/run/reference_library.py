@@ -1,4 +1,4 @@
-"""Reference libraries: of a drive's own keyframes, of frames of several logs, and how far one explains a drive."""
+"""Reference libraries of a drive's own keyframes or of frames of several logs, and their coverage of a drive."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from vplog.places.coverage import (
 )
 from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
-from vplog.places.library_files import load_references, read_library_record, read_sources
+from vplog.places.library_files import check_descriptors, load_references, read_library_record, read_sources
+from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import PAPER_SIZE, choose, evenly
 from vplog.results.staging import recover, staged
 from vplog.storage.folders import check_regular
@@ -34,10 +35,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from vplog.cache.codecs import Codec
     from vplog.cache.feature_shards import Extracted
     from vplog.data import Bytes, Ints, Keyframes
-    from vplog.features.sift import SiftSettings
+    from vplog.features.extractors import FeatureSettings
     from vplog.places import PlaceSettings
     from vplog.places.reference_choice import LibrarySettings
     from vplog.stages import Log, PlaceState
@@ -50,7 +50,7 @@ class Describing(Protocol):
     """The settings that a library is made with, as the pipeline has them."""
 
     @property
-    def features(self) -> SiftSettings: ...
+    def features(self) -> FeatureSettings: ...
     @property
     def library(self) -> LibrarySettings: ...
     @property
@@ -62,9 +62,10 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
     if folder is None:
         return
     recover(folder)
-    made = pipeline.places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
-    for name, value in pipeline.places:
-        if getattr(made, name) != value:
+    places = pipeline.places.recogniser() if isinstance(pipeline.places, PluginSettings) else pipeline.places
+    made = places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
+    for name, value in places:
+        if name not in made.LOCATIONS and getattr(made, name) != value:
             raise LibraryError(
                 f"{folder} was made with places.{name}={getattr(made, name)}, and this run has {value}. "
                 f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
@@ -116,12 +117,13 @@ def learn(
     return places.learn(references, execution)
 
 
-@step("cover", lambda *_: coverage_codec())
+@step("cover", lambda *_: json_codec(lambda tree: Coverage(**tree), asdict))
 def cover(
     keyframes: Keyframes, references: list[Reference], given: bool, features: Extracted, *, execution: Execution
 ) -> Coverage:
-    """How far the references explain the drive, with a warning where that is little; of no frames where the library
-    has no features that could tell (`places.features: 0`)."""
+    """Coverage of the drive by the references, with a warning where it is low; over no frames where the library has no
+    features (`places.features: 0`)."""
+    check_descriptors(references, features[0])
     if not any(len(one.features) for one in references):
         return Coverage(0.0, 0.0, 0)
     library = index_words(references, WordSettings(), execution, own=False)
@@ -129,13 +131,6 @@ def cover(
     if doubt := coverage_warning(coverage, len(features), given, len(library)):
         _log.warning(doubt)
     return coverage
-
-
-def coverage_codec() -> Codec[Coverage]:
-    """JSON of how far references explain a drive."""
-    return json_codec(
-        lambda tree: Coverage(float(tree["explained"]), float(tree["median"]), int(tree["frames"])), asdict
-    )
 
 
 def build_library(
@@ -210,7 +205,7 @@ def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
 def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, execution: Execution) -> list[Ints]:
     """Stamps of the references of each log that explain the frames of all best; equally many of each are compared."""
     each = -(-frames_needed(pipeline.library.size) // len(opened))
-    descriptors, owners, seen_ns = [], [], []
+    descriptors, owners, stamps_ns = [], [], []
     for number, log in enumerate(opened):
         stamps = log.stamps()[evenly(len(log.stamps()), each)]
         frames = extract_frames(log.frames(stamps), pipeline.features, execution)
@@ -218,7 +213,7 @@ def _stamps_by_coverage(opened: Sequence[Log], pipeline: Describing, execution: 
             if features is not None:
                 descriptors.append(features.descriptors[:STRONGEST].copy())
                 owners.append(number)
-                seen_ns.append(stamp_ns)
+                stamps_ns.append(stamp_ns)
     rows = choose_by_coverage(len(descriptors), descriptors.__getitem__, pipeline.library, execution)
-    owner, stamp = np.array(owners, np.int64)[rows], np.array(seen_ns, np.int64)[rows]
+    owner, stamp = np.array(owners, np.int64)[rows], np.array(stamps_ns, np.int64)[rows]
     return [stamp[owner == number] for number in range(len(opened))]

@@ -18,14 +18,14 @@ from vplog.storage.scratch import replacing
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.results.report.page import Judged
+    from vplog.results.report.page import TruthComparison
 
 
 def write_report(
     folder: Path,
     record: dict[str, Any],
     path: Path | None = None,
-    judged: Judged | None = None,
+    judged: TruthComparison | None = None,
     pictures: dict[int, bytes] | None = None,
 ) -> Path:
     """Write the page of the run in `folder`, whose run.json holds `record`, as `path` (report.html in it where None).
@@ -41,7 +41,7 @@ def write_report(
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run changed of the odometry."""
+    """Difference of a run's trajectory from the odometry, and its closures."""
 
     moved_m: float
     """Largest distance between a corrected and an odometry position, both from the same first pose."""
@@ -67,15 +67,19 @@ def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     found = mcap_read.read_pictures(folder / "result.mcap")
-    laid = world_from_body[:1] @ se3.inverse(keyframes.odom_from_body[:1]) @ odometry.odom_from_body
+    before = world_from_body[:1] @ se3.inverse(keyframes.odom_from_body[:1]) @ odometry.odom_from_body
     earth = earth_of(after, found.gps, record.get("gps"))
-    return Tracks(keyframes, world_from_body, Trajectory(odometry.stamp_ns, laid), after, found, earth)
+    return Tracks(keyframes, world_from_body, Trajectory(odometry.stamp_ns, before), after, found, earth)
 
 
 def gather(
-    folder: Path, record: dict[str, Any], judged: Judged | None = None, pictures: dict[int, bytes] | None = None
+    folder: Path,
+    record: dict[str, Any],
+    judged: TruthComparison | None = None,
+    pictures: dict[int, bytes] | None = None,
 ) -> Content:
-    """All that the page tells. Raises ResultError where a file of the run is missing or damaged."""
+    """The content of the page. Raises ResultError where a file of the run is missing or damaged."""
     tracks = gather_tracks(folder, record)
+    covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
-    return Content(record, tracks, closures, tracks.found.pictures or pictures or {}, judged)
+    return Content(record, tracks, covariance, closures, tracks.found.pictures or pictures or {}, judged)

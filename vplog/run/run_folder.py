@@ -1,9 +1,10 @@
-"""The folder of a run: whose run it is, and how a new one takes its place."""
+"""The folder of a run: the log that its results are of, and how a new run replaces them."""
 
 from __future__ import annotations
 
 import shlex
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from glob import escape
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -27,31 +28,41 @@ _RUN_FILES = (
     "run.json", "report.html", "result.mcap", "graph.g2o", "trajectory.tum", "keyframes.parquet", "descriptors.parquet",
     "closures.parquet", "edges.parquet", "trajectory.parquet", "library/library.json", "library/features.parquet",
     "library/references.parquet", "map[0-9]*.g2o", "joins.parquet", "joint_keyframes.parquet",
-    "joint_trajectory.parquet", "joint_trajectory.tum",
+    "joint_trajectory.parquet", "joint_trajectory.tum", "landmarks.parquet",
     *(f"closure-{'[0-9]' * digits}.png" for digits in range(1, 10)),
 )  # fmt: skip
-"""All that runs and `explain` write into the folder of a run and into those of its drives, as glob patterns."""
+"""Glob patterns of all files that runs and `explain` write into the folder of a run and into those of its drives."""
+
+
+@dataclass(frozen=True)
+class CacheOptions:
+    """Cache of the results of stages, and whether an existing run may be replaced."""
+
+    folder: Path | None = None
+    """A folder of this drive alone; None for `.cache` in the run folder."""
+    use: bool = True
+    """Whether results are found there, and stay."""
+    force: bool = False
+    """Whether the run of another log is replaced."""
 
 
 @contextmanager
-def begun(
+def staged_run(
     out: Path,
     head: dict[str, Any],
     files: Sequence[Path],
     library: Path | None = None,
     topics: TopicChoice | None = None,
     drives: Collection[str] = (),
-    *,
-    resumable: bool = True,
-    force: bool = False,
+    cache: CacheOptions = CacheOptions(),
 ) -> Iterator[Path]:
     """A folder for the results of a run, which become those of `out` when the block ends well (vplog/results/staging).
 
-    The run's request is in the cache of `out` until then if it is `resumable`, and stays there if stages were kept:
-    `head` is what provenance.head says of it, `files` are its logs, `drives` the names of those of a run of several.
-    Raises SettingsError where `out` holds other things, or without `force` the run of another log.
+    A run with a cache in `out` is resumable: its request is there until then, and stays if stages are cached. `head` is
+    its provenance.head, `files` are its logs, `drives` the names of the drives of a joint run.
+    Raises SettingsError where `out` holds other things, or without `cache.force` the run of another log.
     """
-    cache, request = out / CACHE, out / REQUEST
+    folder, request, resumable = out / CACHE, out / REQUEST, cache.use and cache.folder is None
     record = {
         **head,
         "finished": False,
@@ -59,41 +70,41 @@ def begun(
         "library": {"from": provenance.library_of(library)},
     }
 
-    def begin() -> list[str]:
+    def check_folder() -> list[str]:
         check_regular(out, "run.json")
         above = out.absolute().parent
         if out.absolute().name in _drives_in(_read(above / "run.json") or {}) or (out / "drive.json").exists():
             raise SettingsError(f"{out} is a drive of the run or map in {above}. Choose another folder with -o.")
-        if not force:
+        if not cache.force:
             _check_same_logs(out, files)
         return _results_in(out, library, drives, resumable)
 
-    with staged(out, begin) as made, stands_for(made, out):
-        before = set() if request.is_file() else set(cache.rglob(f"*{ENDING}"))
+    with staged(out, check_folder) as made, stands_for(made, out):
+        before = set() if request.is_file() else set(folder.rglob(f"*{ENDING}"))
         try:
             if resumable:
-                cache.mkdir(exist_ok=True)
+                folder.mkdir(exist_ok=True)
                 run_record.write_run_json(request, record)
             yield made
         except BaseException as error:
-            kept = set(cache.rglob(f"*{ENDING}")) - before if resumable else ()
+            cached = set(folder.rglob(f"*{ENDING}")) - before if resumable else ()
             interrupted = was_interrupted(error)
-            if kept and (interrupted or isinstance(error, OSError | MemoryError | ResultError)):
-                error.add_note(_what_is_kept(out, kept))
+            if cached and (interrupted or isinstance(error, OSError | MemoryError | ResultError)):
+                error.add_note(_resume_note(out, cached))
             else:
                 request.unlink(missing_ok=True)  # resumed, it would fail again
                 with suppress(OSError):  # not there, or it holds what was kept of this and other runs
-                    cache.rmdir()
+                    folder.rmdir()
                 if resumable and interrupted:
                     error.add_note("no stage was finished, so nothing is kept. Give the same command again")
             raise
 
 
-def _what_is_kept(out: Path, kept: Collection[Path]) -> str:
+def _resume_note(out: Path, cached: Collection[Path]) -> str:
     """Stages and bytes that an interrupted run leaves, and the command that resumes it."""
-    stages = ", ".join(sorted({file.name.split("-")[0] for file in kept}))
+    stages = ", ".join(sorted({file.name.split("-")[0] for file in cached}))
     return (
-        f"{sum(file.stat().st_size for file in kept) / 1e6:.1f} MB of results of stages ({stages}) are kept in "
+        f"{sum(file.stat().st_size for file in cached) / 1e6:.1f} MB of results of stages ({stages}) are kept in "
         f"{out / CACHE}. Go on with: {_resume(out)}"
     )
 
@@ -108,11 +119,11 @@ def _results_in(out: Path, library: Path | None, drives: Collection[str], resuma
     A library that the new run is given stays, and the cache of each of its drives if it is `resumable`. Raises
     SettingsError where `out` holds other things than a run.
     """
-    account = _account(out) if any(not file.name.startswith(".") for file in out.iterdir()) else {}
-    if account is None:
+    record = _run_json(out) if any(not file.name.startswith(".") for file in out.iterdir()) else {}
+    if record is None:
         raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
     given = library is not None and library.resolve() == (out / "library").resolve()
-    earlier = [escape(name) for name in _drives_in(account)]
+    earlier = [escape(name) for name in _drives_in(record)]
     caches = [f"{CACHE}/{escape(one.name)}" for one in (out / CACHE).glob("*/") if one.name not in drives]
     caches += [f"{name}/{CACHE}" for name in earlier] + ([CACHE] if drives or not resumable else [])
     return [
@@ -125,21 +136,21 @@ def _results_in(out: Path, library: Path | None, drives: Collection[str], resuma
 
 def _check_same_logs(out: Path, files: Sequence[Path]) -> None:
     """Raises SettingsError where `out` holds the run of a log that is not among these."""
-    given, account, unfinished = " ".join(map(str, files)), _account(out), _read(out / REQUEST) or {}
-    if account == {}:
+    given, record, unfinished = " ".join(map(str, files)), _run_json(out), _read(out / REQUEST) or {}
+    if record == {}:
         raise SettingsError(
             f"{out}/run.json is damaged, so the log of that run is not known. Choose another folder with -o, or "
             "replace the run with --force."
         )
-    if account and account.get("finished") is False:  # as older versions left it
-        account, unfinished = None, unfinished or account
+    if record and record.get("finished") is False:  # as older versions left it
+        record, unfinished = None, unfinished or record
     if not {log.resolve() for log in _logs_in(unfinished)} <= {file.resolve() for file in files}:
         raise SettingsError(
             f"{out} keeps an unfinished run of {_named(unfinished)}, not of {given}. Go on with that: {_resume(out)}. "
             "Or choose another folder with -o, or drop it with --force."
         )
-    drives = [_read(out / name / "run.json") or account for name in _drives_in(account or {})]
-    for one in drives or [account]:
+    drives = [_read(out / name / "run.json") or record for name in _drives_in(record or {})]
+    for one in drives or [record]:
         if one and not _is_of(one, files):
             raise SettingsError(
                 f"{out} is the run of {_named(one)}, and {given} is another log, or has changed since. Choose another "
@@ -147,10 +158,10 @@ def _check_same_logs(out: Path, files: Sequence[Path]) -> None:
             )
 
 
-def _is_of(account: dict[str, Any], files: Sequence[Path]) -> bool:
+def _is_of(record: dict[str, Any], files: Sequence[Path]) -> bool:
     """Whether the log of a finished run is among these, by its content. That is read only where paths, lengths and
     times leave it open."""
-    known, about, content = _logs_in(account), account.get("log_stat"), account.get("inputs")
+    known, about, content = _logs_in(record), record.get("log_stat"), record.get("inputs")
     about, content = (one if isinstance(one, dict) else {} for one in (about, content))
     same_paths = {log.resolve() for log in known} <= {file.resolve() for file in files}
     if same_paths and provenance.stat_of(known) == about:
@@ -163,10 +174,10 @@ def _is_of(account: dict[str, Any], files: Sequence[Path]) -> bool:
     return False
 
 
-def _account(out: Path) -> dict[str, Any] | None:
+def _run_json(out: Path) -> dict[str, Any] | None:
     """run.json of a folder, empty where it is damaged; None where it has none of vplog."""
-    account = _read(out / "run.json")
-    return account if not account or "vplog" in account else None
+    record = _read(out / "run.json")
+    return record if not record or "vplog" in record else None
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -177,18 +188,18 @@ def _read(path: Path) -> dict[str, Any] | None:
         return {}
 
 
-def _logs_in(account: dict[str, Any]) -> list[Path]:
+def _logs_in(record: dict[str, Any]) -> list[Path]:
     """The logs that a run.json names."""
-    named = account.get("logs") or account.get("parts") or [account.get("log")]
+    named = record.get("logs") or record.get("parts") or [record.get("log")]
     return [located(str(path)) for path in named if path] if isinstance(named, list) else []
 
 
-def _named(account: dict[str, Any]) -> str:
-    return " ".join(map(str, _logs_in(account)))
+def _named(record: dict[str, Any]) -> str:
+    return " ".join(map(str, _logs_in(record)))
 
 
-def _drives_in(account: dict[str, Any]) -> list[str]:
+def _drives_in(record: dict[str, Any]) -> list[str]:
     """Folders of the drives of a run of several, by its run.json."""
-    drives = account.get("drives")
+    drives = record.get("drives")
     names = [drive.get("folder") for drive in drives if isinstance(drive, dict)] if isinstance(drives, list) else []
     return [name for name in names if isinstance(name, str) and PurePath(name).name == name != ".."]

@@ -53,9 +53,8 @@ def verify(
 def calibrate(
     keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings, *, execution: Execution
 ) -> float:
-    """By what share of a rotation the calibration is wrong at most."""
-    drive = drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
-    return calibration_share(drive, execution)
+    """Relative error of rotations by the calibration, see `calibration_share`."""
+    return calibration_share(drive_of(keyframes, camera, features.__getitem__, settings), execution)
 
 
 @step("verify", lambda *_: closures_codec(), items=lambda proposals, *_: len(proposals.query))
@@ -70,7 +69,7 @@ def verify_part(
     execution: Execution,
 ) -> Closures:
     """The ledger of some candidates."""
-    drive = drive_of(keyframes, camera, features.__getitem__, settings, camera.baseline_m)
+    drive = drive_of(keyframes, camera, features.__getitem__, settings)
     return verify_between(proposals, drive, drive, execution, share)
 
 

@@ -1,4 +1,4 @@
-"""Closures between drives: place recognition proposes pairs of drives and candidates, and geometry verifies them."""
+"""Inter-session closures: place recognition proposes pairs of drives and candidates, and geometry verifies them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceState
 
 _NO_POSE = (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.TOO_FEW_INLIERS)
-"""Verdicts of views that geometry does not show to be of one place."""
+"""Verdicts without geometric evidence that both views are of one place."""
 _FIRST_SHARE = 8
-"""One in so many of the bests is looked at first, whatever the length of the drives: where they share a stretch, its
-views are among those that score highest."""
+"""One in so many of the best candidates is verified first, whatever the length of the drives: where they share a
+stretch, its views are among those that score highest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,8 @@ def proposed_in(
 def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pipeline) -> Candidates:
     """The candidates with those in a drive more.
 
-    `propose.per_query` bounds what is kept of a query over all drives, as it does within one: what a drive costs to
-    verify does not grow with the map. Ties go to the drive of lower number, in whatever order they are searched.
+    `propose.per_query` limits the candidates of a query over all drives, as it does within one: the cost of verifying a
+    drive does not grow with the map. Ties go to the drive of lower number, in whatever order they are searched.
     """
     drive = np.concatenate([known.drive, np.full(len(more.query), number, np.int32)])
     every = Proposals(**{
@@ -76,8 +76,8 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
     every, drive = every.rows(order), drive[order]
     starts = np.searchsorted(every.query, every.query)
     rank = (np.arange(len(drive)) - starts).astype(np.int32)
-    kept = rank < pipeline.propose.per_query
-    return Candidates(drive[kept], replace(every, rank=rank).rows(kept))
+    retained = rank < pipeline.propose.per_query
+    return Candidates(drive[retained], replace(every, rank=rank).rows(retained))
 
 
 def candidates_among(
@@ -115,9 +115,10 @@ def candidates_among(
 
 
 def likely_drives(candidates: Candidates, settings: JoinSettings) -> list[int]:
-    """Numbers of the drives that are worth a look, increasing: those that hold most, and enough to join."""
+    """Numbers of the drives to verify, increasing: those with the largest sums of scores, and candidates enough to
+    join."""
     numbers, counts = np.unique(candidates.drive, return_counts=True)
-    score = np.maximum(candidates.proposals.score, 0.0)  # less than nothing would make more of them less
+    score = np.maximum(candidates.proposals.score, 0.0)  # a negative score would count against its drive
     weight = np.array([score[candidates.drive == one].sum(dtype=np.float64) for one in numbers])
     enough = np.flatnonzero(counts >= settings.least_closures)
     best = enough[np.lexsort((numbers[enough], -weight[enough]))][: settings.most_drives]
@@ -138,7 +139,7 @@ class DrivePair(NamedTuple):
 def likely_pairs(
     found: Mapping[int, Candidates], places: Callable[[int], Sequence[Any]], state: PlaceState, settings: JoinSettings
 ) -> list[DrivePair]:
-    """The pairs of drives whose candidates are worth verifying, by later, then earlier drive."""
+    """The pairs of drives to verify, by later, then earlier drive."""
     pairs = []
     for later, candidates in found.items():
         own = places(later)
@@ -158,36 +159,35 @@ def closures_between(
     execution: Execution,
     fetch: Callable[[Int32s, Int32s], None] = lambda *_: None,
 ) -> Closures:
-    """The ledger of the candidates of one drive's keyframes (queries) in another (matches) that are worth a look.
+    """The ledger of the candidates of one drive's keyframes (queries) in another (matches), those that are verified.
 
-    First come the bests of the queries that score highest. Where geometry shows none of them to be of the same place
-    the drives do not meet; else the best of each other query follows, and then all candidates of the queries around
-    those of the same place: they are for the graph, and left out where no calibration gives them metres. `share` is the
-    larger `calibration_share` of the two drives; `fetch` gets queries and matches before they are verified. Progress
-    counts the candidates of each look.
+    The best candidates of the highest-scoring queries come first. Where geometry confirms none of them, the drives
+    share no place; else the best of each other query follows, and then all candidates of the queries around confirmed
+    ones: these are for the graph, and left out without calibration. `share` is the larger `calibration_share` of the
+    two drives; `fetch` gets queries and matches before they are verified. Progress counts candidates.
     """
     _, best = np.unique(proposals.query, return_index=True)
     by_score = best[np.argsort(-proposals.score[best], kind="stable")]
     count = max(settings.first_look, -(-len(best) // _FIRST_SHARE))
-    looks: list[tuple[Ints, Closures]] = []
+    verified: list[tuple[Ints, Closures]] = []
 
-    def look(rows: Ints) -> None:
+    def verify_rows(rows: Ints) -> None:
         fetch(np.unique(proposals.query[rows]), np.unique(proposals.match[rows]))
         ledger = verify_between(proposals.rows(rows), later, earlier, execution, share)
-        looks.append((rows, ledger))
+        verified.append((rows, ledger))
 
     def confirmed() -> Int32s:
-        """Queries whose candidate is of the same place, increasing."""
-        return np.unique(np.concatenate([one.query[[v not in _NO_POSE for v in one.verdict]] for _, one in looks]))
+        """Queries with a geometrically confirmed candidate, increasing."""
+        return np.unique(np.concatenate([one.query[[v not in _NO_POSE for v in one.verdict]] for _, one in verified]))
 
-    look(np.sort(by_score[:count]))
+    verify_rows(np.sort(by_score[:count]))
     if len(confirmed()):
-        look(np.sort(by_score[count:]))
+        verify_rows(np.sort(by_score[count:]))
         if later.camera.matrix is not None and earlier.camera.matrix is not None:
-            others = _near(proposals.query, confirmed(), settings.around)
+            others = _near_confirmed(proposals.query, confirmed(), settings.around)
             others[best] = False
-            look(np.flatnonzero(others))
-    return merged([ledger for _, ledger in looks], [rows for rows, _ in looks])
+            verify_rows(np.flatnonzero(others))
+    return merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
 
 
 def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences) -> Closures:
@@ -202,10 +202,13 @@ def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences
     )
 
 
-def _near(query: Int32s, held: Int32s, around: int) -> Bools:
-    """(C,) whether a query is at most so many keyframes from one of `held`, which increase."""
-    if len(held) == 0:
+def _near_confirmed(query: Int32s, confirmed_queries: Int32s, around: int) -> Bools:
+    """(C,) whether a query is at most so many keyframes from one of `confirmed_queries`, which increase."""
+    if len(confirmed_queries) == 0:
         return np.zeros(len(query), bool)
-    after = np.searchsorted(held, query)
-    left, right = held[np.maximum(after - 1, 0)], held[np.minimum(after, len(held) - 1)]
+    after = np.searchsorted(confirmed_queries, query)
+    left, right = (
+        confirmed_queries[np.maximum(after - 1, 0)],
+        confirmed_queries[np.minimum(after, len(confirmed_queries) - 1)],
+    )
     return np.minimum(np.abs(query - left), np.abs(query - right)) <= around

@@ -11,8 +11,6 @@ from vplog.data import EdgeKind, Verdict
 from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
 from vplog.graph.correct_trajectory import correct_trajectory
-from vplog.graph.hypotheses import claimed_times
-from vplog.graph.variance_components import Sigmas
 from vplog.results import tables
 from vplog.run.back_end import by_odometry
 
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
     Ledgers = Mapping[tuple[int, int], Closures]
-    """By numbers of the later drive, whose keyframes are the queries, and of the earlier one."""
+    """Ledgers by numbers of the later drive, whose keyframes are the queries, and of the earlier one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,46 +38,43 @@ class SolvedDrive:
 def solve_drives(
     drives: Sequence[SolvedDrive], ledgers: Ledgers, pipeline: Pipeline
 ) -> tuple[graph_joint.Joined, dict[tuple[int, int], Closures]]:
-    """The maps that the drives make, and the ledgers with weights, residuals and verdicts of the solve. Raises
+    """The joint graphs of connected drives, and the ledgers with weights, residuals and verdicts of the solve. Raises
     GraphError where a graph cannot be solved."""
-    between = [_between_of(*pair, ledger) for pair, ledger in ledgers.items()]
+    between = [_verified_closures(*pair, ledger) for pair, ledger in ledgers.items()]
     graphs = [drive.graph for drive in drives]
     joined = graph_joint.join(graphs, between, pipeline.solve, pipeline.join, pipeline.refine)
-    judged = map(_judged_by, ledgers.values(), joined.weight, joined.residual)
+    judged = map(_with_solve, ledgers.values(), joined.weight, joined.residual)
     return joined, dict(zip(ledgers, judged, strict=True))
 
 
-def own_drive(graph: PoseGraph, weight: Floats, closures: Closures, sigma_factor: float) -> graph_joint.Drive:
-    """The graph of a drive at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0),
-    with the odometry's noise before its solve scaled that by `sigma_factor`: the joint solve estimates it again, with
-    the same scale for all."""
+def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joint.Drive:
+    """The graph of a drive at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0)."""
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
-    claimed = claimed_times(graph, Sigmas(odometry=1.0 / sigma_factor))
     used = np.flatnonzero(np.isfinite(closures.weight))
     metric = np.array([closures.scale[row] != "none" for row in used.tolist()], bool)
-    of_odometry = by_odometry(claimed, closures, np.concatenate([used[metric], used[~metric]]))
+    of_odometry = by_odometry(graph, closures, np.concatenate([used[metric], used[~metric]]))
     edges = np.flatnonzero(odometry | (weight > 0.5))
     own = replace(
-        claimed,
+        graph,
         a=graph.a[edges],
         b=graph.b[edges],
-        a_from_b=claimed.a_from_b[edges],
-        information=claimed.information[edges],
+        a_from_b=graph.a_from_b[edges],
+        information=graph.information[edges],
         kind=[graph.kind[edge] for edge in edges.tolist()],
     )
-    return graph_joint.Drive(own, of_odometry[edges], sigma_factor)
+    return graph_joint.Drive(own, of_odometry[edges])
 
 
 def pair_record(query_drive: str, match_drive: str, ledger: Closures) -> dict[str, Any]:
     """A pair of drives as run.json and component.json have it."""
-    kept = int(np.nansum(ledger.weight))
+    inliers = int(np.nansum(ledger.weight))
     return {
         "query_drive": query_drive,
         "match_drive": match_drive,
         "candidates": len(ledger),
         "verified": int(np.isfinite(ledger.weight).sum()),
-        "kept": kept,
-        "median_residual_sigma": float(np.nanmedian(ledger.residual_after)) if kept else None,
+        "kept": inliers,
+        "median_residual_sigma": float(np.nanmedian(ledger.residual_after)) if inliers else None,
     }
 
 
@@ -107,7 +102,7 @@ def _accepted(ledger: Closures) -> np.ndarray:
     return np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
 
 
-def _between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
+def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
     """The verified closures of a ledger, for the graph."""
     rows = _accepted(ledger)
     shared = busier(ledger.match[rows], ledger.query[rows])
@@ -122,7 +117,7 @@ def _between_of(later: int, earlier: int, ledger: Closures) -> graph_joint.Betwe
     )
 
 
-def _judged_by(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
+def _with_solve(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
     """The ledger with weights and residuals (L,) of its verified rows from the joint solve."""
     rows = _accepted(ledger)
     weights, residuals, verdict = np.full(len(ledger), np.nan), np.full(len(ledger), np.nan), list(ledger.verdict)

@@ -1,4 +1,4 @@
-"""Several drives in one map: each by itself, closures between them, one graph of those that closures join."""
+"""A joint run of several drives: each by itself, inter-session closures, and one graph of the drives they connect."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from vplog import logs
 from vplog.errors import SettingsError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
-from vplog.execution.timing import Watch
+from vplog.execution.timing import StageTimer
 from vplog.geometry import tum
 from vplog.loops.verify import calibration_share, drive_of, no_closures
-from vplog.pipeline import CacheOptions
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
-from vplog.run.feature_extraction import odometry_of
+from vplog.run.odometry import is_visual
 from vplog.run.reference_library import build_library, check_library
-from vplog.run.run_folder import begun
+from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.sessions.inter_session import candidates_among, closures_between, likely_pairs, with_shared
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 
@@ -38,13 +37,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Alone:
+class DriveRun:
     """One drive, run by itself."""
 
     name: str
     run: Run
     drive: Drive
-    """For the verification of its candidates."""
+    """Input of the verification of its candidates."""
     solved: SolvedDrive
 
 
@@ -63,18 +62,16 @@ def run_joint(
     share one library, the one given or one of an equal share of each. Raises VplogError with one line.
     """
     if pipeline.gps.use:
-        raise SettingsError("GPS holds one drive at a time: run each by itself with --gps, or several without.")
+        raise SettingsError("GPS is for one drive at a time: run each by itself with --gps, or several without.")
     opened = [logs.open(path, topics) for path in paths]
     drives_at = dict(zip(_names([log.name for log in opened]), paths, strict=True))
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
-        odometry_of(log)
+        is_visual(log, topics or logs.TopicChoice())
     head = {**provenance.head(pipeline, paths[0], execution.threads), **provenance.logs_of(paths)}
-    watch = Watch()
+    watch = StageTimer()
     with ExitStack() as stack:
-        made = stack.enter_context(
-            begun(out, head, paths, library, topics, drives_at, resumable=cache.use, force=cache.force)
-        )
+        made = stack.enter_context(staged_run(out, head, paths, library, topics, drives_at, cache))
         caches = out / CACHE if cache.use else made / CACHE
         if not cache.use:
             stack.callback(shutil.rmtree, caches, ignore_errors=True)
@@ -88,43 +85,43 @@ def run_joint(
                 done = run_alone(
                     path, made / name, pipeline, library, topics, execution.within(name), CacheOptions(caches / name)
                 )
-                drives.append(_alone(name, done, pipeline))
+                drives.append(_drive_run(name, done, pipeline))
         with watch.stage("between"):
             state = pipeline.places.load(library, execution)
             ledgers = _ledgers(drives, state, pipeline, execution)
         with watch.stage("join"), limited(execution.threads):
-            joined, ledgers = solve_drives([alone.solved for alone in drives], ledgers, pipeline)
+            joined, ledgers = solve_drives([drive_run.solved for drive_run in drives], ledgers, pipeline)
         with watch.stage("write"):
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-            write_ledgers(made / "joins.parquet", [alone.solved for alone in drives], ledgers, header)
+            write_ledgers(made / "joins.parquet", [drive_run.solved for drive_run in drives], ledgers, header)
             _write_maps(made, drives, joined, header)
-        account = {
+        record = {
             **head,
             "finished": True,
             "library": {"hash": state.hash, "from": provenance.library_of(library)},
-            **_account(drives, ledgers, joined),
+            **_joint_record(drives, ledgers, joined),
             "stages": watch.stages,
             "totals": watch.totals(),
         }
-        run_record.write_run_json(made / "run.json", account)
-    return account
+        run_record.write_run_json(made / "run.json", record)
+    return record
 
 
-def _alone(name: str, run: Run, pipeline: Pipeline) -> Alone:
+def _drive_run(name: str, run: Run, pipeline: Pipeline) -> DriveRun:
     keyframes = replace(run.keyframes, drive=name)
     graph = replace(run.graph, world_from_body=run.solution.world_from_body)
-    own = own_drive(graph, run.solution.weight, run.closures, run.record["odometry"]["sigma_factor"])
-    drive = drive_of(keyframes, run.camera, run.features.__getitem__, pipeline.verify, run.camera.baseline_m)
-    return Alone(name, run, drive, SolvedDrive(keyframes, own, lambda: run.odometry))
+    own = own_drive(graph, run.solution.weight, run.closures)
+    drive = drive_of(keyframes, run.camera, run.features.__getitem__, pipeline.verify)
+    return DriveRun(name, run, drive, SolvedDrive(keyframes, own, lambda: run.odometry))
 
 
-def _ledgers(drives: Sequence[Alone], state: PlaceState, pipeline: Pipeline, execution: Execution) -> Ledgers:
-    """The ledger of every pair of drives; empty where it is not likely that they meet."""
-    places = [alone.run.places for alone in drives]
-    calibrated = [alone.drive.camera.matrix is not None for alone in drives]
+def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, execution: Execution) -> Ledgers:
+    """The ledger of every pair of drives; empty where too few candidates are proposed."""
+    places = [drive_run.run.places for drive_run in drives]
+    calibrated = [drive_run.drive.camera.matrix is not None for drive_run in drives]
     share = [
-        calibration_share(alone.drive, execution) if known else 0.0
-        for alone, known in zip(drives, calibrated, strict=True)
+        calibration_share(drive_run.drive, execution) if known else 0.0
+        for drive_run, known in zip(drives, calibrated, strict=True)
     ]
     later = {number: places[number] for number in range(1, len(drives))}
     searched = {number: range(number) for number in later}
@@ -155,7 +152,7 @@ def _names(names: Sequence[str]) -> list[str]:
     return result
 
 
-def _write_maps(out: Path, drives: Sequence[Alone], joined: Joined, header: tables.TableMetadata) -> None:
+def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: tables.TableMetadata) -> None:
     """The graph of each map of several drives, and the keyframes and trajectories of its drives in the map's frame."""
     for number, members in enumerate(joined.maps):
         if members not in joined.solved:
@@ -168,9 +165,9 @@ def _write_maps(out: Path, drives: Sequence[Alone], joined: Joined, header: tabl
             tum.write_tum(folder / "joint_trajectory.tum", trajectory)
 
 
-def _account(drives: Sequence[Alone], ledgers: Ledgers, joined: Joined) -> dict[str, Any]:
+def _joint_record(drives: Sequence[DriveRun], ledgers: Ledgers, joined: Joined) -> dict[str, Any]:
     """Maps, pairs and warnings as run.json has them."""
-    names = [alone.name for alone in drives]
+    names = [drive_run.name for drive_run in drives]
     maps = [
         {
             "drives": [names[member] for member in members],
@@ -189,7 +186,7 @@ def _account(drives: Sequence[Alone], ledgers: Ledgers, joined: Joined) -> dict[
             for members in joined.maps
             if len(members) == 1
         ]
-    warnings += [f"{alone.name}: {text}" for alone in drives for text in alone.run.record["warnings"]]
+    warnings += [f"{drive_run.name}: {text}" for drive_run in drives for text in drive_run.run.record["warnings"]]
     map_of = {member: number for number, members in enumerate(joined.maps) for member in members}
     return {
         "drives": [

@@ -1,7 +1,7 @@
-"""gs:// through pyarrow: where the server is, who asks, and a bound on every wait.
+"""gs:// through pyarrow: endpoint, credentials, and a bound on every wait.
 
 pyarrow's client goes on for 15 minutes with what cannot succeed, and looks for credentials as long. So it is given less
-time, the server is greeted first, and what has no credentials asks without any, as public data allow.
+time, the server is probed first, and access without credentials is anonymous, as public data allow.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ if TYPE_CHECKING:
 _PUBLIC = "https://storage.googleapis.com"
 _METADATA = "http://metadata.google.internal"
 """Gives credentials on Google's own machines, and is nowhere else."""
-_GREETING_S = 10.0
+_PROBE_S = 10.0
 """For one request of some hundred bytes."""
 _METADATA_S = 2.0
 """It is on the machine itself: google-auth waits 3 s."""
 _RETRY_S = 20
-"""What fails for so long is given up; a request that says nothing is given up by the client after 120 s."""
+"""Retries end after this; a request without an answer is ended by the client after 120 s."""
 _REASON = re.compile(
     r"(?:.*underlying error message was: |.*?last message of )(.*?)(?: error_info=|,? gcloud-cpp|}}|$)", re.S
 )
-"""The part of a google::cloud::Status that says what is wrong: the innermost message."""
+"""The innermost message of a google::cloud::Status."""
 
 
-def google_place() -> str:
-    """Where the server is, by the variable of Google's own tools."""
+def gcs_endpoint() -> str:
+    """The endpoint, by the variable of Google's own tools."""
     given = os.environ.get("STORAGE_EMULATOR_HOST") or _PUBLIC
     return given if "://" in given else f"http://{given}"
 
 
-def google_file_system(endpoint: str, bucket: str, wait_s: float = _GREETING_S) -> FileSystem:
+def google_file_system(endpoint: str, bucket: str, wait_s: float = _PROBE_S) -> FileSystem:
     """Raises OSError in one line where the server does not answer within `wait_s`, or credentials are of no use."""
     from pyarrow import fs
 
-    _greet(endpoint, bucket, wait_s)
+    _probe(endpoint, bucket, wait_s)
     parts = urllib.parse.urlsplit(endpoint)
     anonymous = endpoint != _PUBLIC or not _has_credentials()
     system = fs.GcsFileSystem(
@@ -63,7 +63,7 @@ def google_file_system(endpoint: str, bucket: str, wait_s: float = _GREETING_S) 
 
 
 def _try_credentials(system: FileSystem, bucket: str) -> None:
-    """Credentials are read with the first request; one may lack the right to this and have all that is needed."""
+    """Read the credentials with a first request, which they need not permit."""
     try:
         system.get_file_info(f"{bucket}/vplog")
     except OSError as error:
@@ -71,8 +71,8 @@ def _try_credentials(system: FileSystem, bucket: str) -> None:
             raise
 
 
-def _greet(endpoint: str, bucket: str, wait_s: float) -> None:
-    """Any answer will do. Where a proxy is between, it answers, not the server: nothing to learn."""
+def _probe(endpoint: str, bucket: str, wait_s: float) -> None:
+    """Raises OSError where nothing answers. A proxy would answer for the server, so behind one nothing is probed."""
     if urllib.request.getproxies().get(urllib.parse.urlsplit(endpoint).scheme) and endpoint == _PUBLIC:
         return
     url = f"{endpoint}/storage/v1/b/{urllib.parse.quote(bucket, safe='')}/o?maxResults=1&fields=kind"
@@ -102,7 +102,7 @@ def _has_credentials() -> bool:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """What Google's client says in one line, as the OSError that it is; all else as it comes."""
+    """Errors of Google's client as an OSError of one line; others are not changed."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -113,7 +113,7 @@ def plain_errors() -> Iterator[None]:
 
 
 def plain(text: str) -> str:
-    """One line of a google::cloud::Status, and what to do where it is about who asks."""
+    """One line of a google::cloud::Status, with a remedy where credentials are at fault."""
     if "google::cloud::Status" not in text:
         return text
     found = _REASON.search(text)

@@ -1,4 +1,4 @@
-"""Files on a web server, by ranges (RFC 9110, section 14); what it says is not believed, and every wait has an end."""
+"""Files on a web server, by ranges (RFC 9110, section 14); its answers are not trusted, and every wait is bounded."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _TIMEOUT_S = 30.0
-"""A server that says nothing for so long is taken as gone."""
+"""Timeout of a server without an answer."""
 _SLOWEST = 1000
 """Bytes a second, below which a server is taken as gone; a modem had seven times as many."""
 _CONTENT_RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
@@ -53,7 +53,7 @@ def get_range(url: str, start: int, count: int, length: int) -> bytes:
             if time.monotonic() - began > _TIMEOUT_S + len(data) / _SLOWEST:
                 raise OSError(f"the server sends less than {_SLOWEST} bytes a second")
     if not data:
-        raise OSError(f"the server says that it has {length} bytes, and sends none from byte {start} on")
+        raise OSError(f"the server states a length of {length} bytes, and sends none from byte {start} on")
     return bytes(data)
 
 
@@ -61,7 +61,7 @@ class _StatusError(OSError):
     """The server refuses."""
 
     def __init__(self, code: int, reason: str) -> None:
-        super().__init__(f"the server says {code} {reason}")
+        super().__init__(f"the server answers {code} {reason}")
         self.code = code
 
 

@@ -1,7 +1,7 @@
-"""Image files: their size by their own header, and their pixels, in bounded memory and without a word on stderr.
+"""Image files: their size by their own header, and their pixels, in bounded memory and without output on stderr.
 
-libpng and libjpeg print what they find on stderr, in OpenCV too. So JPEGs are decoded by simplejpeg, which raises
-instead, and OpenCV is given only PNGs that libpng has nothing to say of.
+libpng and libjpeg print warnings to stderr, in OpenCV too. So JPEGs are decoded by simplejpeg, which raises
+instead, and OpenCV is given only PNGs that libpng does not warn of.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ except ImportError:  # no wheel for this processor
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says of files is raised here
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors of files are raised here
 
 MAX_PIXELS = 2**26
 """px of a compressed image that are decoded (67 million: above the cameras of vehicles and robots)."""
@@ -57,12 +57,12 @@ _LAST_FILTER = 4
 
 
 class BadImageError(ValueError):
-    """Bytes that are no image, or no whole one; the message says why."""
+    """Bytes that are no image, or no whole one; the message is the reason."""
 
 
 def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
     """(H, W) grey of 8 bits, or of 16 where the file has as many. `unchanged`: (H, W) or (H, W, C) as OpenCV orders
-    colours. Raises BadImageError where the header's size is not believable or the pixels are not whole."""
+    colours. Raises BadImageError where the header's size is implausible or the pixels are not whole."""
     if data[:2] != JPEG:
         data = bytes(data)
     size = image_size(data)

@@ -41,7 +41,7 @@ VERSION_KEY = "vplog.table_version"
 VERSION_ABOUT = (
     "Version of the columns. A reader takes this one and older ones; columns that it does not know it passes over."
 )
-"""What the contracts say of it."""
+"""Its description in the contracts."""
 _SEAL = struct.Struct("<8sII")
 """Magic, CRC-32 of all before, CRC-32 of the footer with its length and magic."""
 _SEAL_MAGIC = b"vplogcrc"
@@ -52,7 +52,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 class _Sealed(io.RawIOBase):
-    """A stream that sums up what is written to it, and holds back the footer."""
+    """A stream with a CRC-32 of what is written to it, which holds back the footer."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self._crc, self.footer = stream, 0, bytearray()
@@ -124,7 +124,7 @@ def _check_seal(path: Path, footer_alone: bool = False) -> None:
         stream.seek(max(size - _TAIL, 0))
         start = size - _TAIL - int.from_bytes(stream.read(4), "little") - _SEAL.size
         if start < 0:
-            return  # pyarrow says what is wrong
+            return  # left to pyarrow
         stream.seek(start)
         magic, body, footer = _SEAL.unpack(stream.read(_SEAL.size))
         if magic != _SEAL_MAGIC:
@@ -132,12 +132,12 @@ def _check_seal(path: Path, footer_alone: bool = False) -> None:
         sound = zlib.crc32(stream.read()) == footer
         if sound and not footer_alone:
             stream.seek(0)
-            sound = _summed(stream, start) == body
+            sound = _crc_of(stream, start) == body
     if not sound:
         raise ValueError("It is damaged: its checksum does not match.")
 
 
-def _summed(stream: BinaryIO, count: int) -> int:
+def _crc_of(stream: BinaryIO, count: int) -> int:
     """CRC-32 of the next `count` bytes."""
     total = 0
     while count and (block := stream.read(min(count, _BLOCK_BYTES))):
@@ -153,7 +153,7 @@ def _check_version(path: Path, schema: pa.Schema) -> None:
 
 
 def check_version(path: Path, version: object, newest: int, maker: object = None) -> None:
-    """Raises NewerError where a file says that it is of a newer version than the newest that is read."""
+    """Raises NewerError where the version of a file is newer than the newest that is read."""
     if type(version) is not int or not 0 < version <= newest:
         by = f"by vplog {maker}" if isinstance(maker, str) and maker else "by another vplog"
         raise NewerError(

@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
 
 from vplog.errors import LogError, ResultError, SettingsError
-from vplog.storage.gcs import google_file_system, google_place, plain, plain_errors
+from vplog.storage.gcs import gcs_endpoint, google_file_system, plain, plain_errors
 from vplog.storage.http import get_range, head
 from vplog.storage.scratch import scratch
 from vplog.storage.urls import shown, without_secrets
@@ -32,9 +32,9 @@ SCHEMES = ("s3", "gs", "http", "https")
 _BLOCK_BYTES = 1 << 20
 """Read ahead of small reads: a chunk of a log; a request costs as much as some hundred kB."""
 _TIMEOUT_S = 30.0
-"""A server that says nothing for so long is taken as gone."""
+"""Timeout of a server without an answer."""
 _DENIED = re.compile(r"ACCESS_DENIED|AccessDenied|PERMISSION_DENIED|HTTP response code 403")
-"""What pyarrow's clients say of a request that this account may not make."""
+"""Errors of pyarrow's clients where this account lacks the permission."""
 
 
 class Stat(NamedTuple):
@@ -184,7 +184,7 @@ class RemotePath:
         """The file system of an object store, and the path in it."""
         place = urllib.parse.unquote(self.url.split("://", 1)[1])
         if self.scheme == "gs":
-            return google_system(google_place(), place.partition("/")[0]), place
+            return google_system(gcs_endpoint(), place.partition("/")[0]), place
         return file_system(*s3_place()), place
 
     @cached_property
@@ -291,11 +291,11 @@ def file_system(endpoint: str | None, region: str | None) -> FileSystem:
 
 
 _STANDS_FOR: dict[Path, Path | RemotePath] = {}
-"""What folders and files of this machine stand for, while they are there."""
+"""Original places of temporary copies, by local path."""
 
 
 def original(path: Path) -> Path:
-    """What a local path stands for, itself or by the folder it is in; any other path itself."""
+    """The original place of a temporary copy or of a path in one; any other path itself."""
     for folder in (path, *([] if isinstance(path, RemotePath) else path.parents)):
         if folder in _STANDS_FOR:
             place = _STANDS_FOR[folder]

@@ -83,8 +83,9 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A binary stream that becomes `path` when the block ends well; what was there before stays until then.
+def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
+    """A binary stream that becomes `path` when the block ends well; what was there before stays until then. With
+    `parents` the folders above it are made.
 
     The bytes go to a hidden file beside it, are synced, then renamed. A link stays one: what it points to is replaced.
     A device or a pipe is written into. Raises ResultError where the folder cannot be written or the disk is full.
@@ -96,6 +97,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             with path.open("wb") as stream:
                 yield stream
             return
+        if parents:
+            path.parent.mkdir(parents=True, exist_ok=True)
         path = path.resolve() if path.is_symlink() else path
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:

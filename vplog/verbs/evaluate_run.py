@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Gps, Trajectory
 from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, trajectory
 from vplog.evaluate.body_truth import body_truth
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from vplog import logs
     from vplog.data import Floats, Keyframes
     from vplog.evaluate.body_truth import BodyTruth
+
+
+_PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,8 @@ class Evaluation:
 def evaluate(
     folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None
 ) -> dict[str, Any]:
-    """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file or `gps`.
+    """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file, `gps`, or `auto`:
+    the ground truth that comes with the log, else its GPS.
 
     Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
 
@@ -61,16 +65,27 @@ def evaluate(
     record = run_record.read_finished_run(folder)
     if "maps" in record:
         return _joint(folder, record, truth, options)
-    if truth == "gps":
-        return {"truth": "gps", **_against_gps(folder, record, topics, options)}
-    return evaluate_poses(folder, record, truth, options).record
+    known = log_truth(record, topics, options) if truth == "auto" else None
+    if isinstance(known, Trajectory) or truth not in ("gps", "auto"):
+        return evaluate_poses(folder, record, truth, options, known if isinstance(known, Trajectory) else None).record
+    return {"truth": truth, **_against_gps(folder, record, topics, options, known)}
+
+
+def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions) -> Trajectory | Gps:
+    """The ground truth that comes with the log of a run, else its fixes. Raises TruthError where it has neither."""
+    log = reopened(record, None, topics, _PUT_BACK)
+    found = log.truth()
+    found = log.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
+    if found is None:
+        raise TruthError(f"{log.name} comes with no ground truth and no GPS fixes. Give a file: --truth FILE.tum")
+    return found
 
 
 def evaluate_poses(
     folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None
 ) -> Evaluation:
     """A run of one drive against a TUM file, or the poses `known` that were read from it. Raises as `evaluate`."""
-    known = _read_truth(truth, options) if known is None else known
+    known = _shifted(read_truth(truth), options) if known is None else known
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
@@ -83,7 +98,11 @@ def evaluate_poses(
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, camera)
     found = {
         "truth": shown(truth),
-        "truth_is": {"frame": of_body.frame, "oriented": of_body.oriented},
+        "truth_is": {
+            "frame": of_body.frame,
+            "oriented": of_body.oriented,
+            "odometry": (record.get("topics") or {}).get("odometry") == "truth",
+        },
         **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
         "residuals": asdict(closures.score_residuals(keyframes, ledger, of_body)),
@@ -93,8 +112,7 @@ def evaluate_poses(
     return Evaluation(found, keyframes, of_body, judged)
 
 
-def _read_truth(truth: str, options: TruthOptions) -> Trajectory:
-    known = read_truth(truth)
+def _shifted(known: Trajectory, options: TruthOptions) -> Trajectory:
     return Trajectory(known.stamp_ns + round(options.truth_offset_s * 1e9), known.world_from_body)
 
 
@@ -122,9 +140,9 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
 
     Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
     """
-    if truth == "gps":
-        raise TruthError(f"{folder} holds several drives; each has its own GPS: vplog evaluate {folder}/DRIVE")
-    known = _read_truth(truth, options)
+    if truth in ("gps", "auto"):
+        raise TruthError(f"{folder} holds several drives; each has its own truth: vplog evaluate {folder}/DRIVE")
+    known = _shifted(read_truth(truth), options)
     drives: dict[str, Evaluation] = {}
     uncovered: dict[str, str] = {}
     maps = []
@@ -169,7 +187,11 @@ def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCri
 
 
 def _against_gps(
-    folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions
+    folder: Path,
+    record: dict[str, Any],
+    topics: logs.TopicChoice | None,
+    options: TruthOptions,
+    fixes: Gps | None = None,
 ) -> dict[str, Any]:
     if options != TruthOptions(align=options.align):
         raise TruthError(
@@ -179,7 +201,7 @@ def _against_gps(
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
-    fixes = reopened(record, None, topics, "Put it back there, or give a truth file: --truth FILE.tum.").gps()
+    fixes = reopened(record, None, topics, _PUT_BACK).gps() if fixes is None else fixes
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from vplog.data import Closures, Keyframes
     from vplog.figures.closure_view import SharedBoxes
     from vplog.pipeline import Pipeline
+    from vplog.stages import Log
 
 
 def explain(
@@ -52,13 +53,15 @@ def explain(
     row = tables.read_closure(path, number)
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
     reason = str(run_record.recorded(record, folder / "run.json", dict, "solution").get("reason", ""))
-    words = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
+    explanation = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
-        opened, file = reopened(record, log, topics), picture or folder / f"closure-{number}.png"
-        shown = _show(number, row, words, folder, record, pipeline, opened, file)
-    return {"run": str(folder), "closure": number, "row": row, **asdict(words), "picture": shown}
+        view = _view(number, row, explanation, folder, record, pipeline, reopened(record, log, topics))
+        file = picture or folder / f"closure-{number}.png"
+        draw(file, view)
+        shown = {"file": str(file), **_counts(view)}
+    return {"run": str(folder), "closure": number, "row": row, **asdict(explanation), "picture": shown}
 
 
 def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyframes) -> int:
@@ -84,23 +87,26 @@ def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyf
     return int(found[0])
 
 
-def _show(
-    number: int, row: dict[str, Any], words: explain_text.Words, folder: Path, record: dict[str, Any],
-    pipeline: Pipeline, log: Any, picture: Path,
-) -> dict[str, Any]:  # fmt: skip
-    """Read both frames again, look for what they share, and draw it."""
+def _view(
+    number: int, row: dict[str, Any], explanation: explain_text.Explanation, folder: Path, record: dict[str, Any],
+    pipeline: Pipeline, log: Log,
+) -> View:  # fmt: skip
+    """Both frames, read again from the log, with their matches and shared boxes."""
     stamps = np.array([row["match_stamp_ns"], row["query_stamp_ns"]], np.int64)
     match, query = frames_at(log, stamps, pipeline, f"is it the log of {folder}? Name it with --log.")
     agreement = find_agreement(query[1], match[1], row, log.camera(), pipeline.verify)
     boxes, missing = _boxes(row, folder, record, pipeline)
-    draw(picture, View(number, row, words, query[0], match[0], agreement, boxes, missing))
+    return View(number, row, explanation, query[0], match[0], agreement, boxes, missing)
+
+
+def _counts(view: View) -> dict[str, Any]:
+    """The picture in numbers, for the record."""
     return {
-        "file": str(picture),
-        "matches": len(agreement.agrees),
-        "agree": int(agreement.agrees.sum()),
-        "agree_with": agreement.model,
-        "references": [one.reference for one in boxes],
-        "without_boxes": missing,
+        "matches": len(view.agreement.agrees),
+        "agree": int(view.agreement.agrees.sum()),
+        "agree_with": view.agreement.model,
+        "references": [one.reference for one in view.boxes],
+        "without_boxes": view.missing,
     }
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import Verdict
-from vplog.figures.canvas import as_text, drawn
-from vplog.results.report.charts import evenly
+from vplog.figures.canvas import as_text, saved_figure
+from vplog.results.report.charts import subsampled
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
     from vplog.data import Bytes, Floats
     from vplog.figures.closure_view import Agreement, SharedBoxes
-    from vplog.verbs.explain_text import Words
+    from vplog.verbs.explain_text import Explanation
 
 _COLOURS = ("#ff9d2e", "#4cc3ff", "#ff5fa8", "#b9e04a")
 """One for each reference drawn, apart from each other and from the lines, bright on grey pictures."""
 _AGREES, _OTHER = "#35e06f", "#ff4d3d"
 _MOST_LINES = 150
-"""Lines of either kind that are drawn, evenly chosen: more hide the picture."""
+"""Lines of either kind that are drawn, subsampled: more hide the picture."""
 _WIDTH_IN = 12.0
 _CHARACTERS = 195
 """Characters of a caption line, at 8 points, along that width."""
@@ -41,7 +41,7 @@ class View:
 
     number: int
     row: dict[str, Any]
-    words: Words
+    explanation: Explanation
     query: Bytes
     """(H, W) grey."""
     match: Bytes
@@ -59,7 +59,9 @@ def draw(path: Path, view: View) -> None:
     boxes_in = 0.35 + max((_WIDTH_IN / 4 * b.image.shape[0] / b.image.shape[1] for b in view.boxes), default=-0.35)
     caption = textwrap.wrap(_caption(view), _CHARACTERS)
     kind = "svg" if path.suffix == ".svg" else "png"
-    with drawn(path.parent, path.stem, _WIDTH_IN, frames_in + boxes_in + 0.75 + 0.16 * len(caption), (kind,)) as figure:
+    with saved_figure(
+        path.parent, path.stem, _WIDTH_IN, frames_in + boxes_in + 0.75 + 0.16 * len(caption), (kind,)
+    ) as figure:
         figure.suptitle(as_text(_title(view)), x=0.01, ha="left", fontsize=12, fontweight="bold")
         figure.supxlabel(as_text("\n".join(caption)), x=0.01, ha="left", fontsize=8, color="#444444")
         heights = (frames_in, boxes_in) if view.boxes else (frames_in,)
@@ -79,7 +81,7 @@ def _caption(view: View) -> str:
     a = view.agreement
     count = int(a.agrees.sum())
     sentences = [
-        f"{view.words.verdict}",
+        f"{view.explanation.verdict}",
         f"{len(a.agrees)} feature matches; "
         + (
             f"green: the {count} that agree with {a.model}; red: the others."
@@ -122,7 +124,7 @@ def _frames(axes: Axes, view: View, stacked: bool) -> None:
     for number, boxes in enumerate(view.boxes):
         # each a little smaller than the one before, so that equal windows are all seen
         for window, side, at in ((boxes.query_window, view.query, 0.0), (boxes.match_window, view.match, offset)):
-            low = _rectangle(axes, window, side, at, _COLOURS[number], inset=0.006 * (number + 1))
+            low = _rectangle(axes, window, side, at, 0.006 * (number + 1), edgecolor=_COLOURS[number])
             axes.text(low[0] + 0.03 * number * width, low[1], str(boxes.reference), va="bottom", fontsize=8,
                       bbox={"facecolor": _COLOURS[number], "pad": 1.0, "linewidth": 0})  # fmt: skip
 
@@ -131,24 +133,21 @@ def _lines(axes: Axes, agreement: Agreement, offset: Floats) -> None:
     from matplotlib.collections import LineCollection
 
     for wanted, colour, width, alpha in ((False, _OTHER, 0.4, 0.6), (True, _AGREES, 0.5, 0.8)):
-        rows = evenly(np.flatnonzero(agreement.agrees == wanted), _MOST_LINES)
+        rows = subsampled(np.flatnonzero(agreement.agrees == wanted), _MOST_LINES)
         ends = np.stack([agreement.query[rows] + 0.5, agreement.match[rows] + offset], axis=1)
         axes.add_collection(LineCollection(list(ends), colors=colour, linewidths=width, alpha=alpha), autolim=False)
         points = ends.reshape(-1, 2)
         axes.scatter(points[:, 0], points[:, 1], 3.0, colour, linewidths=0, alpha=0.9)
 
 
-def _rectangle(
-    axes: Axes, corners: Floats, image: Bytes, at: Floats | float, colour: str, inset: float = 0.0,
-    width: float = 1.2, style: str = "-",
-) -> Floats:  # fmt: skip
+def _rectangle(axes: Axes, corners: Floats, image: Bytes, at: Floats | float, inset: float, **style: Any) -> Floats:
     """Draw a box given in shares of an image whose corner is `at`; its lower left corner."""
     from matplotlib.patches import Rectangle
 
     height, wide = image.shape
     size = np.array([wide, height])
     low, high = corners[:2] * size + at + inset * wide, corners[2:] * size + at - inset * wide
-    axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, edgecolor=colour, linewidth=width, linestyle=style))
+    axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, **{"linewidth": 1.2, **style}))
     return np.array([low[0], high[1]])
 
 
@@ -162,6 +161,7 @@ def _reference(axes: Axes, boxes: SharedBoxes, row: dict[str, Any], colour: str)
         for number, one in enumerate(corners):
             if np.isfinite(one).all():
                 inset = 0.0 if style == "-" else 0.008
-                _rectangle(axes, one, boxes.image, 0.0, colour, inset, 2.0 if number == best else 0.6, style)
+                line = {"edgecolor": colour, "linewidth": 2.0 if number == best else 0.6, "linestyle": style}
+                _rectangle(axes, one, boxes.image, 0.0, inset, **line)
     share = row["shared_overlap"][row["shared_references"].index(boxes.reference)]
     axes.set_title(f"reference {boxes.reference}: {100 * share:.0f} % in common", fontsize=8.5)

@@ -29,8 +29,8 @@ _SCALE = {
 
 
 @dataclass(frozen=True)
-class Words:
-    """Paragraphs on one closure, each of one to four sentences."""
+class Explanation:
+    """Paragraphs of one to four sentences that explain one closure."""
 
     verdict: str
     proposed: str
@@ -41,7 +41,7 @@ class Words:
 
 def describe(
     row: Row, keyframes: Keyframes, world_from_body: Floats, siblings: list[str], pipeline: Pipeline, reason: str
-) -> Words:
+) -> Explanation:
     """Describe one ledger row, by column.
 
     `world_from_body` (N, 4, 4) are the solved poses, `siblings` the verdicts of all candidates of its query, `reason`
@@ -49,7 +49,7 @@ def describe(
     """
     verdict = Verdict(row["verdict"])
     became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, f"Rejected, {verdict.value}")
-    return Words(
+    return Explanation(
         f"{became}: {verdict.sentence}",
         _proposed(row, keyframes, siblings),
         _geometry(row),
@@ -125,16 +125,13 @@ def _solver(row: Row, keyframes: Keyframes, world_from_body: Floats, reason: str
     apart = f"The two keyframes are {odometry_m:.2f} m apart by the odometry and {solved_m:.2f} m in the result."
     if row["weight"] is None:
         return f"It was not given to the solver. {apart}"
-    before, after = (_sigma(row[f"residual_{when}"]) for when in ("before", "after"))
+    residuals = (row[f"residual_{when}"] for when in ("before", "after"))
+    before, after = ("an unknown number of sigma" if one is None else f"{one:.1f} sigma" for one in residuals)
     return (
         f"The odometry alone is {before} away from it, and the solved trajectory {after} (for a true closure "
         f"{_TYPICAL_SIGMA} is usual, and more than {_MOST_SIGMA} rare). Its weight in the robust solve is "
         f"{row['weight']:.2f}. {apart} The solve of the whole run: {reason}"
     )
-
-
-def _sigma(residual: float | None) -> str:
-    return "an unknown number of sigma" if residual is None else f"{residual:.1f} sigma"
 
 
 def _count(number: int, name: str, plural: str = "s") -> str:
@@ -189,6 +186,7 @@ _CHANGES = {
     "rejected_by_solver": "It would be kept if the odometry or other closures agreed with it. Where it is right, the "
     "odometry's noise is set too small or the neighbouring closures are false: look at the candidates around keyframe "
     "{query} with a weight of 1, and at the noise settings (`noise`).",
+    "not_significant": "It would be used at a false rate of {p_false:.2g} (--false-rate), or without one.",
     "direction_only": "Metres would need landmarks: keyframes around the match that moved further, a depth image or a "
     "stereo pair.",
 }

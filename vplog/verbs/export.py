@@ -6,12 +6,14 @@ import hashlib
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
+from vplog.execution.execution import Execution
 from vplog.geometry import tum
 from vplog.results import geo, poses, tables
 from vplog.results.rrd import write_rrd
 from vplog.results.run_record import read_single_run
 from vplog.run.report import gather_tracks
 from vplog.storage.scratch import replacing
+from vplog.verbs.export_images import FOLDERS, export_images
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,15 +21,23 @@ if TYPE_CHECKING:
     from vplog.results.geo import Earth
     from vplog.results.report.page import Tracks
 
-FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "rrd")
+FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd")
+"""Those that are one file; two more are a folder."""
 
 
-def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
-    """Write the run in `folder` as one of `FORMATS`; what was written. Raises ResultError."""
+def export(
+    folder: Path, kind: str, path: Path, log: Path | None = None, execution: Execution = Execution()
+) -> dict[str, Any]:
+    """Write the run in `folder` as one of `FORMATS` or `FOLDERS`; what was written. Raises VplogError.
+
+    The pictures of a folder are those of the run's log, or of `log` where that has moved.
+    """
     record = read_single_run(folder)
     tracks = gather_tracks(folder, record)
     written = [str(path)]
     match kind:
+        case _ if kind in FOLDERS:
+            written = export_images(folder, record, kind, path, log, execution)
         case "tum":
             tum.write_tum(path, tracks.after)
         case "kitti":
@@ -41,17 +51,20 @@ def export(folder: Path, kind: str, path: Path) -> dict[str, Any]:
             where = _earth(folder, kind, tracks)
             tree = geo.feature_collection(where, tracks.world_from_body, tracks.keyframes.stamp_ns, closures)
             geo.write_geojson(path, tree)
+        case "kml":
+            closures = tables.read_closures(folder / "closures.parquet")
+            where = _earth(folder, kind, tracks)
+            geo.write_kml(path, where, tracks.world_from_body, closures, tracks.keyframes.drive)
+        case "utm":
+            geo.write_utm(path, tracks.after, _earth(folder, kind, tracks))
         case "geoparquet":
             header = tables.read_metadata(folder / "trajectory.parquet")
             geo.write_geoparquet(path, tracks.after, _earth(folder, kind, tracks), header)
         case "rrd":
             closures = tables.read_closures(folder / "closures.parquet")
-            write_rrd(
-                path, tracks.keyframes, tracks.world_from_body, closures, tracks.before, tracks.after, tracks.earth,
-                folder / "result.mcap",
-            )  # fmt: skip
+            write_rrd(path, tracks, closures, folder / "result.mcap")
         case _:
-            raise ResultError(f"No format {kind!r}. Formats: {', '.join(FORMATS)}.")
+            raise ResultError(f"No format {kind!r}. Formats: {', '.join([*FORMATS, *FOLDERS])}.")
     return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}
 
 
@@ -69,7 +82,7 @@ def _copy(source: Path, path: Path, sha256: object) -> None:
 
 def _earth(folder: Path, kind: str, tracks: Tracks) -> Earth:
     if tracks.earth is None:
-        others = ", ".join(one for one in FORMATS if not one.startswith("geo"))
+        others = ", ".join(one for one in [*FORMATS, *FOLDERS] if not one.startswith(("geo", "kml", "utm")))
         raise ResultError(
             f"{folder} has fewer than three satellite fixes, so no place on earth, which {kind} needs. "
             f"Other formats: {others}."

@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 
 from vplog import logs
-from vplog.errors import LogError, ResultError
-from vplog.logs.odometry_sources import in_words as evidence_in_words
+from vplog.errors import LogError
+from vplog.logs.clocks import GAP_NS, GAP_PERIODS
+from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
 from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.run.odometry import gives_visual
 from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
 
@@ -31,12 +33,9 @@ if TYPE_CHECKING:
 _SAMPLES = 8
 """Frames that are decoded: enough to see what the drive looks like and whether its images decode throughout."""
 PICTURE_PX = 480
-"""px across a picture that is kept: a phone's width, and half of a column on a screen."""
+"""px across a stored picture: a phone's width, and half of a column on a screen."""
 _QUALITY = 75
 """JPEG quality: pictures to recognise a place by, of some 20 kB each."""
-_GAP_S = 1.0
-"""s without a message that count as a gap, where they are also _GAP_PERIODS of the topic's own."""
-_GAP_PERIODS = 10
 _MOST_TRIED = 4
 """Other topics that are tried where those chosen do not work: each reads the log again."""
 _MOST_GAPS = 20
@@ -44,7 +43,8 @@ _MOST_GAPS = 20
 _OPTIONS = {
     "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
-    "calibration_file": "calibration",
+    "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
+    "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
 _PART_WORDS = {
@@ -55,6 +55,7 @@ _PART_WORDS = {
     "right_info": "calibration of the right camera",
     "odometry": "odometry",
     "gps": "satellite fixes",
+    "imu": "gyroscope, which turns the velocities",
     "tf_static": "static transforms",
     "tf": "transforms",
 }
@@ -75,26 +76,28 @@ def preflight(path: Path, topics: TopicChoice | None = None) -> Preflight:
 
     Where a run cannot work, other topics are tried in the same way, and the record's `command` is one that works.
     """
-    found = _look(path, topics or logs.TopicChoice())
+    found = _inspect(path, topics or logs.TopicChoice())
     if found.record["problems"]:
-        found.record["command"] = _working(path, topics or logs.TopicChoice(), found)
+        found.record["command"] = _working_command(path, topics or logs.TopicChoice(), found)
     return found
 
 
-def _working(path: Path, topics: TopicChoice, found: Preflight) -> str | None:
-    """A run with another camera or odometry topic, or, with images alone, a library; None where nothing works."""
+def _working_command(path: Path, topics: TopicChoice, found: Preflight) -> str | None:
+    """A run with another camera or odometry topic; with images alone a library, and of pictures in a folder a map; None
+    where nothing works."""
     unused = [topic for topic in found.record["topics"] if topic["count"] and not topic["used"]]
     for topic in [topic for topic in unused if topic["role"] in ("image", "odometry")][:_MOST_TRIED]:
         file = {"odometry_file": None} if topic["role"] == "odometry" else {}
         choice = topics.model_copy(update={topic["role"]: topic["name"], **file})
         with suppress(LogError):
-            if _look(path, choice).record["ready"]:
+            if _inspect(path, choice).record["ready"]:
                 return command(path, choice)
     images = topics.model_copy(update={"odometry": None, "odometry_file": None})
-    return command(path, images).replace("vplog run", "vplog library", 1) if found.pictures else None
+    verb = "library" if logs.open(path, images).file_names() is None else "batch"
+    return command(path, images).replace("vplog run", f"vplog {verb}", 1) if found.pictures else None
 
 
-def _look(path: Path, topics: TopicChoice) -> Preflight:
+def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     """What is there with these topics, whose `command` runs on it where nothing is in the way."""
     log = logs.open(path, topics)
     found = log.info()
@@ -102,7 +105,9 @@ def _look(path: Path, topics: TopicChoice) -> Preflight:
     camera, odometry, gps = _camera(log, problems), log.odometry(), log.gps()
     stamp_ns = log.stamps() if camera is not None else np.zeros(0, np.int64)
     pictures, decoded = _pictures(log, stamp_ns, problems)
-    keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
+    visual = camera is not None and gives_visual(log)
+    by_images = visual and odometry is None and topics.odometry in (None, "visual")
+    keyframes, missing = (None, []) if by_images else _keyframes(log, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     for topic, entry in zip(found.topics, named["topics"], strict=True):
@@ -115,6 +120,7 @@ def _look(path: Path, topics: TopicChoice) -> Preflight:
             "keyframes": keyframes,
         },
         "odometry": _about_odometry(odometry, found, topics),
+        "visual_odometry": "used" if by_images else "possible" if visual else "",
         "gps": _about_gps(gps, found),
         "scale": _scale(camera, found),
         "gaps": _gaps(found, stamp_ns, odometry, gps),
@@ -173,10 +179,7 @@ def _keyframes(
     if not len(stamp_ns):
         return None, []
     if odometry is None or len(odometry.stamp_ns) < 2:
-        problems.append(
-            "There is no odometry, and a trajectory is built on it: name its topic with --odometry-topic, or give "
-            "poses with --odometry-file."
-        )
+        problems.append(f"There is no odometry, and a trajectory is built on it. {log.without_odometry()}")
         return None, []
     try:
         keyframes, missing = select_keyframes(log.name, stamp_ns, odometry, KeyframeSettings())
@@ -195,7 +198,7 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
     """Why a topic is used or not, in a sentence."""
     if topic.used:
         chosen = {str(value) for name, value in topics if value and not name.endswith("_file")}
-        return f"used as {_PART_WORDS[topic.part]}" + (", as asked for" if topic.name in chosen else "")
+        return f"used as {_PART_WORDS[topic.part]}" + (", as requested" if topic.name in chosen else "")
     if not topic.count:
         return "no messages"
     if not topic.role:
@@ -212,9 +215,11 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
     source = next((other for other in others if other.topic == topic.name), None)
     if best is not None and source is not None:
         return (
-            f"{best.topic} is taken, score {best.score:.2g}; this has {evidence_in_words(source)}; "
+            f"{best.topic} is taken, score {best.score:.2g}; this has {evidence_text(source)}; "
             f"--odometry-topic {topic.name} takes it"
         )
+    if topic.role == "imu":
+        return "its gyroscope would turn velocities, which are not the odometry"
     if topic.role in ("tf", "tf_static"):
         return "it adds no transform to those of other topics"
     if topic.role == "depth" and any(other.part == "right" for other in found.topics):
@@ -239,13 +244,15 @@ def _about_camera(camera: Camera) -> dict[str, Any]:
 def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoice) -> dict[str, Any] | None:
     if odometry is None:
         return None
-    taken = next((topic for topic in found.topics if topic.part == "odometry"), None)
+    taken, _ = _odometry_sources(found)
     position = odometry.odom_from_body[:, :3, 3]
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
     known = odometry.covariance is not None
     return {
-        "source": taken.name if taken else str(topics.odometry_file),
+        "source": taken.topic if taken else str(topics.odometry_file),
         "type": taken.type if taken else "TUM file",
+        "kind": taken.kind if taken else "poses",
+        "properties": PROPERTIES[taken.kind if taken else "poses"],
         "frames": found.odometry_frames,
         "count": len(odometry.stamp_ns),
         **_timing(odometry.stamp_ns),
@@ -257,8 +264,7 @@ def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoi
 
 def _odometry_sources(found: LogInfo) -> tuple[OdometrySource | None, list[OdometrySource]]:
     """The source in use, None of a file, and the others."""
-    used = next((topic.name for topic in found.topics if topic.part == "odometry"), None)
-    best = next((source for source in found.odometry_sources if source.topic == used), None)
+    best = next((source for source in found.odometry_sources if source.used), None)
     return best, [source for source in found.odometry_sources if source is not best]
 
 
@@ -267,9 +273,9 @@ def _choice(found: LogInfo, topics: TopicChoice) -> str:
     best, others = _odometry_sources(found)
     if best is None:
         return ""
-    why = "as asked for" if topics.odometry else "the only source" if not others else "the best source"
-    text = f"{best.topic} is {why}: {evidence_in_words(best)}"
-    return text + (f"; next is {others[0].topic}: {evidence_in_words(others[0])}" if others else "")
+    why = "as requested" if topics.odometry else "the only source" if not others else "the best source"
+    text = f"{best.topic} is {why}: {evidence_text(best)}"
+    return text + (f"; next is {others[0].topic}: {evidence_text(others[0])}" if others else "")
 
 
 def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
@@ -308,7 +314,7 @@ def _gaps(found: LogInfo, stamp_ns: Ints, odometry: Odometry | None, gps: Gps | 
     gaps = []
     for part, stamps in by_part:
         steps = np.diff(stamps)
-        limit = max(_GAP_S * 1e9, _GAP_PERIODS * float(np.median(steps))) if len(steps) else 0.0
+        limit = max(GAP_NS, GAP_PERIODS * float(np.median(steps))) if len(steps) else 0.0
         gaps += [(int(steps[row]), int(stamps[row]), part) for row in np.flatnonzero(steps > limit)]
     longest = sorted(gaps, reverse=True)[:_MOST_GAPS]
     return [
@@ -317,7 +323,7 @@ def _gaps(found: LogInfo, stamp_ns: Ints, odometry: Odometry | None, gps: Gps | 
     ]
 
 
-def in_words(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """What of a record would be used, a name and a line each."""
     camera, frames, odometry, gps = (found[name] for name in ("camera", "frames", "odometry", "gps"))
     if camera is not None:
@@ -336,22 +342,31 @@ def in_words(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "odometry", f"{text}, covariance {odometry['covariance']}"
         if odometry["choice"]:
             yield "chosen", odometry["choice"]
+        yield "drift", odometry["properties"]
+    if found["visual_odometry"] == "used":
+        yield "odometry", "visual: the run computes it from the images"
+        yield "drift", PROPERTIES["visual"]
+    elif found["visual_odometry"]:
+        yield "", f"--odometry visual: {PROPERTIES['visual']}"
+    for source in found["odometry_sources"]:
+        if not source["used"]:
+            name = source["kind"] if source["kind"] in ("gps", "truth") else source["topic"]
+            yield "", f"--odometry {name}: {PROPERTIES[source['kind']]}"
     if gps is not None:
         known = f"{gps['with_covariance']} with a covariance"
         yield "gps", f"{gps['source']}: {gps['count']} fixes, {known}; --gps uses them"
+    if found["truth"]:
+        yield "truth", f"{found['truth']}; vplog evaluate OUT --truth auto compares with it"
     yield "scale", f"{found['scale']['source']}: {found['scale']['why']}"
-    if found["skew_ms"]:
+    if any(found["skew_ms"].values()):  # none of data sets, which nothing recorded
         skews = ", ".join(f"{topic} {skew:.1f}" for topic, skew in found["skew_ms"].items())
         yield "skew", f"log time less header stamp, ms: {skews}"
 
 
 def write_page(path: Path, found: Preflight) -> None:
     """Raises ResultError where the file cannot be written."""
-    try:
-        with replacing(path) as stream:
-            stream.write(page(found).encode())
-    except OSError as error:
-        raise ResultError(f"Cannot write {path}: {error.strerror}. Choose another with --html.") from None
+    with replacing(path) as stream:
+        stream.write(page(found).encode())
 
 
 def page(found: Preflight) -> str:
@@ -359,4 +374,6 @@ def page(found: Preflight) -> str:
     record, start_ns = found.record, found.record["start_ns"]
     pictures = [(f"{(stamp_ns - start_ns) / 1e9:.1f} s", jpeg(image, _QUALITY)) for stamp_ns, image in found.pictures]
     name, seconds = record["path"].rstrip("/").rsplit("/", 1)[-1], max(record["end_ns"] - start_ns, 0) / 1e9
-    return render("info.html", record=record, name=name, seconds=seconds, facts=in_words(record), pictures=pictures)
+    return render(
+        "info.html", record=record, name=name, seconds=seconds, facts=preflight_lines(record), pictures=pictures
+    )

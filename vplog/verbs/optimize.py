@@ -1,4 +1,4 @@
-"""`vplog optimize`: a pose graph from anywhere is read, checked, solved, held against its odometry, and written."""
+"""`vplog optimize`: a pose graph of any origin is read, checked, solved, compared with its odometry, and written."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from vplog.data import EdgeKind, PoseGraph, Solution
 from vplog.errors import GraphError
-from vplog.execution.timing import Watch
+from vplog.execution.timing import StageTimer
 from vplog.geometry.se3 import inverse
 from vplog.graph.build import checked, parts, subgraph
 from vplog.graph.certificate import solve_certified
@@ -40,12 +40,12 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
 
     Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
     where it is. With `certify` the record has a `certificate`: whether the solution is the global optimum of the edges
-    kept. Where it is not and a better one is found, that is taken.
+    accepted. Where it is not and a better one is found, that is taken.
 
     Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
     """
     optimiser = TypeAdapter(OptimiserSettings).validate_python({"kind": method})
-    watch = Watch()
+    watch = StageTimer()
     with watch.stage("read"):
         file = read_g2o(path)
     graph, ids = file.graph, file.ids
@@ -58,7 +58,7 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
         with watch.stage("certify"):
             solution, certificate = solve_certified(graph, solution)
     with watch.stage("write"):
-        solution = _holding(solution, graph, part == part[file.held], file.held)
+        solution = _with_fixed(solution, graph, part == part[file.held], file.held)
         write_g2o(out, file.graph, solution.world_from_body, ids, file.held)
     record = _record(path, out, method, file, solution, warnings + repairs, watch)
     if certificate is not None:
@@ -67,7 +67,7 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
 
 
 def _about_parts(part: Ints, ids: Ints) -> list[str]:
-    """What to say of a graph that is not in one part (N,)."""
+    """Warnings on a graph of several unconnected parts (N,)."""
     size = np.bincount(part)
     first = [str(ids[np.argmax(part == number)]) for number in np.flatnonzero(size > 1)[:5].tolist()]
     alone = int((size == 1).sum())
@@ -122,7 +122,7 @@ def _by_part(part: Ints, parts: int) -> Callable[[int], Ints]:
     return lambda number: order[first[number] : first[number + 1]]
 
 
-def _holding(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:
+def _with_fixed(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:
     """The solution with this part (N,) moved as one so that its row is where the graph has it."""
     poses = np.array(solution.world_from_body)
     poses[part] = graph.world_from_body[row] @ inverse(poses[row]) @ poses[part]
@@ -130,7 +130,7 @@ def _holding(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -
 
 
 def _record(
-    path: Path, out: Path, method: str, file: GraphFile, solution: Solution, warnings: list[str], watch: Watch
+    path: Path, out: Path, method: str, file: GraphFile, solution: Solution, warnings: list[str], watch: StageTimer
 ) -> dict[str, Any]:
     graph = file.graph
     loop = np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind])

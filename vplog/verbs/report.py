@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
+from vplog.data import Gps
 from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
-from vplog.evaluate.closures import in_words
+from vplog.evaluate.closures import closure_sentences
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.figures.run_figures import ClosureInputs, choose_examples, draw_closures
@@ -17,12 +18,12 @@ from vplog.geometry import se3
 from vplog.pipeline import Pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
-from vplog.results.report.page import Judged
+from vplog.results.report.page import TruthComparison
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
 from vplog.storage.remote_path import original
 from vplog.storage.urls import shown
-from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, log_truth
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,8 +45,8 @@ def report(
 ) -> dict[str, Any]:
     """Write report.html of the run in `folder`, to `path` where given; what was written.
 
-    `truth` is a TUM file or `gps`, and `options` how it is used, as in `evaluate`; `log` the drive, read again where
-    result.mcap has no pictures of closures.
+    `truth` is a TUM file, `gps` or `auto`, and `options` how it is used, as in `evaluate`; `log` the drive, read again
+    where result.mcap has no pictures of closures.
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
@@ -64,11 +65,12 @@ def report(
 
 def judge(
     folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None, options: TruthOptions
-) -> Judged:
+) -> TruthComparison:
     """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
-    if truth == "gps":
-        return Judged(truth, evaluate(folder, truth, topics, options))
-    found = evaluate_poses(folder, record, truth, options)
+    known = log_truth(record, topics, options) if truth == "auto" else None
+    if truth == "gps" or isinstance(known, Gps):
+        return TruthComparison(truth, evaluate(folder, truth, topics, options))
+    found = evaluate_poses(folder, record, truth, options, known)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
     true, solved = at.world_from_body[at.known][:, :3, 3], world_from_body[at.known][:, :3, 3]
@@ -76,10 +78,10 @@ def judge(
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
     path = se3.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
-    return Judged(
+    return TruthComparison(
         Path(shown(truth)).name,
         found.record,
-        in_words(found.record["closures"]),
+        closure_sentences(found.record["closures"]),
         path,
         judged.right,
         judged.right | judged.wrong,

@@ -54,7 +54,7 @@ def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
             f"{out}/run.json lacks options of its run. Give the full command without --resume: finished stages are "
             "reused."
         )
-    known = [str(located(text).resolve()) for text in _texts(account, file)]
+    known = [str(located(text).resolve()) for text in _recorded_logs(account, file)]
     paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
     if not given:
         again = f"Give it again: vplog run --resume LOG -o {out}"
@@ -80,9 +80,11 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
     """Raises LogError where a log is not what it was when the run began, by its stat, or by its content if known."""
     about = account.get("log_stat")
     if not isinstance(about, dict) or not all(path.exists() for path in paths) or stat_of(paths) == about:
-        return  # of an older version; or the run says what is missing
+        return  # of an older version; or the run reports what is missing
     now = inputs_of(paths, out / CACHE)
-    if now.token == key_of(now.look):  # the cache does not know the content either, so nothing of it would be found
+    if now.token == key_of(
+        now.signature
+    ):  # the cache does not know the content either, so nothing of it would be found
         given = shlex.join(map(str, paths))
         raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
 
@@ -93,7 +95,7 @@ def _place(known: list[str], path: Path) -> int:
     return known.index(text) if text in known else len(known)
 
 
-def _texts(account: dict[str, Any], file: Path) -> list[str]:
+def _recorded_logs(account: dict[str, Any], file: Path) -> list[str]:
     name = next((name for name in ("logs", "parts") if account.get(name)), "log")
     named = recorded(account, file, str if name == "log" else list, name)
     return [recorded({name: path}, file, str, name) for path in ([named] if name == "log" else named)]

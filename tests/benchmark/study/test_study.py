@@ -12,7 +12,7 @@ import pytest
 from vplog import logs
 from vplog.benchmark.recogniser_specs import read_method
 from vplog.benchmark.study import study
-from vplog.benchmark.study.experiments import DEPARTURES, Departure
+from vplog.benchmark.study.experiments import ABLATIONS, Ablation
 from vplog.benchmark.study.study import EXPERIMENTS, short_names, truth_of_pair
 from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice
@@ -66,8 +66,8 @@ def without_seconds(found: dict[str, Any]) -> dict[str, Any]:
 def test_every_experiment_on_two_drives(
     verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    two = [departure for departure in DEPARTURES if departure.name in ("no agreement", "own image left out")]
-    monkeypatch.setattr("vplog.benchmark.study.experiments.DEPARTURES", two)  # they stand for all: one loop does them
+    two = [ablation for ablation in ABLATIONS if ablation.name in ("no agreement", "own image left out")]
+    monkeypatch.setattr("vplog.benchmark.study.experiments.ABLATIONS", two)  # they stand for all: one loop does them
     day, dusk = traversals
     out = tmp_path / "study"
     arguments = ("study", day, dusk, "--truth", "index", "-o", out, *QUICK)
@@ -219,22 +219,22 @@ def test_a_drive_and_its_own_past(verb: Verb, drive: Drive, tmp_path: Path) -> N
 
 def test_departures_are_settings_that_change_something() -> None:
     base = BobbSettings()
-    methods = [read_method(departure.method, Pipeline()) for departure in DEPARTURES]
+    methods = [read_method(ablation.method, Pipeline()) for ablation in ABLATIONS]
     assert all(method != base for method in methods)
-    assert len({method.model_dump_json() for method in methods}) == len(DEPARTURES)
-    assert len({departure.name for departure in DEPARTURES}) == len(DEPARTURES)
+    assert len({method.model_dump_json() for method in methods}) == len(ABLATIONS)
+    assert len({ablation.name for ablation in ABLATIONS}) == len(ABLATIONS)
 
 
 @pytest.mark.parametrize("gone", ["soft_sift=true", "agreement_floor=2", "pairing=worst"])
 def test_a_departure_that_is_no_more_is_one_line(
     verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: str
 ) -> None:
-    stale = Departure("stale", (gone,), "Once there.")
-    monkeypatch.setattr("vplog.benchmark.study.experiments.DEPARTURES", (*DEPARTURES, stale))
+    stale = Ablation("stale", (gone,), "Once there.")
+    monkeypatch.setattr("vplog.benchmark.study.experiments.ABLATIONS", (*ABLATIONS, stale))
     arguments = ("study", *traversals, "--truth", "index", "-o", tmp_path / "out", *QUICK)
     said = verb(*arguments, "--only", "ablations").error
     assert f"bobb:{gone}" in said
-    assert "`vplog config` prints every setting" in said
+    assert "`vplog config --set places.kind=bobb` prints them all" in said
 
 
 # What is refused
@@ -252,7 +252,7 @@ def test_a_departure_that_is_no_more_is_one_line(
         (("DAY", "DUSK", "--methods", "vlad", "--only", "sizes"), "none of them makes boxes"),
         (("DAY", "DUSK", "--methods", "surf"), "No method 'surf'"),
         (("DAY", "DUSK", "--sizes", "50", "--only", "sizes"), "the shortest drive has only 9 frames"),
-        (("DAY", "DUSK", "--truth", "pairs.csv"), "here every drive is both"),
+        (("DAY", "DUSK", "--truth", "pairs.csv"), "Cannot read pairs.csv"),
         (("DAY", "DUSK", "--truth", "a.tum,b.tum,c.tum"), "3 files for 2 drives"),
         (("DAY", "nowhere"), "nowhere"),
         (("DAY", "DUSK", "-o", "DAY"), "a folder with other things in it, not a study"),
@@ -282,9 +282,14 @@ def test_names_without_what_all_share() -> None:
     assert short_names(["run_", "run_2"]) == ["run_", "2"]
 
 
-def test_truth_files_go_to_their_drives() -> None:
+def test_truth_files_go_to_their_drives(tmp_path: Path) -> None:
     truth = TruthChoice("a.tum,b.tum,c.tum", distance_m=3.0)
     assert truth_of_pair(truth, 2, 0, 3) == TruthChoice("c.tum,a.tum", distance_m=3.0)
     assert truth_of_pair(TruthChoice("index"), 1, 0, 2) == TruthChoice("index")
-    with pytest.raises(TruthError):
-        truth_of_pair(TruthChoice("a.CSV"), 0, 1, 2)
+    (tmp_path / "pairs.CSV").write_text("query,match\n0,1\n")
+    pairs = TruthChoice(str(tmp_path / "pairs.CSV"))
+    assert [truth_of_pair(pairs, 0, 1, 2).transposed, truth_of_pair(pairs, 1, 0, 2).transposed] == [False, True]
+    with pytest.raises(TruthError, match="here are 3 drives"):
+        truth_of_pair(pairs, 0, 1, 3)
+    (tmp_path / "labels.csv").write_text("image,label\n0.png,a\n")
+    assert truth_of_pair(TruthChoice(str(tmp_path / "labels.csv")), 1, 0, 3).transposed is False

@@ -39,10 +39,10 @@ def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool, monkeypatc
     )
     for _ in range(2):
         expected = [(n, None if n == 5 else b"" if n % 3 == 0 else bytes([n]) * size) for n in range(9)]
-        assert list(chunks.in_turn(range(9), lambda number: number == 5)) == expected
+        assert list(chunks.iterate(range(9), lambda number: number == 5)) == expected
     assert sorted(loaded) == sorted([*range(5), *range(6, 9), 1, 3, 7])  # even ones were kept
     assert lost == [0, 3, 6, 3]
-    some = chunks.in_turn(range(100, 200))
+    some = chunks.iterate(range(100, 200))
     next(some)
     some.close()
     assert loaded[-1] == 100  # who looks for one does not load those behind it

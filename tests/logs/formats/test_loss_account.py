@@ -33,7 +33,7 @@ from tests.logs.drives import (
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.formats.container import messages_in
-from vplog.logs.formats.loss_account import Account, Runs, merged, runs_of
+from vplog.logs.formats.loss_account import LossAccount, LossRuns, merged, runs_of
 from vplog.logs.recorded_log import RecordedLog
 from vplog.storage import scratch
 
@@ -352,9 +352,9 @@ def test_types_named_as_idl_does_are_known(name: str, tmp_path: Path) -> None:
 
 @given(st.lists(st.booleans(), max_size=40))
 def test_runs_are_those_of_the_lost_messages(lost: list[bool]) -> None:
-    runs = Runs()
+    runs = LossRuns()
     for time_ns, one in enumerate(lost):
-        runs.lost(time_ns) if one else runs.sound()
+        runs.add_lost(time_ns) if one else runs.add_sound()
     assert runs.messages == sum(lost)
     covered = {t for start, stop in runs.spans for t in range(start, stop + 1)}
     assert covered == {t for t, one in enumerate(lost) if one}
@@ -373,8 +373,8 @@ def test_merged_spans_cover_all_and_are_few(found: list[tuple[int, int]]) -> Non
 @given(st.permutations(range(6)), st.integers(0, 5))
 @settings(suppress_health_check=[HealthCheck.too_slow])
 def test_the_account_does_not_depend_on_the_order(order: list[int], again: int) -> None:
-    def account(places: list[int]) -> Account:
-        made = Account()
+    def account(places: list[int]) -> LossAccount:
+        made = LossAccount()
         for place in places:
             made.add("damaged_chunk", {"/a": place + 1, "/b": 1}, ("file", place), [(place * 10**9, place * 10**9 + 1)])
         return made

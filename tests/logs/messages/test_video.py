@@ -24,6 +24,8 @@ from vplog.logs.messages.video import VideoStream, codec_of, packet_kind
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from av import VideoFrame
+
 av = pytest.importorskip("av", reason="PyAV is not installed: pip install 'vplog[video]'")
 foxglove = pytest.importorskip("foxglove_schemas_protobuf.CompressedVideo_pb2")
 
@@ -48,7 +50,23 @@ def pictures() -> list[np.ndarray]:
 
 @cache
 def packets(codec: str, b_frames: int = 0, x265: str = "") -> list[bytes]:
-    """One payload a frame, in the order of decoding."""
+    """One payload a frame, in the order of decoding; again where FFmpeg does not decode what it has encoded, which was
+    seen once in some hundred runs."""
+    for _ in range(3):
+        payloads = encoded(codec, b_frames, x265)
+        decoder = av.CodecContext.create({"av1": "libdav1d"}.get(codec, codec), "r")
+        decoder.thread_count = 1  # dav1d's threads were once waited for forever
+        decoder.options = {"err_detect": "explode"}  # as the reader has it
+        try:
+            for payload in payloads:
+                decoder.decode(av.Packet(payload))
+        except av.error.InvalidDataError:
+            continue
+        return payloads
+    raise AssertionError(f"FFmpeg encodes no {codec} that it decodes")
+
+
+def encoded(codec: str, b_frames: int, x265: str) -> list[bytes]:
     encoder = av.CodecContext.create(ENCODERS[codec], "w")
     encoder.width, encoder.height, encoder.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     encoder.time_base, encoder.framerate = Fraction(1, 20), Fraction(20)
@@ -70,8 +88,9 @@ def packets(codec: str, b_frames: int = 0, x265: str = "") -> list[bytes]:
     return [bytes(packet) for packet in found]
 
 
-def close(image: np.ndarray, number: int) -> bool:
+def close(found: np.ndarray | VideoFrame, number: int) -> bool:
     """Nearer to its own picture than compression takes it, and further from its neighbours'."""
+    image = found if isinstance(found, np.ndarray) else video_module.grey(found)
     errors = [np.abs(image.astype(float) - picture).mean() for picture in pictures()]
     return int(np.argmin(errors)) == number and errors[number] < 3.0
 
@@ -313,7 +332,7 @@ def test_an_ffmpeg_without_the_decoder_is_said(monkeypatch: pytest.MonkeyPatch) 
 def test_luma_is_that_of_pictures() -> None:
     """Limited range is stretched: black is 0 and white 255, as OpenCV's own reader of files has it."""
     video = stream("h264", packets("h264"))
-    image = video.frame(0)
+    image = video_module.grey(video.frame(0))
     y, u = np.full((4, 4), 235, np.uint8), np.full((2, 4), 128, np.uint8)
     white = cv2.cvtColor(np.vstack([y, u]), cv2.COLOR_YUV2RGB_I420)
     assert white.min() == 255

@@ -25,7 +25,7 @@ from vplog.maps.joining import components as component_folders
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining import join as map_join
 from vplog.maps.joining.join import read_drives
-from vplog.maps.joining.joint_record import components_in, components_of
+from vplog.maps.joining.joint_record import components_in
 from vplog.maps.merge import merge_maps
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
@@ -112,7 +112,7 @@ class Elsewhere(Executor):
 
 
 def test_the_halves_of_a_drive_are_one_component(whole: Path, drive: Drive) -> None:
-    [component] = components_of(whole)
+    [component] = components_in(map_store.Store(whole)) or []
     assert component["drives"] == ["after", "before"]
     folder = whole / "joint" / component["folder"]
     told = read_run_json(folder / "component.json")
@@ -166,7 +166,7 @@ def test_what_is_killed_goes_on_to_the_same_bytes(whole: Path, copy: Path, monke
     (copy / "joins" / "drive=drive" / "match=after.parquet").unlink()
     for module, name in (
         (drive_pairs, "put_ledger"),
-        (map_join, "_remember"),
+        (map_join, "_record_pairs"),
         (run_record, "write_run_json"),
         (component_folders, "write_joint"),
     ):
@@ -249,7 +249,7 @@ def test_a_pair_without_its_log_is_left_out_and_tried_again(copy: Path) -> None:
     told = joined(copy)
     assert told["components"] == []
     [warning] = told["warnings"]
-    assert warning.startswith("before in after was left out. The log of before /gone.mcap no longer exists")
+    assert warning.startswith("before and after were not verified. The log of before /gone.mcap no longer exists")
     run_record.write_run_json(record, about)
     told = joined(copy)
     assert (told["searched"], told["pairs_computed"], told["warnings"]) == (["before"], 1, [])
@@ -334,8 +334,8 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
         members = [by_name[name] for name in (other, *HALVES)]
         state = map_join.load_places(store.library(drives.library), few)
         later = {number: candidates.places_of(store, members[number], state) for number in (1, 2)}
-        assert candidates.worth_a_search(store, members, later, state, few) == {1: range(1), 2: {1}}
-        every = candidates.worth_a_search(store, members, later, state, PIPELINE)
+        assert candidates.drives_to_search(store, members, later, state, few) == {1: range(1), 2: {1}}
+        every = candidates.drives_to_search(store, members, later, state, PIPELINE)
         assert every == {1: range(1), 2: range(2)}
         for threads in (1, 3):
             found = candidates.candidates_of(store, members, [2], state, few, Execution(threads))[2]

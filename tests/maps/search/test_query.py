@@ -25,7 +25,7 @@ from vplog.maps.search.exact import Answers, best_places, no_answers
 from vplog.maps.search.index import update_index
 from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.segment import open_segment
-from vplog.maps.search.sequences import likely_drives
+from vplog.maps.search.sequences import drives_by_credit
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import NOWHERE, BobbSettings, BobbState, Place
 from vplog.places.sequence import SequenceSettings
@@ -79,10 +79,10 @@ class Map:
             scored += [(-float(score), number, row) for row, score in enumerate(scores) if score > 0]
         return sorted(scored)[:top]
 
-    def update(self, threads: int = 1) -> tuple[list[map_index.Part], list[str]]:
+    def update(self, threads: int = 1) -> tuple[list[map_index.SegmentView], list[str]]:
         return update_index(self.store, self.store.drives(), self.state, Execution(threads))
 
-    def check(self, threads: int = 1) -> list[map_index.Part]:
+    def check(self, threads: int = 1) -> list[map_index.SegmentView]:
         """The index says what brute force does; its parts."""
         parts, warnings = self.update(threads)
         assert not warnings
@@ -265,7 +265,7 @@ def test_no_bytes_lead_beyond_the_arrays(made: Map, seed: int) -> None:
     finally:
         path.unlink()
     if len(segment.contents) == len(part.numbers):
-        found = best_places([map_index.Part(segment, None, part.numbers)], made.state, made.views(4), TOP)
+        found = best_places([map_index.SegmentView(segment, None, part.numbers)], made.state, made.views(4), TOP)
         assert found.score.shape == (4, TOP)
 
 
@@ -294,12 +294,12 @@ def test_a_drive_is_likely_by_how_far_it_stands_out() -> None:
     drive = np.array([[2, 3, 4], [2, 3, 5], [7, 2, 3], [2, 4, 5], [2, 3, 4]], np.int32)
     score = np.array([[0.3, 0.2, 0.2], [0.3, 0.2, 0.2], [0.9, 0.3, 0.2], [0.3, 0.2, 0.2], [0.3, 0.2, 0.2]], np.float32)
     none = np.zeros((5, 3), np.int32)
-    found = likely_drives(Answers(drive, none, score, none), 5)
+    found = drives_by_credit(Answers(drive, none, score, none), 5)
     assert {2, 7} <= set(found.tolist())
-    assert len(likely_drives(no_answers(0, 3), 5)) == 0
+    assert len(drives_by_credit(no_answers(0, 3), 5)) == 0
     many = np.arange(50, dtype=np.int32)[None]
     falling = np.linspace(1, 0.1, 50, dtype=np.float32)[None]
-    assert likely_drives(Answers(many, many, falling, many), 5).tolist() == list(range(8))
+    assert drives_by_credit(Answers(many, many, falling, many), 5).tolist() == list(range(8))
 
 
 def test_a_segment_of_another_version_is_not_called_damaged(made: Map) -> None:

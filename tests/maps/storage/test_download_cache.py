@@ -176,11 +176,11 @@ def test_the_oldest_goes_first(tmp_path: Path) -> None:
         names.append(sha256_of(file))
         cache.keep(names[-1], file)
         os.utime(cache.root / "objects" / names[-1], (number, number))
-    assert cache.take(names[0], tmp_path / "again"), "which makes it young"
+    assert cache.fetch_to(names[0], tmp_path / "again"), "which makes it young"
     cache.trim()
     assert {path.name for path in (cache.root / "objects").iterdir()} == {names[0], names[3]}
     assert (tmp_path / "again").read_bytes() == bytes(1000)
-    assert not cache.take(names[1], tmp_path / "gone")
+    assert not cache.fetch_to(names[1], tmp_path / "gone")
     left = cache.root / "objects" / ".half.part"
     left.touch()
     cache.trim()
@@ -192,7 +192,7 @@ def test_the_oldest_goes_first(tmp_path: Path) -> None:
 
 def test_several_read_and_trim_at_once(root: Any, cache: Cache) -> None:
     """With room for next to nothing: what one takes away another has open, or fetches anew."""
-    cache = replace(cache, most_bytes=1000)
+    cache = replace(cache, max_bytes=1000)
 
     def read(_: int) -> set[str]:
         with map_store.reading(root, cache) as store:

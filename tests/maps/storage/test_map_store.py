@@ -95,7 +95,7 @@ def test_a_writer_killed_anywhere_leaves_the_old_drive_or_the_new(
 ) -> None:
     """Killed before its n-th change of the disk, for every n; the next writer puts right what is left over."""
     if not exchanges:
-        monkeypatch.setattr(local, "exchanged", lambda *_: False)
+        monkeypatch.setattr(local, "exchange_folders", lambda *_: False)
     old, new = write_run(tmp_path / "old", "one", 1), write_run(tmp_path / "new", "one", 9)
     store, steps, states = map_store.Store(root), 0, set[int]()
     while True:
@@ -118,7 +118,7 @@ def test_a_writer_killed_anywhere_leaves_the_old_drive_or_the_new(
 
                 for owner, name in (
                     (type(root), "rename"), (type(root), "replace"), (type(root), "unlink"), (os, "link"),
-                    (shutil, "rmtree"), (local, "exchanged"),
+                    (shutil, "rmtree"), (local, "exchange_folders"),
                 ):  # fmt: skip
                     setattr(owner, name, stepping(getattr(owner, name)))
                 map_store.publish(writer, "one", made)
@@ -198,9 +198,9 @@ def test_a_drive_may_be_called_anything(tmp_path: Path, name: str) -> None:
     ledger.parent.mkdir(parents=True)
     with replacing(ledger) as stream:
         stream.write(b"ledger")
-    drive_pairs.forget(store, f"{name}2", {name})
+    drive_pairs.remove_stale_ledgers(store, f"{name}2", {name})
     assert ledger.exists()
-    drive_pairs.forget(store, f"{name}2", set())
+    drive_pairs.remove_stale_ledgers(store, f"{name}2", set())
     assert not ledger.exists()
 
 

@@ -1,4 +1,4 @@
-"""Charts of the experiments that are numbers, one function each, drawn from what study.json says."""
+"""Charts of the experiments that are numbers, one function each, drawn from the content of study.json."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.figures.canvas import as_text, drawn
+from vplog.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,7 +45,7 @@ def draw_pairs(found: Found, folder: Path) -> None:
     """Fig. 5."""
     rows = found["rows"]
     methods, labels = _unique(rows, "method"), _pair_labels(rows)[:_MOST_BARS]
-    with drawn(folder, "pairs", max(7.0, 1.3 + 1.6 * len(labels)), 7.6) as figure:
+    with saved_figure(folder, "pairs", max(7.0, 1.3 + 1.6 * len(labels)), 7.6) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
         wide = 0.82 / len(methods)
         for number, method in enumerate(methods):
@@ -75,7 +75,7 @@ def draw_sizes(found: Found, folder: Path) -> None:
     labels = _pair_labels(rows)
     shown = labels if len(labels) <= _MOST_COLUMNS else []
     columns = [*shown, "mean of all pairs"]
-    with drawn(folder, "sizes", max(6.0, 1.2 + 1.55 * len(columns)), 5.4) as figure:
+    with saved_figure(folder, "sizes", max(6.0, 1.2 + 1.55 * len(columns)), 5.4) as figure:
         grid = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
         for column, label in enumerate(columns):
             for method in methods:
@@ -111,7 +111,7 @@ def draw_library(found: Found, folder: Path) -> None:
     drives.sort(key=[row["map"] for row in rows].index)
     labels = _pair_labels(rows)[:_MOST_BARS]
     wide = 0.8 / len(drives)
-    with drawn(folder, "library", max(7.0, 1.3 + 1.35 * len(labels)), 1.2 + 2.9 * len(methods)) as figure:
+    with saved_figure(folder, "library", max(7.0, 1.3 + 1.35 * len(labels)), 1.2 + 2.9 * len(methods)) as figure:
         grid = figure.subplots(2 * len(methods), 1, sharex=True, squeeze=False)[:, 0]
         for pair_of_axes, method in zip(grid.reshape(-1, 2), methods, strict=True):
             for axes, score in zip(pair_of_axes, ("r_at_1", "anr"), strict=True):
@@ -143,7 +143,7 @@ def draw_conditions(found: Found, folder: Path) -> None:
     side = max(1.45, 0.55 * len(drives))
     width = 1.6 + side * len(tables)
     anr = [v for table in tables.values() for line in table["anr"] for v in line if v is not None]
-    with drawn(folder, "conditions", max(width, 6.5), 2 * side + 1.9) as figure:
+    with saved_figure(folder, "conditions", max(width, 6.5), 2 * side + 1.9) as figure:
         grid = figure.subplots(2, len(tables), sharex=True, sharey=True, squeeze=False)
         for column, (method, table) in enumerate(tables.items()):
             for axes, score in zip(grid[:, column], ("r_at_1", "anr"), strict=True):
@@ -182,7 +182,7 @@ def draw_bits(found: Found, folder: Path) -> None:
     """The spatial cost of section IV, as one chart."""
     rows = found["rows"]
     methods = [row["method"] for row in rows]
-    with drawn(folder, "bits", 10.0, 5.0) as figure:
+    with saved_figure(folder, "bits", 10.0, 5.0) as figure:
         grid = figure.subplots(1, 2)
         for axes, score in zip(grid, ("r_at_1", "anr"), strict=True):
             for row in rows:
@@ -209,11 +209,11 @@ def draw_bits(found: Found, folder: Path) -> None:
 
 
 def draw_ablations(found: Found, folder: Path) -> None:
-    """One bar a departure, for the change without it."""
+    """One bar for each ablation: the change of the score."""
     rows, base = found["rows"], found["base"]
     order = sorted(rows, key=lambda row: -row["r_at_1_change"])
     at = np.arange(len(order))
-    with drawn(folder, "ablations", 10.5, 1.9 + 0.36 * len(order)) as figure:
+    with saved_figure(folder, "ablations", 10.5, 1.9 + 0.36 * len(order)) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         for axes, score, sign in ((left, "r_at_1", 1), (right, "anr", -1)):
             change = np.array([row[f"{score}_change"] for row in order])

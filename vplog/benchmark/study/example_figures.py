@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.benchmark.study.charts import explain
-from vplog.benchmark.study.experiments import boxed
-from vplog.figures.canvas import as_text, drawn
+from vplog.benchmark.study.experiments import box_methods
+from vplog.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
+    from vplog.benchmark.study.evaluation_store import Bench
     from vplog.benchmark.study.experiments import StudyOptions
-    from vplog.benchmark.study.trial_store import Bench
     from vplog.data import Boxes, Bytes, Floats
     from vplog.stages import BoxState
 
 _SHOWN = 4
 """References drawn for an example, and of the most and least used: the paper's J, and its number in Fig. 9."""
 _FRAMES = 12
-"""Consecutive frames of Fig. 7: what fits beside each other and is told apart by colour."""
+"""Consecutive frames of Fig. 7: as many as fit side by side and have distinct colours."""
 _MOST_EXAMPLES = 6
 """Pairs of drives that examples are drawn of: all pairs of three drives."""
 _CLOSE_UP = 10
@@ -45,15 +46,15 @@ def references(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str
             for reference, corners in zip(found.references.tolist(), found.corners, strict=True):
                 on[reference].append(corners)
             images += 1
-    order = np.argsort(-count, kind="stable")
-    rest = float(count[order[len(order) // 2 :]].mean())
-    ratio = round(float(count[order[0]]) / rest, 2) if rest else None
-    _draw_references(name, bench, state, count, order, on, images, out)
+    use = _ReferenceUse(name, count, on, images)
+    rest = float(count[use.order[len(use.order) // 2 :]].mean())
+    ratio = round(float(count[use.order[0]]) / rest, 2) if rest else None
+    _draw_references(bench, state, use, out)
     about = {
         "method": name,
         "library": bench.names[0],
         "images": images,
-        "chosen": {str(reference): int(count[reference]) for reference in order.tolist()},
+        "chosen": {str(reference): int(count[reference]) for reference in use.order.tolist()},
         "most_against_mean_of_least_half": ratio,
     }
     return about, ["references"]
@@ -70,7 +71,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
         for drive in sorted({query, other}):
             places[drive] = bench.describe(state, drive, "examples", done, total)
             done += len(bench.frames[drive])
-        ranks, truth = bench.ask(state, query, other, places)
+        ranks, truth = bench.rank(state, query, other, places)
         for kind, right in (("found", True), ("missed", False)):
             among = np.flatnonzero(ranks.positive & ((ranks.top_true == 1.0) if right else (ranks.better > 0)))
             if not len(among):
@@ -117,7 +118,7 @@ def sequence(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
     used = np.bincount(np.concatenate([one.references for one in run]), minlength=len(state.references))
     order = [int(r) for r in np.argsort(-used, kind="stable") if used[r]]
     rows = list(range(start, start + length))
-    _draw_sequence(bench, state, query, other, rows, run, order, out)
+    _draw_sequence(bench, state, rows, run, order, out)
     about = {
         "method": name,
         "query": bench.names[query],
@@ -133,12 +134,12 @@ PICTURES: dict[str, Callable[[Bench, StudyOptions, Path], tuple[dict[str, Any], 
     "examples": examples,
     "sequence": sequence,
 }
-"""Experiments by name: what study.json says of each, and the names of its figures."""
+"""Experiments by name: the record of each for study.json, and the names of its figures."""
 
 
 def _learned(bench: Bench, options: StudyOptions, drive: int) -> tuple[str, BoxState]:
     """The first method that makes boxes, with the drive's first library."""
-    name = boxed(bench, options)[0]
+    name = box_methods(bench, options)[0]
     state: Any = bench.learn(name, options.libraries(drive)[0])
     return name, state
 
@@ -147,12 +148,27 @@ def _shared(state: BoxState, a: Any, b: Any) -> int:
     return len(np.intersect1d(state.boxes(a).references, state.boxes(b).references))
 
 
-def _draw_references(
-    name: str, bench: Bench, state: BoxState, count: np.ndarray, order: np.ndarray, on: list[list[Floats]],
-    images: int, out: Path,
-) -> None:  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class _ReferenceUse:
+    """How often the references of a library explain an image."""
+
+    method: str
+    count: np.ndarray
+    """(L,) images that each reference explains."""
+    boxes: list[list[Floats]]
+    """By reference: (I, 4) boxes of each of these images."""
+    images: int
+
+    @property
+    def order(self) -> np.ndarray:
+        """(L,) references, most used first."""
+        return np.argsort(-self.count, kind="stable")
+
+
+def _draw_references(bench: Bench, state: BoxState, use: _ReferenceUse, out: Path) -> None:
+    count, order, images, method = use.count, use.order, use.images, use.method
     shown = min(_SHOWN, len(order) // 2)
-    with drawn(out, "references", 11.0, 6.9) as figure:
+    with saved_figure(out, "references", 11.0, 6.9) as figure:
         grid = figure.add_gridspec(3, max(shown, 1), height_ratios=(1.25, 1, 1))
         bars = figure.add_subplot(grid[0, :])
         share = 100.0 * count[order] / images
@@ -171,7 +187,7 @@ def _draw_references(
             for column, reference in enumerate(rows.tolist()):
                 axes = figure.add_subplot(grid[1 + line, column])
                 _show(axes, state.references[reference].image)
-                corners = np.concatenate(on[reference]) if on[reference] else np.zeros((0, 4))
+                corners = np.concatenate(use.boxes[reference]) if use.boxes[reference] else np.zeros((0, 4))
                 corners = corners[~np.isnan(corners).any(axis=-1)]
                 image = state.references[reference].image
                 _overlay(axes, image, _coverage(corners))
@@ -184,7 +200,7 @@ def _draw_references(
         explain(
             figure,
             "Which reference images explain the drives",
-            f"How often {name} chose each of {len(order)} reference images of {bench.names[0]} to explain a frame of "
+            f"How often {method} chose each of {len(order)} reference images of {bench.names[0]} to explain a frame of "
             f"any drive ({', '.join(bench.names)}). Below, the most and the least used ones with all boxes that were "
             "mined on them: bright where most boxes are, the stronger a line the more images share that box.",
         )
@@ -199,7 +215,7 @@ def _draw_example(
     both = set(other.references.tolist())
     chosen = sorted(range(len(mine.references)), key=lambda j: (int(mine.references[j]) not in both, j))[:_SHOWN]
     chosen.sort()
-    with drawn(out, file, 2.6 * (1 + max(len(chosen), 1)), 4.3) as figure:
+    with saved_figure(out, file, 2.6 * (1 + max(len(chosen), 1)), 4.3) as figure:
         grid = figure.subplots(2, 1 + max(len(chosen), 1), squeeze=False)
         sides = ((query, mine, "query"), (match, other, "true map frame"))
         for line, ((drive, row, _), boxes, role) in enumerate(sides):
@@ -235,15 +251,15 @@ def _draw_example(
 
 
 def _draw_sequence(
-    bench: Bench, state: BoxState, query: int, other: int, rows: list[int], run: list[Boxes], order: list[int],
-    out: Path,
-) -> None:  # fmt: skip
+    bench: Bench, state: BoxState, rows: list[int], run: list[Boxes], order: list[int], out: Path
+) -> None:
     from matplotlib import colormaps
     from matplotlib.patches import Rectangle
 
+    query, other = bench.pairs[0]
     colours = [colormaps["plasma"](0.92 * number / max(len(rows) - 1, 1)) for number in range(len(rows))]
     middle = run[0].corners.shape[1] // 2
-    with drawn(out, "sequence", 12.0, 7.6) as figure:
+    with saved_figure(out, "sequence", 12.0, 7.6) as figure:
         parts: Any = figure.subfigures(3, 1, height_ratios=(0.85, 2.1, 2.1))
         strip, plane, below = parts
         for axes, image, row, colour in zip(
@@ -338,8 +354,8 @@ def _window_colours(count: int) -> list[Any]:
 def _windows(axes: Axes, image: Bytes, windows: Floats) -> None:
     """A tile of its colour at the middle of each window, which themselves overlap."""
     for window, colour in zip(windows, _window_colours(len(windows)), strict=True):
-        middle, half = (window[:2] + window[2:]) / 2, (window[2:] - window[:2]) / 6
-        _box(axes, image, np.concatenate([middle - half, middle + half]), colour, width=2.2)
+        middle, extent = (window[:2] + window[2:]) / 2, (window[2:] - window[:2]) / 6
+        _box(axes, image, np.concatenate([middle - extent, middle + extent]), colour, width=2.2)
 
 
 def _coloured(axes: Axes, image: Bytes, boxes: Boxes, rank: int) -> None:

@@ -1,4 +1,4 @@
-"""The experiments of the paper that are numbers: which trials each takes, and its figures.
+"""The experiments of the paper that are numbers: the evaluations of each, and its figures.
 
 Numbers of figures are those of Tanaka et al., Mining Visual Phrases for Long-Term Visual SLAM, IROS 2014, section IV.
 """
@@ -9,15 +9,16 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
+from vplog.benchmark.feature_cache import CacheChoice
 from vplog.benchmark.recogniser_specs import read_method
-from vplog.benchmark.study.trial_store import LESS_IS_BETTER, SCORES, Library, Trial
+from vplog.benchmark.study.evaluation_store import LESS_IS_BETTER, SCORES, Evaluation, Library
 from vplog.errors import SettingsError
 from vplog.places.reference_choice import PAPER_SIZE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from vplog.benchmark.study.trial_store import Bench
+    from vplog.benchmark.study.evaluation_store import Bench
     from vplog.logs import TopicChoice
 
     Row = dict[str, Any]
@@ -28,16 +29,16 @@ KINDS_OF_BOXES = ("bobb", "bobb_paper")
 """Recognisers that explain images by boxes on references: those that the size and the origin of a library matter to
 most, and that pictures can be drawn of."""
 BASE = "bobb"
-"""The recogniser that the departures are of."""
+"""The recogniser that is ablated."""
 
 
 @dataclass(frozen=True)
-class Departure:
-    """One idea, on its own."""
+class Ablation:
+    """One departure from the paper, undone by itself."""
 
     name: str
     """What is there without it, in a few words."""
-    undone_by: tuple[str, ...]
+    assignments: tuple[str, ...]
     """Assignments of settings, as `--methods bobb:setting=value` takes them."""
     why: str
     """What the idea is for, in one sentence."""
@@ -45,41 +46,41 @@ class Departure:
     @property
     def method(self) -> str:
         """The recogniser without it, as `--methods` takes it."""
-        return ":".join((BASE, *self.undone_by))
+        return ":".join((BASE, *self.assignments))
 
 
-DEPARTURES = (
-    Departure(
+ABLATIONS = (
+    Ablation(
         "plain SIFT", ("root_sift=false",), "Roots of descriptors keep a few large values from ruling the distance."
     ),
-    Departure("grain too", ("least_size=0",), "The smallest features are grain that another camera or light lacks."),
-    Departure("keypoints alone", ("patch_weight=0",), "Patches need no detector, which fails in the dark."),
-    Departure("patches alone", ("features=0",), "Keypoints are found again where the view turns or comes nearer."),
-    Departure("800 keypoints", ("features=800",), "More describe blurred views, and cost twice the time."),
-    Departure("own image left out", ("own=false",), "A later visit is explained by the image of the first one."),
-    Departure("weights not rooted", ("share_power=1",), "The root lets more than the first reference decide."),
-    Departure(
+    Ablation("grain too", ("least_size=0",), "The smallest features are grain that another camera or light lacks."),
+    Ablation("keypoints alone", ("patch_weight=0",), "Patches need no detector, which fails in the dark."),
+    Ablation("patches alone", ("features=0",), "Keypoints are found again where the view turns or comes nearer."),
+    Ablation("800 keypoints", ("features=800",), "More describe blurred views, and cost twice the time."),
+    Ablation("own image left out", ("own=false",), "A later visit is explained by the image of the first one."),
+    Ablation("weights not rooted", ("share_power=1",), "The root lets more than the first reference decide."),
+    Ablation(
         "boxes of a tenth",
         ("box_columns=6", "box_rows=3"),
         "Boxes of half the sides measure how far apart they are; smaller ones miss each other at once.",
     ),
-    Departure("10 neighbours", ("neighbours=10",), "The scale of distances is read off a far neighbour, not a match."),
-    Departure("all matches weigh alike", ("reach=100",), "Distances change with light, so a match counts relatively."),
-    Departure(
+    Ablation("10 neighbours", ("neighbours=10",), "The scale of distances is read off a far neighbour, not a match."),
+    Ablation("all matches weigh alike", ("reach=100",), "Distances change with light, so a match counts relatively."),
+    Ablation(
         "no agreement", ("agreement_floor=1",), "Matches of one place move alike from view to view; chance ones do not."
     ),
-    Departure("popular ones count fully", ("popularity=0",), "What explains every view distinguishes none."),
-    Departure("J = 4", ("references=4",), "More references explain more of a view, at twelve bytes each."),
-    Departure("2 x 2 windows", ("windows_along=2",), "Nine windows say where in the view a box comes from."),
-    Departure("windows of a quarter", ("window_share=0.25",), "A window must hold enough features to be found again."),
-    Departure("best window only", ("pairing=best",), "Eq. (1); the same window says that the view is the same."),
-    Departure("same window only", ("pairing=same",), "The best window also finds a view from nearer or aside."),
+    Ablation("popular ones count fully", ("popularity=0",), "What explains every view distinguishes none."),
+    Ablation("J = 4", ("references=4",), "More references explain more of a view, at twelve bytes each."),
+    Ablation("2 x 2 windows", ("windows_along=2",), "Nine windows say where in the view a box comes from."),
+    Ablation("windows of a quarter", ("window_share=0.25",), "A window must hold enough features to be found again."),
+    Ablation("best window only", ("pairing=best",), "Eq. (1); the same window says that the view is the same."),
+    Ablation("same window only", ("pairing=same",), "The best window also finds a view from nearer or aside."),
 )
 """One row of the study each."""
 
 
 _CHANGED = ("r_at_1", "anr", "ap")
-"""Scores whose change without a departure is told."""
+"""Scores whose change is reported for each ablation."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,16 @@ class StudyOptions:
     only: Sequence[str] | None = None
     """Names of the experiments; None for all."""
     topics: TopicChoice | None = None
+    cache: CacheChoice = CacheChoice()
+    """Where features are kept for further calls."""
 
     def libraries(self, drive: int, size: int | None = None) -> list[Library]:
         """One for each seed."""
         return [Library(drive, self.library_size if size is None else size, seed) for seed in range(self.seeds)]
 
 
-def boxed(bench: Bench, options: StudyOptions) -> list[str]:
-    """Those of the methods that make boxes. Raises SettingsError where none does."""
+def box_methods(bench: Bench, options: StudyOptions) -> list[str]:
+    """The methods that make boxes. Raises SettingsError where none does."""
     found = [name for name in options.methods if bench.methods[name].kind in KINDS_OF_BOXES]
     if not found:
         raise SettingsError(
@@ -122,7 +125,7 @@ def pairs(bench: Bench, options: StudyOptions) -> dict[str, Any]:
 
 
 def conditions(bench: Bench, options: StudyOptions) -> dict[str, Any]:
-    """Fig. 10: the same trials, seen as a table of query against map condition."""
+    """Fig. 10: the same evaluations as a table of query against map condition."""
     rows = pairs(bench, options)["rows"]
     names = bench.names
     table = {
@@ -139,7 +142,7 @@ def conditions(bench: Bench, options: StudyOptions) -> dict[str, Any]:
 
 
 def bits(bench: Bench, options: StudyOptions) -> dict[str, Any]:
-    """Section IV on spatial cost: the same trials, seen as what a place takes against how well it is found."""
+    """Section IV on spatial cost: the same evaluations as the size of a stored place against its scores."""
     rows = _mean(pairs(bench, options)["rows"], ("method",))
     for row in rows:
         row["stored_bits"] = round(8 * row["bytes_per_image"])
@@ -149,14 +152,14 @@ def bits(bench: Bench, options: StudyOptions) -> dict[str, Any]:
 
 def sizes(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 6: libraries of several sizes from the map."""
-    names = boxed(bench, options)
+    names = box_methods(bench, options)
     least = min(len(frames) for frames in bench.frames)
     sizes = sorted(set(options.sizes))
     fitting, left_out = [size for size in sizes if size <= least], [size for size in sizes if size > least]
     if not fitting:
         raise SettingsError(f"--sizes {','.join(map(str, sizes))}: the shortest drive has only {least} frames.")
-    trials = (_every(bench, names, lambda drive, size=size: options.libraries(drive, size)) for size in fitting)
-    rows = _rows(bench, "sizes", chain.from_iterable(trials))
+    evaluations = (_every(bench, names, lambda drive, size=size: options.libraries(drive, size)) for size in fitting)
+    rows = _rows(bench, "sizes", chain.from_iterable(evaluations))
     found: dict[str, Any] = {"rows": rows, "mean": _mean(rows, ("method", "size"))}
     if left_out:
         found["left_out"] = f"Sizes {left_out} are more than the {least} frames of the shortest drive."
@@ -166,15 +169,15 @@ def sizes(bench: Bench, options: StudyOptions) -> dict[str, Any]:
 def library(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 8: libraries from every drive, for every pair."""
     drawn = [library for drive in range(len(bench.names)) for library in options.libraries(drive)]
-    rows = _rows(bench, "library", _every(bench, boxed(bench, options), lambda _: drawn))
+    rows = _rows(bench, "library", _every(bench, box_methods(bench, options), lambda _: drawn))
     for row in rows:
         row["from"] = {row["query"]: "query", row["map"]: "map"}.get(row["library"], "other")
     return {"rows": rows, "mean": _mean(rows, ("method", "from"))}
 
 
 def ablations(bench: Bench, options: StudyOptions) -> dict[str, Any]:
-    """Every departure from the paper taken back on its own. Raises SettingsError where a setting is no more."""
-    names = [BASE, *(departure.method for departure in DEPARTURES)]
+    """Every departure from the paper undone on its own. Raises SettingsError where a setting no longer exists."""
+    names = [BASE, *(ablation.method for ablation in ABLATIONS)]
     for name in names:
         bench.methods[name] = read_method(name, bench.pipeline)
     rows = _rows(bench, "ablations", _every(bench, names, options.libraries))
@@ -182,13 +185,13 @@ def ablations(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     mean = {row["method"]: row for row in _mean(rows, ("method",))}
     named = [(bench.names[query], bench.names[other]) for query, other in bench.pairs]
     table: list[Row] = []
-    for departure in DEPARTURES:
-        without = mean[departure.method]
-        row: Row = {"name": departure.name, "setting": " ".join(departure.undone_by), "why": departure.why}
+    for ablation in ABLATIONS:
+        without = mean[ablation.method]
+        row: Row = {"name": ablation.name, "setting": " ".join(ablation.assignments), "why": ablation.why}
         row |= {score: without[score] for score in (*_CHANGED, "bytes_per_image")}
         row |= {f"{score}_change": change for score, change in _changes(without, mean[BASE]).items()}
         row["changes"] = [
-            {"query": pair[0], "map": pair[1], **_changes(found[departure.method, *pair], found[BASE, *pair])}
+            {"query": pair[0], "map": pair[1], **_changes(found[ablation.method, *pair], found[BASE, *pair])}
             for pair in named
         ]
         table.append(row)
@@ -210,26 +213,26 @@ NUMBERS: dict[str, Callable[[Bench, StudyOptions], dict[str, Any]]] = {
 """Experiments by name."""
 
 
-def _every(bench: Bench, methods: Iterable[str], libraries: Callable[[int], list[Library]]) -> list[Trial]:
+def _every(bench: Bench, methods: Iterable[str], libraries: Callable[[int], list[Library]]) -> list[Evaluation]:
     """Each method on each pair of drives, with each of the libraries for its map."""
     return [
-        Trial(method, library, query, other)
+        Evaluation(method, library, query, other)
         for query, other in bench.pairs
         for method in methods
         for library in libraries(other)
     ]
 
 
-def _rows(bench: Bench, stage: str, trials: Iterable[Trial]) -> list[Row]:
-    """A row for trials that differ by the seed of the library alone: mean of every score, and the worst."""
-    trials = list(dict.fromkeys(trials))
+def _rows(bench: Bench, stage: str, evaluations: Iterable[Evaluation]) -> list[Row]:
+    """One row for evaluations that differ in the seed of the library alone: mean of every score, and the worst."""
+    evaluations = list(dict.fromkeys(evaluations))
     groups: dict[tuple[Any, ...], list[Row]] = {}
-    for trial, figures in zip(trials, bench.run(stage, trials), strict=True):
-        names = (bench.names[drive] for drive in (trial.query, trial.map, trial.library.drive))
-        groups.setdefault((trial.method, *names, trial.library.size), []).append(figures)
+    for evaluation, figures in zip(evaluations, bench.run(stage, evaluations), strict=True):
+        names = (bench.names[drive] for drive in (evaluation.query, evaluation.map, evaluation.library.drive))
+        groups.setdefault((evaluation.method, *names, evaluation.library.size), []).append(figures)
     by = ("method", "query", "map", "library", "size")
     return [
-        {**_together(by, key, some), "library_hashes": [one["library_hash"][:12] for one in some]}
+        {**_aggregated(by, key, some), "library_hashes": [one["library_hash"][:12] for one in some]}
         for key, some in groups.items()
     ]
 
@@ -239,11 +242,11 @@ def _mean(rows: list[Row], by: tuple[str, ...]) -> list[Row]:
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in by), []).append(row)
-    return [_together(by, key, some) for key, some in groups.items()]
+    return [_aggregated(by, key, some) for key, some in groups.items()]
 
 
-def _together(by: tuple[str, ...], key: tuple[Any, ...], some: list[Row]) -> Row:
-    """One row of several: mean of every score and the worst, which rows of several trials have already."""
+def _aggregated(by: tuple[str, ...], key: tuple[Any, ...], some: list[Row]) -> Row:
+    """One row of several: mean and worst of every score; aggregated rows bring their own worst."""
     row: Row = dict(zip(by, key, strict=True))
     for score in SCORES:
         row[score] = _rounded(sum(one[score] for one in some) / len(some))

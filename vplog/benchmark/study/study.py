@@ -18,12 +18,14 @@ import numpy as np
 
 import vplog
 from vplog import logs
-from vplog.benchmark.compare import check_truth, same_drive
+from vplog.benchmark.compare import check_truth, every_image, protocol, same_drive
+from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.study.charts import CHARTS
+from vplog.benchmark.study.evaluation_store import Bench, all_pairs
 from vplog.benchmark.study.example_figures import PICTURES
 from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
-from vplog.benchmark.study.trial_store import Bench, all_pairs
+from vplog.benchmark.traversals import candidate_stops
 from vplog.cache.code_hash import code_of
 from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
@@ -37,6 +39,7 @@ from vplog.storage.urls import shown
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from vplog.evaluate.place_truth import PlaceTruth
     from vplog.pipeline import Pipeline
 
 EXPERIMENTS = (*NUMBERS, *PICTURES)
@@ -48,8 +51,8 @@ _TWO_DRIVES = {
     "conditions": "a change of condition between drives",
 }
 """What these experiments need two drives for."""
-_SCORES = ("vplog.benchmark.study.trial_store", "vplog.benchmark.recogniser_specs")
-"""Modules that the scores of a trial depend on, with all that these import."""
+_SCORES = ("vplog.benchmark.study.evaluation_store", "vplog.benchmark.recogniser_specs")
+"""Modules that the scores of an evaluation depend on, with all that these import."""
 
 
 def study(
@@ -60,11 +63,13 @@ def study(
     options: StudyOptions = StudyOptions(),
     execution: Execution = Execution(),
 ) -> dict[str, Any]:
-    """Experiments on drives of one route, each query and map in turn; what study.json says.
+    """Experiments on drives of one route, each query and map in turn; the content of study.json.
 
     Raises VplogError with one line where that cannot be.
     """
     min_gap, topics = options.min_gap, options.topics
+    if truth.kind == "labels":
+        topics = every_image(topics)
     chosen = _choose(options.only, len(drives))
     recognisers = read_methods(options.methods, pipeline)
     _check_drives(drives, min_gap)
@@ -74,11 +79,12 @@ def study(
         opened = [logs.open(path, topics) for path in drives]
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=made)))
         names = short_names([log.name for log in opened])
-        known = {}
+        known, protocols = {}, []
         for query, other in all_pairs(len(drives)):
             of_pair = truth_of_pair(truth, query, other, len(drives))
             known[query, other] = open_truth(of_pair, opened[query], opened[other])
             warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)
+            protocols.append(_protocol(known[query, other], (names[query], names[other]), min_gap))
         hashes = [_hash(hash_inputs(path)) for path in drives]
         _check_same_drives(out, hashes)
         common = {
@@ -87,9 +93,11 @@ def study(
             "min_gap": min_gap,
             "truth_hash": _truth_hash(truth),
         }
+        kept = options.cache.open() or scratch
+        folders = [FeatureFolder.of(kept, path, topics, pipeline.features) for path in drives]
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
-            {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, stack, execution,
+            {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
         )  # fmt: skip
         account = {
             "vplog": vplog.__version__,
@@ -98,6 +106,7 @@ def study(
                 for name, path, log, digest in zip(names, drives, opened, hashes, strict=True)
             ],
             "truth": _shown(truth),
+            "protocol": protocols,
             **common,
             "library_size": options.library_size,
             "sizes": sorted(set(options.sizes)),
@@ -122,7 +131,15 @@ def study(
         notes = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
         result = _write(made, account, inputs, done, list(dict.fromkeys(notes)))
     shutil.rmtree(out / _WORK, ignore_errors=True)
+    options.cache.trim()
     return result
+
+
+def _protocol(known: PlaceTruth, names: tuple[str, str], min_gap: int | None) -> dict[str, Any]:
+    """The rule by which a match is true in one pair of drives, as `compare.protocol` has it."""
+    stops = candidate_stops(known.query_frames, known.map_frames, min_gap)
+    found = protocol(known, known.pairs(known.query_frames, known.map_frames).below(stops), min_gap)
+    return {"query": names[0], "map": names[1], **found, "text": f"{names[0]} in {names[1]}: {found['text']}"}
 
 
 def _do(name: str, bench: Bench, options: StudyOptions, out: Path) -> dict[str, Any]:
@@ -175,7 +192,7 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def _experiments(found: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Those of a study.json whose figures are named as files of a study, by name."""
+    """The experiments of a study.json whose figures are named as files of a study, by name."""
     earlier = found.get("experiments")
     for name, one in earlier.items() if isinstance(earlier, dict) else ():
         figures = one.get("figures") if isinstance(one, dict) else None
@@ -222,15 +239,18 @@ def _check_same_drives(out: Path, hashes: Sequence[str]) -> None:
 
 
 def truth_of_pair(truth: TruthChoice, query: int, other: int, drives: int) -> TruthChoice:
-    """The choice for one pair: of a list of TUM files, one for each drive, those of its two.
+    """The choice for one pair: of a list of files, one for each drive, those of its two; of a table of pairs, which
+    names one query and one map, that of the first drive in the second, or the same turned round.
 
-    Raises TruthError where the list has another length, or a table of pairs would serve more than one pair.
+    Raises TruthError where the list has another length, or a table of pairs would serve more than two drives.
     """
-    if truth.source.lower().endswith(".csv") and drives > 1:
-        raise TruthError(
-            f"--truth {shown(truth.source)} lists the pairs of one query and one map, and here every drive is both. "
-            "Use index, poses, gps or a TUM file for each drive."
-        )
+    if drives > 1 and truth.lists_pairs:
+        if drives > 2:
+            raise TruthError(
+                f"--truth {shown(truth.source)} lists the pairs of one query and one map; here are {drives} drives. "
+                "Use index, labels, utm, poses, gps, a table `image,label` or a TUM file for each drive."
+            )
+        return replace(truth, transposed=(query, other) == (1, 0))
     files = truth.source.split(",")
     if len(files) == 1 or Path(truth.source).is_file():
         return truth

@@ -126,7 +126,11 @@ def _clique_inverse(conditional: gtsam.GaussianConditional, separator: Floats) -
     R_inv = np.linalg.inv(conditional.R())
     gain = -R_inv @ conditional.S()
     cross = gain @ separator
-    return np.block([[R_inv @ R_inv.T + cross @ gain.T, cross], [cross.T, separator]]), len(R_inv)
+    inner = len(R_inv)
+    inverse = np.empty((inner + len(separator), inner + len(separator)))  # np.block takes as long as the products
+    inverse[:inner, :inner] = R_inv @ R_inv.T + cross @ gain.T
+    inverse[:inner, inner:], inverse[inner:, :inner], inverse[inner:, inner:] = cross, cross.T, separator
+    return inverse, inner
 
 
 def _as_factors(matrix: Blocks, right: Floats) -> gtsam.GaussianFactorGraph:

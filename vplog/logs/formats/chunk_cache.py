@@ -1,4 +1,4 @@
-"""The chunks of a file, unpacked: those to come by other threads, the last ones stay in memory."""
+"""The chunks of a file, unpacked: the next ones by other threads, the last ones cached."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Chunks:
         threads: bool,
     ) -> None:
         """`load` reads and unpacks one, in any thread where `threads`; for its BadChunkError `damaged` is called in the
-        thread of the caller. `size` says how many bytes there will be, `packed` whether to cache them."""
+        thread of the caller. `size` is its unpacked size, `packed` whether it is cached."""
         self._load, self._damaged, self._size, self._packed = load, damaged, size, packed
         self._threads = min(_THREADS, allowed()) if threads else 0
         self._file = next(_FILES)
@@ -94,15 +94,15 @@ class Chunks:
         data = self(number)
         return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
 
-    def in_turn(
-        self, numbers: Iterable[int], stays: Callable[[int], bool] | None = None
+    def iterate(
+        self, numbers: Iterable[int], in_place: Callable[[int], bool] | None = None
     ) -> Generator[tuple[int, bytes | None]]:
-        """Each number with its chunk, None where it `stays` in the file. Those that follow are unpacked meanwhile once
-        that saves time; who only looks for the first message of a topic starts no thread."""
+        """Each number with its chunk, None where it is read `in_place`. The next ones are unpacked meanwhile once that
+        saves time; reading only the first message of a topic starts no thread."""
         numbers, spent_s = iter(numbers), 0.0
         for number in numbers:
             began_s = time.perf_counter()
-            data = None if stays and stays(number) else self(number)
+            data = None if in_place and in_place(number) else self(number)
             spent_s += time.perf_counter() - began_s
             yield number, data
             if spent_s >= _ALONE_S and self._threads:
@@ -110,10 +110,10 @@ class Chunks:
         else:
             return
         with ThreadPoolExecutor(self._threads, "vplog-read-ahead") as pool:
-            yield from self._ahead(numbers, stays or (lambda _: False), pool)
+            yield from self._prefetched(numbers, in_place or (lambda _: False), pool)
 
-    def _ahead(
-        self, numbers: Iterator[int], stays: Callable[[int], bool], pool: ThreadPoolExecutor
+    def _prefetched(
+        self, numbers: Iterator[int], in_place: Callable[[int], bool], pool: ThreadPoolExecutor
     ) -> Iterator[tuple[int, bytes | None]]:
         waiting: deque[tuple[int, Future[bytes] | None]] = deque()
         following = next(numbers, None)
@@ -123,7 +123,7 @@ class Chunks:
                     size = self._size(following)
                     if waiting and sum(self._size(number) for number, _ in waiting) + size > _AHEAD_BYTES:
                         break
-                    handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not stays(following)
+                    handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not in_place(following)
                     handed = handed and _RECENT.get((self._file, following)) is None
                     waiting.append((following, pool.submit(self._load, following) if handed else None))
                     following = next(numbers, None)
@@ -131,7 +131,7 @@ class Chunks:
                 if future is not None:
                     yield number, self._take(number, future.result)
                 else:
-                    yield number, None if stays(number) else self(number)
+                    yield number, None if in_place(number) else self(number)
         finally:
             for future in (future for _, future in waiting if future is not None):
                 future.cancel()

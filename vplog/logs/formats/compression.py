@@ -40,10 +40,10 @@ _SPARE = 2**30
 
 
 class BadChunkError(Exception):
-    """A chunk's bytes do not unpack as its header says; the message holds the reason."""
+    """A chunk that cannot be unpacked; the message is the reason."""
 
     def __init__(self, reason: str, data: bytes = b"") -> None:
-        """`data` is what it unpacked to all the same."""
+        """`data` are the bytes that could be unpacked."""
         super().__init__(reason)
         self.data = data
 
@@ -94,15 +94,11 @@ class _ThreadLocal(threading.local):
 _OF_THREAD = _ThreadLocal()
 
 
-def _lz4(data: bytes, most: int) -> bytes:
-    return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most)
-
-
-def _bz2(data: bytes, most: int) -> bytes:
-    return bz2.BZ2Decompressor().decompress(data, max_length=most)
-
-
-_DECODERS = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}
+_DECODERS = {
+    "zstd": _zstd,
+    "lz4": lambda data, most: lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most),
+    "bz2": lambda data, most: bz2.BZ2Decompressor().decompress(data, max_length=most),
+}
 
 
 def unpack_zstd_message(data: Octets) -> bytes:

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from vplog.logs.formats.loss_account import Account
+from vplog.logs.formats.loss_account import LossAccount
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
+
+    from vplog.data import Gps, Trajectory
 
 Octets = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
@@ -103,6 +105,12 @@ class Contents:
     start_ns: int
     """First log time; 0 where there is no message."""
     end_ns: int
+    truth: Trajectory | Gps | None = None
+    """Ground truth that is published with it: poses of the body, or its places."""
+    body: str = ""
+    """Frame that the truth is of."""
+    names: dict[int, str] = field(default_factory=dict)
+    """Image file by stamp, of images that are known by their names."""
 
     @property
     def messages(self) -> int:
@@ -113,7 +121,7 @@ class Contents:
 class Notes:
     """Remarks on a log, each once, in the order they were found, and the account of what is lost."""
 
-    account: Account = field(default_factory=Account)
+    account: LossAccount = field(default_factory=LossAccount)
     _remarks: list[str] = field(default_factory=list)
 
     def add(self, line: str) -> None:
@@ -151,11 +159,6 @@ def messages_in(container: Container, channels: Collection[Channel]) -> Iterator
     """The messages of these channels in file order."""
     for block in container.blocks(channels):
         yield from block.messages()
-
-
-def ordered(counts: dict[Channel, int]) -> dict[Channel, int]:
-    """Counts in an order that does not depend on the file."""
-    return dict(sorted(counts.items()))
 
 
 def plural(count: int, noun: str) -> str:

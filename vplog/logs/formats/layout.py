@@ -57,7 +57,7 @@ class Layout:
 
     chunks: list[Chunk] = field(default_factory=list)
     missing: list[Chunk] = field(default_factory=list)
-    """Chunks that lie in damaged bytes, as the index at the end or their own indexes tell of them."""
+    """Chunks that lie in damaged bytes, as listed by the index at the end or by their own indexes."""
     recorded: dict[int, int] = field(default_factory=dict)
     """Messages per channel id by the file's statistics or its whole index; else empty."""
     gaps: list[tuple[int, int]] = field(default_factory=list)
@@ -70,7 +70,7 @@ class Layout:
     """Byte behind which nothing can be read, where the messages had ended."""
     unknown_at: int | None = None
     """The first record of an unknown kind that would be a message if that byte were damaged."""
-    spare: list[tuple[int, bytes]] = field(default_factory=list)
+    summary_definitions: list[tuple[int, bytes]] = field(default_factory=list)
     """Opcode and data of schemas and channels of a damaged summary, for those that no other place defines."""
 
     def in_order(self) -> None:
@@ -80,7 +80,7 @@ class Layout:
             chunk.counts = {} if chunk.doubtful else chunk.counts
 
 
-class Search:
+class ResyncSearch:
     """One file: its bytes, and a search for patterns whose cost is bounded over the life of the object."""
 
     def __init__(self, file: BinaryIO, length: int) -> None:

@@ -50,7 +50,7 @@ class Loss:
     messages: int | None
     """None where it is not known how many: nothing whole in the log counted them."""
     of: int | None
-    """Messages of the topic that were recorded, by the index, the statistics or the metadata; None where none says."""
+    """Messages of the topic that were recorded, by the index, the statistics or the metadata; None where unknown."""
     spans_ns: tuple[Span, ...]
     """Log times of the first and last message of each run of lost ones, in order; empty where not known."""
     detail: str = ""
@@ -71,16 +71,16 @@ _HOW_MANY_OPEN = (*_OUTSIDE, "damaged_chunk")
 
 
 @dataclass
-class Account:
+class LossAccount:
     """The losses of one log while it is read. What is found twice, in two passes over a file, is counted once."""
 
     start_ns: int | None = None
     """Log time that sentences count from."""
     _recorded: dict[str, dict[str, int]] = field(default_factory=dict)
-    """Messages by topic of each file, as far as anything says."""
+    """Messages by topic of each file, as far as known."""
     _found: dict[tuple[str, str], dict[tuple[str, int], _Lost]] = field(default_factory=dict)
     _settled: set[tuple[str, tuple[str, int]]] = field(default_factory=set)
-    """Losses that what was recorded gave their numbers: found again, they say nothing new."""
+    """Losses that what was recorded gave their numbers: found again, they are ignored."""
 
     def add(
         self,
@@ -90,7 +90,7 @@ class Account:
         spans: list[Span],
         detail: str = "",
     ) -> None:
-        """Messages lost by topic; None where nothing says how many; 0 of no topic where none is lost after all. `key`,
+        """Messages lost by topic; None where their number is unknown; 0 of no topic where none is lost. `key`,
         a file or topic and a place in it, makes the same loss found again replace itself."""
         if (reason, key) in self._settled:
             return
@@ -106,7 +106,7 @@ class Account:
         )
         self.add("appended", None, (file, at), [], detail)
 
-    def extend(self, other: Account) -> None:
+    def extend(self, other: LossAccount) -> None:
         """Add what another found."""
         for (reason, topic), places in other._found.items():
             for key, lost in places.items():
@@ -123,13 +123,13 @@ class Account:
         """What was found so far; workers that decode images may add to it meanwhile."""
         return {key: places.copy() for key, places in self._found.copy().items()}
 
-    def know(self, file: str, recorded: Mapping[str, int], start_ns: int) -> None:
-        """How many messages of each topic were recorded in a file, as it says itself, and when the first."""
+    def set_recorded(self, file: str, recorded: Mapping[str, int], start_ns: int) -> None:
+        """Set how many messages of each topic a file recorded, by its own statistics, and the first log time."""
         self._recorded[file] = dict(recorded)
         if start_ns:
             self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
 
-    def settle(
+    def reconcile(
         self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
     ) -> dict[str, int]:
         """Make the losses in these files add up to what was recorded less what was found: uncounted ones get what is
@@ -253,14 +253,14 @@ def runs_of(lost: np.ndarray, log_ns: Ints) -> list[Span]:
 
 
 @dataclass
-class Runs:
-    """Runs of lost messages among the sound ones of one topic, as they come by."""
+class LossRuns:
+    """Runs of lost messages among the sound ones of one topic, collected message by message."""
 
     messages: int = 0
     spans: list[Span] = field(default_factory=list)
     _open: bool = False
 
-    def lost(self, log_ns: int) -> None:
+    def add_lost(self, log_ns: int) -> None:
         self.messages += 1
         if self.spans and (self._open or len(self.spans) == _MOST_SPANS):
             self.spans[-1] = min(self.spans[-1][0], log_ns), max(self.spans[-1][1], log_ns)
@@ -268,5 +268,5 @@ class Runs:
             self.spans.append((log_ns, log_ns))
         self._open = True
 
-    def sound(self) -> None:
+    def add_sound(self) -> None:
         self._open = False

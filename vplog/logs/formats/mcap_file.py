@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, ordered, topics_of
+from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, topics_of
 from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.mcap_chunk import ChunkReader
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
@@ -43,7 +43,7 @@ class McapFile:
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: ""}
         self._doubtful: set[tuple[int, int]] = set()
-        """Opcodes and ids of schemas and channels from damaged chunks, until a sound one says the same."""
+        """Opcodes and ids of schemas and channels from damaged chunks, until a sound one repeats it."""
         self._layout = read_layout(self._file, length, self._define, self._name)
         self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
         self._local = not isinstance(path, RemotePath)
@@ -55,9 +55,9 @@ class McapFile:
 
     def contents(self) -> Contents:
         """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
-        say something else."""
+        differ."""
         layout = self._layout
-        if layout.spare:
+        if layout.summary_definitions:
             self._define_doubtful()
         by_id, times = self._counted(unpack_all=False)
         listed = sum((Counter(chunk.counts) for chunk in layout.missing), +by_id)
@@ -68,7 +68,7 @@ class McapFile:
             counts[self._channels[channel_id]] += by_id[channel_id]
         span = (times[0], times[1]) if times else (0, 0)
         self._account_for(by_topic(counts), span)
-        return Contents(ordered(counts), *span)
+        return Contents(dict(sorted(counts.items())), *span)
 
     def _counted(self, unpack_all: bool) -> tuple[Counter[int], list[int]]:
         """Messages by channel id, and the first and last log time."""
@@ -90,7 +90,7 @@ class McapFile:
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         wanted, chunks = set(channels), self._layout.chunks
         numbers = (number for number, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
-        for number, data in self._data.in_turn(numbers, self._stays if brief else None):
+        for number, data in self._data.iterate(numbers, self._is_read_in_place if brief else None):
             chunk = chunks[number]
             if not self._losses.may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
@@ -122,8 +122,8 @@ class McapFile:
             account.add("damaged_bytes", None, (name, layout.unknown_at), [span], detail)
         self._losses.add_end(sum(found.values()), [(span[1], span[1])])
         whole = layout.cut_at is None and not layout.gaps
-        account.know(name, recorded or (total if whole or layout.missing else {}), span[0])
-        unexplained = account.settle({name}, recorded, found)
+        account.set_recorded(name, recorded or (total if whole or layout.missing else {}), span[0])
+        unexplained = account.reconcile({name}, recorded, found)
         if unexplained and sum(recorded.values()) > sum(total.values()):  # else it names other topics
             detail = f"The statistics of {name} count more messages than it holds."
             account.add("damaged_bytes", unexplained, (name, 0), [span], detail)
@@ -145,7 +145,10 @@ class McapFile:
             return
         self._doubtful.add(key) if doubtful else self._doubtful.discard(key)
         if isinstance(record, records.Schema):
-            self._schemas[record.id] = _ros_name(record.name) if record.encoding in _IDL else record.name
+            name = record.name
+            if record.encoding in _IDL:  # sensor_msgs::msg::Image, and DDS's sensor_msgs::msg::dds_::Image_
+                name = name.replace("::", "/").replace("/dds_/", "/").rstrip("_")
+            self._schemas[record.id] = name
         else:
             self._channels[record.id] = Channel(record.topic, self._schemas[record.schema_id], record.message_encoding)
 
@@ -154,9 +157,9 @@ class McapFile:
         for number in range(len(self._layout.chunks)):
             data = self._data(number)
             ChunkReader(number, len(data), self._channels, self._define, None).whole(data)
-        for opcode, data in self._layout.spare:
+        for opcode, data in self._layout.summary_definitions:
             self._define(opcode, data, doubtful=True)
-        self._layout.spare.clear()
+        self._layout.summary_definitions.clear()
 
     def _account_for_chunk(self, chunk: Chunk, reader: ChunkReader) -> bool:
         """Account for what a chunk lacks; whether it is damaged."""
@@ -202,7 +205,7 @@ class McapFile:
         """Parts of what is not packed can be read again by themselves, unless each costs a request."""
         return not self._local or not _is_plain(self._layout.chunks[number])
 
-    def _stays(self, number: int) -> bool:
+    def _is_read_in_place(self, number: int) -> bool:
         """Whether a chunk's messages can be found where they lie, without reading all of it."""
         chunk = self._layout.chunks[number]
         if not self._local or not _is_plain(chunk) or chunk.cut:
@@ -213,8 +216,3 @@ class McapFile:
 
 def _is_plain(chunk: Chunk) -> bool:
     return chunk.compression in (None, "", "none")
-
-
-def _ros_name(name: str) -> str:
-    """`sensor_msgs/msg/Image` of `sensor_msgs::msg::Image` and of DDS's `sensor_msgs::msg::dds_::Image_`."""
-    return name.replace("::", "/").replace("/dds_/", "/").rstrip("_")

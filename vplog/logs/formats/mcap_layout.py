@@ -1,6 +1,6 @@
 """Where the chunks of an MCAP file lie (mcap.dev/spec): read record by record, over damage too.
 
-A record says its length twice, before its fields and by them: where the two differ, the one with a record behind it
+A record has its length twice, before its fields and by them: where the two differ, the one with a record behind it
 holds. Where neither has, reading goes on at the next chunk of the file's index, or the next bytes that can be a record.
 """
 
@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 
 from vplog.errors import LogError
 from vplog.logs.formats.compression import KINDS, crc32
-from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, Search
+from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -93,7 +93,7 @@ class _LayoutReader:
         self._chunked = False
         self._indexing: Chunk | None = None
         """The chunk whose message indexes come by."""
-        self._search = Search(file, length)
+        self._search = ResyncSearch(file, length)
         self.at = self._search.at
         self._summary_start: int | None = None
         self._summary_sound: bool | None = None
@@ -192,7 +192,7 @@ class _LayoutReader:
         return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
-        """Bytes of a record whose fields begin at `start`, as the lengths among them say."""
+        """Bytes of a record whose fields begin at `start`, by the lengths among them."""
         if opcode not in _SHAPES:
             return None
         at = start
@@ -223,7 +223,7 @@ class _LayoutReader:
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             data = self.at(start, min(length, _MAX_DEFINITION))
             if self._summary_sound is False and position >= (self._summary_start or 0):
-                self.layout.spare.append((opcode, data))
+                self.layout.summary_definitions.append((opcode, data))
             else:
                 self._define(opcode, data)
         elif opcode == Opcode.CHUNK:

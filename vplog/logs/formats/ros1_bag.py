@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, ordered, topics_of
+from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, topics_of
 from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
@@ -67,14 +67,15 @@ class Ros1Bag:
             for connection in found.keys() & self._channels.keys():
                 counts[self._channels[connection]] += found[connection]
         span = min(times, default=0), max(times, default=0)
-        result = Contents(ordered(dict.fromkeys(self._channels.values(), 0) | counts), *span)
+        counted = dict.fromkeys(self._channels.values(), 0) | counts
+        result = Contents(dict(sorted(counted.items())), *span)
         self._account_for(by_topic(result.counts), span)
         return result
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         wanted, chunks = set(channels), self._layout.chunks
         rows = (row for row, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
-        for row, data in self._data.in_turn(rows):
+        for row, data in self._data.iterate(rows):
             if data is None or not self._losses.may_hold(chunks[row], wanted):  # by a connection that came meanwhile
                 continue
             found = [(self._channels.get(connection), *rest) for connection, *rest in self._messages(row, data)]
@@ -92,8 +93,8 @@ class Ros1Bag:
         self._losses.add_end(sum(found.values()), [(span[1], span[1])] if span[1] else [])
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         listed = topics_of(layout.recorded, self._channels)
-        self._account.know(self._name, listed or (total if whole else {}), span[0])
-        self._account.settle({self._name}, listed, found)
+        self._account.set_recorded(self._name, listed or (total if whole else {}), span[0])
+        self._account.reconcile({self._name}, listed, found)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""

@@ -12,7 +12,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, Search
+from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,7 +22,7 @@ MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 """Values of the field `op`."""
 _MAX_HEADER = 2**20
-"""Bytes of a record header that are believed; real ones are some 100 bytes."""
+"""Largest header of a record in bytes; real ones have some 100."""
 _MAX_CONNECTION = 16 * 2**20
 """Bytes of a connection record that are read: its message definition, 100 kB at most in practice."""
 _FIELDS = {
@@ -72,7 +72,7 @@ class _LayoutReader:
         self._indexing: Chunk | None = None
         """The chunk whose index records come by."""
         self._index_at = self._chunk_count = 0
-        self._search = Search(file, length)
+        self._search = ResyncSearch(file, length)
         self.at = self._search.at
         self._last: tuple[int, _Head] = -1, (None, 0, 0)
 

@@ -12,8 +12,8 @@ import yaml
 import zstandard
 
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, messages_in, ordered
-from vplog.logs.formats.loss_account import Runs
+from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, messages_in
+from vplog.logs.formats.loss_account import LossRuns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
 _MOST_MESSAGES = 2**48
-"""Messages of a topic that are believed: more than a recorder writes in its life."""
+"""Largest plausible count of messages: more than a recorder writes in its life."""
 _DEEPEST = 64
 """Levels of lists and maps in metadata.yaml; rosbag2 writes 8."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -38,7 +38,7 @@ class MetadataError(Exception):
 
 @dataclass(frozen=True)
 class Metadata:
-    """What metadata.yaml says of a bag."""
+    """The content of metadata.yaml."""
 
     files: list[Path]
     """The storage files that are there, in order."""
@@ -57,7 +57,7 @@ class Chain:
     """A Container over several, one after the other."""
 
     def __init__(self, parts: Sequence[Container], notes: Notes, metadata: Metadata | None = None) -> None:
-        """`metadata` that say how much was recorded let what is lost be counted."""
+        """With `metadata` that count the recorded messages, lost ones are counted."""
         self._parts, self._notes, self._metadata = parts, notes, metadata
 
     def contents(self) -> Contents:
@@ -68,8 +68,8 @@ class Chain:
         spans = [(contents.start_ns, contents.end_ns) for contents in found if contents.messages]
         start_ns = min((start for start, _ in spans), default=0)
         if self._metadata is not None and self._metadata.recorded:
-            self._settle(self._metadata, by_topic(counts), start_ns)
-        return Contents(ordered(counts), start_ns, max((end for _, end in spans), default=0))
+            self._reconcile(self._metadata, by_topic(counts), start_ns)
+        return Contents(dict(sorted(counts.items())), start_ns, max((end for _, end in spans), default=0))
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         for number, part in enumerate(self._parts):
@@ -79,17 +79,17 @@ class Chain:
     def read(self, place: Place) -> Octets:
         return self._parts[place[0]].read(place[1:])
 
-    def _settle(self, known: Metadata, found: dict[str, int], start_ns: int) -> None:
+    def _reconcile(self, known: Metadata, found: dict[str, int], start_ns: int) -> None:
         """Count what is lost by what the metadata say."""
         account, files = self._notes.account, [*(file.name for file in known.files), *known.missing]
-        unexplained = account.settle(files, known.recorded, found, known.end_ns or None)
+        unexplained = account.reconcile(files, known.recorded, found, known.end_ns or None)
         if unexplained:
             more = sum(unexplained.values())
             self._notes.add(f"metadata.yaml counts {more} messages more than its undamaged storage files hold.")
         elif account.losses:
             for file in files:
-                account.know(file, {}, start_ns)
-            account.know("metadata.yaml", known.recorded, start_ns or known.start_ns)
+                account.set_recorded(file, {}, start_ns)
+            account.set_recorded("metadata.yaml", known.recorded, start_ns or known.start_ns)
 
 
 class ZstdMessages:
@@ -111,7 +111,7 @@ class ZstdMessages:
             return b""
 
     def _unpacked(self, channels: Collection[Channel]) -> Iterator[Message]:
-        lost: defaultdict[str, Runs] = defaultdict(Runs)
+        lost: defaultdict[str, LossRuns] = defaultdict(LossRuns)
         reason = ""
         for message in messages_in(self._packed, channels):
             topic = message.channel.topic
@@ -119,10 +119,10 @@ class ZstdMessages:
                 yield message._replace(data=unpack_zstd_message(message.data))
             except BadChunkError as error:
                 reason = reason or f"The first does not unpack: {error}."
-                lost[topic].lost(message.log_ns)
+                lost[topic].add_lost(message.log_ns)
                 self._account.add("packed", {topic: lost[topic].messages}, (topic, 0), lost[topic].spans, reason)
             else:
-                lost[topic].sound()
+                lost[topic].add_sound()
 
 
 def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
@@ -135,7 +135,7 @@ def messages_unpacked(container: Container, contents: Contents, notes: Notes) ->
 
 
 def read_metadata(folder: Path) -> Metadata:
-    """What metadata.yaml says. Raises MetadataError where it is damaged or names no file that exists."""
+    """Read metadata.yaml. Raises MetadataError where it is damaged or names no file that exists."""
     tree = _metadata(folder)
     listed = tree.get("relative_file_paths")
     names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []

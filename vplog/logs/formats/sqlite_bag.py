@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks, ordered
-from vplog.logs.formats.layout import Search
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks
+from vplog.logs.formats.layout import ResyncSearch
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -85,8 +85,8 @@ class SqliteBag:
             counts[channel] += by_id.pop(topic)
         if unknown := by_id.total():
             account.add("unknown_channel", {"": unknown}, (name, 0), [])
-        account.know(name, {} if self._damaged else by_topic(counts), start_ns)
-        return Contents(ordered(counts), start_ns, end_ns)
+        account.set_recorded(name, {} if self._damaged else by_topic(counts), start_ns)
+        return Contents(dict(sorted(counts.items())), start_ns, end_ns)
 
     def _missing_by_index(self, rows: int) -> int:
         """Messages that an index of the table lists and the table, in which `rows` are found, has not."""
@@ -228,7 +228,7 @@ class SqliteBag:
         try:
             db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         except sqlite3.DatabaseError:
-            db.execute("PRAGMA writable_schema = ON")  # else SQLite reads no file shorter than its header says
+            db.execute("PRAGMA writable_schema = ON")  # else SQLite reads no file shorter than in its header
             db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         return db
 
@@ -255,11 +255,11 @@ class SqliteBag:
 
 
 def _appended_at(path: Path) -> int | None:
-    """Where another database begins in a file that is not as long as its head says (sqlite.org/fileformat2.html)."""
+    """Where another database begins in a file of another length than in its header (sqlite.org/fileformat2.html)."""
     with path.open("rb") as file:
         page, pages = struct.unpack(">16xH10xI", file.read(32).ljust(32, b"\0"))
         length = path.stat().st_size
-        return None if length == page * pages else Search(file, length).first(re.compile(MAGIC), len(MAGIC))
+        return None if length == page * pages else ResyncSearch(file, length).first(re.compile(MAGIC), len(MAGIC))
 
 
 def _integer(value: object) -> int:

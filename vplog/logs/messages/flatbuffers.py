@@ -33,7 +33,7 @@ _FIELDS = {
 """Fields of each table in order (github.com/foxglove/foxglove-sdk, schemas/flatbuffer), as far as they are read."""
 
 
-def fill_flat(message: Proto, data: bytes) -> None:
+def parse_flatbuffer(message: Proto, data: bytes) -> None:
     """Set a message from a FlatBuffer. Raises BadMessageError or struct.error where it points outside itself."""
     _fill(message, data, _follow(data, 0))
 

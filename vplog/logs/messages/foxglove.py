@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.logs.messages.flatbuffers import fill_flat
+from vplog.logs.messages.flatbuffers import parse_flatbuffer
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
@@ -34,29 +34,18 @@ if TYPE_CHECKING:
 
 _UNKNOWN_COVARIANCE = 0
 """LocationFix.PositionCovarianceType.UNKNOWN."""
-_LENGTH = 2
-"""Wire type of protobuf's fields that are bytes behind their length (protobuf.dev/programming-guides/encoding)."""
-_FIXED = {1: 8, 5: 4}
-"""Bytes of the wire types that have always as many."""
 
 
 def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
-    """A record of type `foxglove.RawImage` and so on; in protobuf, the bytes of images are a view of `data`. Raises
-    BadMessageError or what the parsers raise."""
-    message, read = _message_class(kind)(), _READERS[kind]
+    """A record of type `foxglove.RawImage` and so on. Raises BadMessageError or what the parsers raise."""
+    message = _message_class(kind)()
     if encoding == "json":
         _fill(message, json.loads(bytes(data)))
     elif encoding == "flatbuffer":
-        fill_flat(message, bytes(data))
+        parse_flatbuffer(message, bytes(data))
     else:
-        at, start, stop = (read in (_raw, _compressed) and _find_data(message, data)) or (len(data), 0, len(data))
-        message.ParseFromString(bytes(data[:at]) + bytes(data[stop:]))  # pixels the parser would copy twice
-        if start and not message.data:
-            image: Any = read(message)
-            return image._replace(data=memoryview(data)[start:stop])
-        if start:  # of a field that comes twice, the last one counts
-            message.ParseFromString(bytes(data))
-    return read(message)
+        message.ParseFromString(bytes(data))
+    return _READERS[kind](message)
 
 
 @cache
@@ -65,44 +54,11 @@ def _message_class(kind: str) -> Any:
     return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
 
 
-def _find_data(message: Proto, data: Octets) -> tuple[int, int, int] | None:
-    """Where the field `data` of an image lies in protobuf: its tag, first byte and end. None where it is left out."""
-    tag, at = message.DESCRIPTOR.fields_by_name["data"].number << 3 | _LENGTH, 0
-    try:
-        while data[at] != tag:
-            at = _skipped(data, at + 1, data[at])
-        size, start = _varint(data, at + 1)
-    except LookupError:
-        return None
-    return (at, start, start + size) if start + size <= len(data) else None
-
-
-def _skipped(data: Octets, at: int, tag: int) -> int:
-    """Where the value of a field ends that begins at `at`. Raises IndexError where the tag is of another message."""
-    if tag >= 0x80:  # a field number above 15, which none of these types has
-        raise IndexError
-    if tag & 7 == _LENGTH:
-        length, at = _varint(data, at)
-        return at + length
-    if tag & 7 == 0:
-        return _varint(data, at)[1]
-    return at + _FIXED[tag & 7]
-
-
-def _varint(data: Octets, at: int) -> tuple[int, int]:
-    """A number in groups of 7 bits, the lowest first, and where it ends. Raises IndexError where it does not."""
-    value = shift = 0
-    for position in range(at, at + 10):  # 64 bits
-        byte = data[position]
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, position + 1
-        shift += 7
-    raise IndexError
-
-
 def _fill(message: Proto, tree: Any) -> None:
-    """Set a message from Foxglove's JSON: times as {sec, nsec}, bytes as base64, enums as numbers."""
+    """Set a message from Foxglove's JSON: times as {sec, nsec}, bytes as base64, enums as numbers.
+
+    protobuf's json_format has times as text and takes five times as long.
+    """
     if not isinstance(tree, dict):
         raise BadMessageError(f"{message.DESCRIPTOR.name} is not a JSON object")
     if message.DESCRIPTOR.full_name == "google.protobuf.Timestamp":
@@ -158,9 +114,19 @@ def _pose(m: Any) -> Record:
     return _placed(m, m.frame_id, "", m.pose.position, m.pose.orientation)
 
 
+def _poses(m: Any) -> Record:
+    """The last pose is that of the message's time."""
+    if not m.poses:
+        raise BadMessageError("it holds no pose")
+    return _placed(m, m.frame_id, "", m.poses[-1].position, m.poses[-1].orientation)
+
+
 def _odometry(m: Any) -> Record:
     covariance = _matrix(m.pose_covariance, (6, 6)).ravel().tolist()
-    return _placed(m, m.frame_id, m.body_frame_id, m.pose.position, m.pose.orientation, covariance)
+    found = _placed(m, m.frame_id, m.body_frame_id, m.pose.position, m.pose.orientation, covariance)
+    linear, angular = m.linear_velocity, m.angular_velocity
+    variances = _matrix(m.velocity_covariance, (6, 6)).ravel()[::7]
+    return found._replace(twist=(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z, *variances.tolist()))
 
 
 def _transform(m: Any) -> PoseMessage:
@@ -188,6 +154,7 @@ _READERS: dict[str, Callable[[Any], Record]] = {
     "foxglove.CompressedVideo": _compressed,
     "foxglove.CameraCalibration": _calibration,
     "foxglove.PoseInFrame": _pose,
+    "foxglove.PosesInFrame": _poses,
     "foxglove.Odometry": _odometry,
     "foxglove.LocationFix": _fix,
     "foxglove.FrameTransform": lambda m: [_transform(m)],

@@ -23,7 +23,7 @@ class FrameNumbers:
 
     def __init__(self) -> None:
         self._bits = 0
-        """Bits of frame_num; 0 where numbers tell nothing: no parameter set was read, or it allows gaps."""
+        """Bits of frame_num; 0 where they are of no use: no parameter set was read, or it allows gaps."""
         self._separate = False
         """Slices name their colour plane."""
         self._last = -1
@@ -41,7 +41,7 @@ class FrameNumbers:
                     self._read_parameters(_Bits(data[start + 1 : min(stop - 3, start + _PARAMETERS)]))
                 elif kind in (_SLICE, _IDR):
                     return self._slice(_Bits(data[start + 1 : start + _HEAD]), kind == _IDR, reference)
-            except IndexError:  # cut short: the decoder says what comes of it
+            except IndexError:  # cut short: left to the decoder
                 return True
         return True
 

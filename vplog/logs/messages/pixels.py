@@ -26,7 +26,7 @@ _DEPTH_HEADER = 12
 _CLIPPED = 0.002
 """Share of pixels beyond black, and beyond white: hot and dead ones and glints, of 1000 px two."""
 _SAMPLED = 16
-"""Images that tell the levels of a drive: day and night, sun and tunnel are among them."""
+"""Images that the levels of a drive are taken from: day and night, sun and tunnel are among them."""
 _LEAST_UNKNOWN = 0.001
 """Share of px without measurement that depth images have at least; a camera has a few dead ones in a million."""
 _INVALID_MM = 65535
@@ -69,6 +69,20 @@ _MOSAICS = {
 _LAYOUTS |= {f"bayer_{name}{8 * size}": (f"u{size}", 1, code) for name, code in _MOSAICS.items() for size in (1, 2)}
 _COLOURS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
 """As OpenCV decodes them."""
+_RGB = {
+    None: cv2.COLOR_GRAY2RGB,
+    cv2.COLOR_RGB2GRAY: None,
+    cv2.COLOR_BGR2GRAY: cv2.COLOR_BGR2RGB,
+    cv2.COLOR_RGBA2GRAY: cv2.COLOR_RGBA2RGB,
+    cv2.COLOR_BGRA2GRAY: cv2.COLOR_BGRA2RGB,
+    cv2.COLOR_YUV2GRAY_UYVY: cv2.COLOR_YUV2RGB_UYVY,
+    cv2.COLOR_YUV2GRAY_YUY2: cv2.COLOR_YUV2RGB_YUY2,
+    cv2.COLOR_BayerBG2GRAY: cv2.COLOR_BayerBG2RGB,
+    cv2.COLOR_BayerRG2GRAY: cv2.COLOR_BayerRG2RGB,
+    cv2.COLOR_BayerGB2GRAY: cv2.COLOR_BayerGB2RGB,
+    cv2.COLOR_BayerGR2GRAY: cv2.COLOR_BayerGR2RGB,
+}
+"""For each conversion to grey that to red, green, blue."""
 _DEPTH_ENCODINGS = ("16UC1", "16SC1", "32FC1", "64FC1")
 _SIXTEEN_BITS = "16UC1"
 """Depth in mm, or what a thermal camera counts."""
@@ -146,15 +160,23 @@ def spread(count: int) -> int:
 
 
 def drive_levels(messages: Iterator[ImageMessage]) -> Levels | None:
-    """The levels of images that speak for a drive; None, and only the first whole one is looked at, where it has not
-    16 bits."""
+    """The levels of sampled images of a drive; None where the first whole one has not 16 bits."""
     first = next((message for message in messages if not message.compressed or image_size(message.data)), None)
     return levels_of(chain([first], messages)) if first is not None and sixteen_bits(first) else None
 
 
 def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
     """(H, W) uint8; of 16 bits by the `levels` of the topic, or by its own. Raises BadMessageError."""
-    pixels, conversion = _pixels(message)
+    return _converted(message, levels, *_pixels(message))
+
+
+def rgb(message: ImageMessage, levels: Levels | None = None) -> Bytes:
+    """(H, W, 3) uint8 red, green, blue; three times the grey where it has no colour. As `grey`."""
+    pixels, conversion = _pixels(message, colour=True)
+    return _converted(message, levels, pixels, _RGB[conversion])
+
+
+def _converted(message: ImageMessage, levels: Levels | None, pixels: Any, conversion: int | None) -> Bytes:
     if pixels.dtype == np.uint16:
         pixels = (levels or levels_of([message]) or Levels(0, 2**16 - 1)).apply(pixels)
     if pixels.dtype != np.uint8:
@@ -165,15 +187,16 @@ def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
         raise BadMessageError(f"{message.encoding[:40]!r} with {pixels.shape[1]} x {pixels.shape[0]} px") from None
 
 
-def _pixels(message: ImageMessage) -> tuple[Any, int | None]:
-    """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion to grey."""
+def _pixels(message: ImageMessage, colour: bool = False) -> tuple[Any, int | None]:
+    """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion to grey; those of image files
+    are grey already without `colour`."""
     if not message.compressed:
         return _raw(message)
     mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
-    pixels = _imdecode(message.data, unchanged=mosaic is not None)
-    if mosaic is None:
-        return pixels, None
-    return pixels, mosaic[2] if pixels.ndim == 2 else _COLOURS[pixels.shape[2]]  # some transports compress the mosaic
+    pixels = _imdecode(message.data, unchanged=colour or mosaic is not None)
+    if pixels.ndim > 2:
+        return pixels, _COLOURS[pixels.shape[2]]
+    return pixels, mosaic and mosaic[2]  # some transports compress the mosaic
 
 
 def depth_m(message: ImageMessage) -> Float32s:
@@ -199,6 +222,12 @@ def depth_m(message: ImageMessage) -> Float32s:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         depth = np.float32(a) / (pixels.astype(np.float32) - np.float32(b))
     return np.where((pixels != 0) & np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan)).astype(np.float32)
+
+
+def scaled_depth_m(data: Octets, per_m: float) -> Float32s:
+    """(H, W) float32 m of an image file of 16 bits with `per_m` counts of a metre, NaN where unknown. Raises
+    BadMessageError."""
+    return _metres(_imdecode(data, unchanged=True), "16UC1") * np.float32(1000.0 / per_m)
 
 
 def _metres(pixels: Any, encoding: str) -> Float32s:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class BadMessageError(Exception):
-    """A message's bytes are not what its type says."""
+    """The bytes of a message do not fit its type."""
 
 
 class ImageMessage(NamedTuple):
@@ -74,6 +74,24 @@ class PoseMessage(NamedTuple):
     """x y z w, as logged."""
     covariance: Sequence[float] | None
     """The 36 numbers of a (6, 6) as logged: translation first, axes of `frame`; None where the type has none."""
+    twist: Sequence[float] | None = None
+    """Velocities of the body in its own axes, linear in m/s, then angular in rad/s, and the six variances of these as
+    logged; None where the type has none. Of a type in GEOMETRY, before it is multiplied by that."""
+
+
+class PathMessage(NamedTuple):
+    """The poses of a drive up to now."""
+
+    stamp_ns: int
+    frame: str
+    poses: list[PoseMessage]
+
+
+class ImuMessage(NamedTuple):
+    stamp_ns: int
+    frame: str
+    gyro: Sequence[float]
+    """rad/s about the axes of `frame`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +102,12 @@ class FixMessage:
     longitude_deg: float
     altitude_m: float
     covariance: Floats
-    """(3, 3) m^2 east-north-up; NaN where its type says unknown."""
+    """(3, 3) m^2 east-north-up; NaN where unknown by its covariance type."""
     frame: str
     """Frame of the antenna."""
 
 
-Record = ImageMessage | CalibrationMessage | PoseMessage | FixMessage | list[PoseMessage]
+Record = ImageMessage | CalibrationMessage | PoseMessage | PathMessage | ImuMessage | FixMessage | list[PoseMessage]
 
 _KINDS = {
     "sensor_msgs/Image": "image",
@@ -105,7 +123,16 @@ _KINDS = {
     "geometry_msgs/PoseStamped": "odometry",
     "geometry_msgs/PoseWithCovarianceStamped": "odometry",
     "geometry_msgs/TransformStamped": "odometry",
+    "geometry_msgs/Pose2D": "odometry",
+    "geometry_msgs/TwistStamped": "odometry",
+    "geometry_msgs/TwistWithCovarianceStamped": "odometry",
+    "nav_msgs/Path": "odometry",
+    "px4_msgs/VehicleOdometry": "odometry",
+    "ackermann_msgs/AckermannDriveStamped": "odometry",
+    "sensor_msgs/JointState": "odometry",
+    "sensor_msgs/Imu": "imu",
     "foxglove.PoseInFrame": "odometry",
+    "foxglove.PosesInFrame": "odometry",
     "foxglove.Odometry": "odometry",
     "sensor_msgs/NavSatFix": "gps",
     "foxglove.LocationFix": "gps",
@@ -114,11 +141,17 @@ _KINDS = {
     "foxglove.FrameTransform": "tf",
     "foxglove.FrameTransforms": "tf",
 }
+TWISTS = ("geometry_msgs/TwistStamped", "geometry_msgs/TwistWithCovarianceStamped")
+"""Types with velocities and no pose."""
+WHEELS = "sensor_msgs/JointState"
+"""The type with a turn rate for each wheel."""
+GEOMETRY = {"ackermann_msgs/AckermannDriveStamped": ("wheelbase_m",), WHEELS: ("wheel_radius_m", "track_m")}
+"""Types whose velocities need measures of the vehicle, by their names in TopicChoice."""
 ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxglove", "flatbuffer": "foxglove"}
 
 
 def kind_of(channel: Channel) -> str:
-    """`image`, `camera_info`, `odometry`, `gps`, `tf`, or `` for what vplog has no use for or cannot decode."""
+    """`image`, `camera_info`, `odometry`, `gps`, `imu`, `tf`, or `` for what vplog has no use for or cannot decode."""
     family = ENCODINGS.get(channel.encoding)
     name = short_type(channel.type)
     if family is None or name.startswith("foxglove.") != (family == "foxglove"):

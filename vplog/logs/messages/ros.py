@@ -6,17 +6,22 @@ they copy, where this takes 5.
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.geometry import se3
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
     FixMessage,
     ImageMessage,
+    ImuMessage,
+    PathMessage,
     PoseMessage,
     nanoseconds,
 )
@@ -30,6 +35,13 @@ if TYPE_CHECKING:
 
 _UNKNOWN_COVARIANCE = 0
 """NavSatFix.COVARIANCE_TYPE_UNKNOWN."""
+_UNKNOWN_VARIANCES = (math.nan,) * 6
+_SIDE = re.compile(r"(left|right|(?<![a-z])[lr](?![a-z]))", re.IGNORECASE)
+"""The side of a wheel in the name of its joint."""
+_NED = 1
+"""VehicleOdometry.POSE_FRAME_NED; 2 is a frame of its own, forward, right and down."""
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 _ENCAPSULATION = 4
 """Bytes before a message in CDR: plain, big (0) or little (1) endian. Numbers are aligned to their size behind them."""
 
@@ -137,7 +149,7 @@ def _video(fields: _Fields) -> Record:
 
 
 def _calibration(fields: _Fields) -> Record:
-    """K and P are of the full image; roi says which part of it is sent, and binning how many px become one."""
+    """K and P are of the full image; roi is the part of it that is sent, and binning the px that become one."""
     stamp_ns, frame = fields.header()
     (height, width), model, distortion = fields.numbers("2I"), fields.text(), fields.doubles()
     numbers = np.array(fields.numbers("30d"))
@@ -154,7 +166,7 @@ def _calibration(fields: _Fields) -> Record:
 def _odometry(fields: _Fields) -> Record:
     (stamp_ns, frame), child = fields.header(), fields.text()
     numbers = fields.numbers("85d")  # pose and its covariance, twist and its own
-    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:7], numbers[7:43])
+    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:7], numbers[7:43], _twist_of(numbers[43:]))
 
 
 def _pose(fields: _Fields) -> Record:
@@ -165,6 +177,85 @@ def _pose(fields: _Fields) -> Record:
 def _pose_with_covariance(fields: _Fields) -> Record:
     (stamp_ns, frame), numbers = fields.header(), fields.numbers("43d")
     return PoseMessage(stamp_ns, frame, "", numbers[:3], numbers[3:7], numbers[7:])
+
+
+def _twist_of(numbers: tuple) -> tuple:
+    """Six velocities, and the variances of their (6, 6) behind them."""
+    return *numbers[:6], *numbers[6::7]
+
+
+def _moving(stamp_ns: int, frame: str, twist: tuple) -> PoseMessage:
+    """Velocities without a pose."""
+    return PoseMessage(stamp_ns, "", frame, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), None, twist)
+
+
+def _twist(fields: _Fields) -> Record:
+    return _moving(*fields.header(), (*fields.numbers("6d"), *_UNKNOWN_VARIANCES))
+
+
+def _twist_with_covariance(fields: _Fields) -> Record:
+    return _moving(*fields.header(), _twist_of(fields.numbers("42d")))
+
+
+def _ackermann(fields: _Fields) -> Record:
+    """github.com/ros-drivers/ackermann_msgs: the yaw rate is speed tan(steering angle) / wheelbase."""
+    stamp_ns, frame = fields.header()
+    angle, _, speed, _, _ = fields.numbers("5f")
+    return _moving(stamp_ns, frame, (speed, 0.0, 0.0, 0.0, 0.0, speed * math.tan(angle), *_UNKNOWN_VARIANCES))
+
+
+def _wheels(fields: _Fields) -> Record:
+    """Velocities of wheels in rad/s by their names: the mean of left and right, and their difference."""
+    stamp_ns, frame = fields.header()
+    names = [fields.text() for _ in range(fields.numbers("I")[0])]
+    _, speeds, _ = fields.doubles(), fields.doubles(), fields.doubles()
+    sides: dict[str, list[float]] = {"l": [], "r": []}
+    for name, speed in zip(names, speeds.tolist(), strict=False):
+        if side := _SIDE.search(name):
+            sides[side[1][0].lower()].append(speed)
+    if not (sides["l"] and sides["r"]):
+        raise BadMessageError("it has no velocities of left and right wheels")
+    left, right = (sum(one) / len(one) for one in (sides["l"], sides["r"]))
+    return _moving(stamp_ns, frame, ((left + right) / 2, 0.0, 0.0, 0.0, 0.0, right - left, *_UNKNOWN_VARIANCES))
+
+
+def _pose_2d(fields: _Fields) -> Record:
+    """x, y and theta without a header."""
+    x, y, theta = fields.numbers("3d")
+    return PoseMessage(0, "", "", (x, y, 0.0), (0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)), None)
+
+
+def _path(fields: _Fields) -> Record:
+    stamp_ns, frame = fields.header()
+    count = fields.numbers("I")[0]
+    poses: list[PoseMessage] = []
+    for _ in range(count):
+        at_ns, own = fields.header()
+        numbers = fields.numbers("7d")
+        poses.append(PoseMessage(at_ns, own or frame, "", numbers[:3], numbers[3:], None))
+    return PathMessage(stamp_ns, frame, poses)
+
+
+def _imu(fields: _Fields) -> Record:
+    (stamp_ns, frame), numbers = fields.header(), fields.numbers("37d")
+    return ImuMessage(stamp_ns, frame, numbers[13:16])
+
+
+def _px4(fields: _Fields) -> Record:
+    """px4_msgs/VehicleOdometry since 1.14: north-east-down and forward-right-down become REP 103's axes."""
+    (micros, _), (frame,) = fields.numbers("2Q"), fields.numbers("B")
+    numbers = np.array(fields.numbers("7f"))
+    fields.numbers("B")  # velocity_frame
+    fields.numbers("6f")  # velocity and angular velocity
+    variances = np.array(fields.numbers("9f"))[:6]
+    fields.numbers("Bb")  # reset_counter, quality
+    world = _ENU_FROM_NED if frame == _NED else _FLU_FROM_FRD
+    turn = world @ se3.rotation(numbers[[4, 5, 6, 3]]) @ _FLU_FROM_FRD
+    variances[:3] = np.abs(world) @ variances[:3]
+    return PoseMessage(
+        micros * 1000, "odom", "base_link", (world @ numbers[:3]).tolist(), se3.quaternion(turn).tolist(),
+        np.diag(variances).ravel().tolist(),
+    )  # fmt: skip
 
 
 def _transform(fields: _Fields) -> PoseMessage:
@@ -194,6 +285,14 @@ _READERS: dict[str, Callable[[_Fields], Record]] = {
     "geometry_msgs/PoseStamped": _pose,
     "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
     "geometry_msgs/TransformStamped": _transform,
+    "geometry_msgs/Pose2D": _pose_2d,
+    "geometry_msgs/TwistStamped": _twist,
+    "geometry_msgs/TwistWithCovarianceStamped": _twist_with_covariance,
+    "nav_msgs/Path": _path,
+    "ackermann_msgs/AckermannDriveStamped": _ackermann,
+    "px4_msgs/VehicleOdometry": _px4,
+    "sensor_msgs/JointState": _wheels,
+    "sensor_msgs/Imu": _imu,
     "sensor_msgs/NavSatFix": _fix,
     "tf2_msgs/TFMessage": _transforms,
     "tf/tfMessage": _transforms,

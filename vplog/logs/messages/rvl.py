@@ -1,7 +1,7 @@
 """RVL depth images (A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017), as compressedDepth has them.
 
 Runs of zeros and of others take turns, each led by its length; of the others, differences to the one before follow.
-Every number is a string of nibbles: three bits of value, lowest first, and one that says that more follow.
+Every number is a string of nibbles: three bits of value, lowest first, and a continuation bit.
 """
 
 from __future__ import annotations

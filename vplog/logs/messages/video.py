@@ -21,6 +21,8 @@ from vplog.logs.messages.records import BadMessageError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from av import VideoFrame
+
     from vplog.data import Bytes
 
 _CODECS = {
@@ -67,19 +69,19 @@ class VideoStream:
         """The first row that the decoder has not been given."""
         self._damaged = -1
         """The last row that did not decode: none decodes from there to the next key frame."""
-        self._ready: dict[int, Bytes] = {}
+        self._ready: dict[int, VideoFrame] = {}
 
     def first_key(self) -> int | None:
         """The first row from which decoding can start; None where there is none."""
         return next((row for row in range(self._count) if self._kind(row) >= _KEY), None)
 
-    def frame(self, row: int) -> Bytes:
-        """(H, W) uint8 grey; rows are best read in increasing order. Raises BadMessageError where it cannot be decoded,
-        and LogError where PyAV is not installed."""
+    def frame(self, row: int) -> VideoFrame:
+        """Rows are best read in increasing order. Raises BadMessageError where it cannot be decoded, and LogError where
+        PyAV is not installed."""
         if row not in self._ready:
             self._advance(row)
         self._last = row
-        self._ready = {later: image for later, image in self._ready.items() if later >= row}
+        self._ready = {later: frame for later, frame in self._ready.items() if later >= row}
         if row not in self._ready:
             raise BadMessageError("its video packet decodes to no frame")
         return self._ready[row]
@@ -147,7 +149,7 @@ class VideoStream:
                 if frame.is_corrupt:
                     return self._fail(number, row)
                 if frame.pts is not None and frame.pts >= row:
-                    self._ready[frame.pts] = _grey(frame)
+                    self._ready[frame.pts] = frame
         except self._av.error.FFmpegError:
             return self._fail(number, row)
         return None
@@ -158,7 +160,7 @@ class VideoStream:
         with suppress(self._av.error.FFmpegError):  # it held nothing
             for frame in decoder.decode(None) if decoder is not None else ():
                 if frame.pts is not None and row <= frame.pts < number and not frame.is_corrupt:
-                    self._ready[frame.pts] = _grey(frame)
+                    self._ready[frame.pts] = frame
         if row not in self._ready:
             raise BadMessageError(_BROKEN)
 
@@ -191,7 +193,7 @@ def packet_kind(codec: str, data: bytes) -> int:
 
 
 def _obu_types(data: bytes) -> set[int]:
-    """Types of the units of an AV1 packet (AV1 bitstream 5.3), up to the first that says no size."""
+    """Types of the units of an AV1 packet (AV1 bitstream 5.3), up to the first without a size."""
     found, position = set(), 0
     while position < len(data):
         header = data[position]
@@ -218,14 +220,19 @@ _EIGHT_BITS = re.compile(r"(yuvj?4[0-9]{2}p|nv12|nv16|nv21|gray)$")
 _STRETCH = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 
 
-def _grey(frame: Any) -> Bytes:
+def grey(frame: Any) -> Bytes:
     """(H, W) uint8: the luma as JPEG and PNG have it."""
     if not _EIGHT_BITS.match(frame.format.name):
-        return np.asarray(cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY), np.uint8)
+        return np.asarray(cv2.cvtColor(rgb(frame), cv2.COLOR_RGB2GRAY), np.uint8)
     plane = frame.planes[0]
     rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
     full = int(frame.color_range) == _FULL_RANGE or frame.format.name.startswith("yuvj")
     return rows.copy() if full else _STRETCH[rows]
+
+
+def rgb(frame: Any) -> Bytes:
+    """(H, W, 3) uint8 red, green, blue."""
+    return frame.to_ndarray(format="rgb24")
 
 
 def _av(codec: str, topic: str) -> Any:

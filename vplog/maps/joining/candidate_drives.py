@@ -10,7 +10,7 @@ import numpy as np
 from vplog.execution.execution import Execution
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import read_column, update_index
-from vplog.maps.search.sequences import PLACES_A_VIEW, credits_of
+from vplog.maps.search.sequences import PLACES_A_VIEW, drive_credits
 from vplog.maps.storage.damage import reading_drive
 from vplog.sessions.inter_session import candidates_among
 from vplog.stages import CodedState
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceState
 
 _CHOICE = 3
-"""Drives searched for each that may be verified. Views alone and in sequences seldom differ in which drives are alike,
+"""Drives searched for each that may be verified. Single views and sequences seldom differ in which drives score high,
 but in their order."""
 _AT_ONCE = 64
-"""New drives that are looked for while the places of one before them are in memory; theirs are too, some 40 MB."""
+"""New drives that are searched in one earlier drive while its places are in memory; theirs are too, some 40 MB."""
 
 
 def places_of(store: Store, member: Member, state: PlaceState) -> Sequence[Any]:
@@ -42,12 +42,12 @@ def candidates_of(
     store: Store, members: Sequence[Member], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
     execution: Execution = Execution(),
 ) -> dict[int, Candidates]:  # fmt: skip
-    """For each new drive, by number, its best candidates in the drives of a lower number that are worth a search."""
+    """For each new drive, by number, its best candidates in the drives of `drives_to_search`."""
     found: dict[int, Candidates] = {}
-    counts = [min(number, most_searched(pipeline)) for number in new]
+    counts = [min(number, max_drives_searched(pipeline)) for number in new]
     for first in range(0, len(new), _AT_ONCE):
         block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
-        searched = worth_a_search(store, members, block, state, pipeline, Execution(execution.threads))
+        searched = drives_to_search(store, members, block, state, pipeline, Execution(execution.threads))
         found |= candidates_among(
             block, lambda number: places_of(store, members[number], state), searched, state, pipeline,
             execution.part(sum(counts[:first]), sum(counts)),
@@ -55,12 +55,12 @@ def candidates_of(
     return found
 
 
-def most_searched(pipeline: Pipeline) -> int:
+def max_drives_searched(pipeline: Pipeline) -> int:
     """Drives that one is searched in, at most: so many that `likely_drives` chooses from enough."""
     return _CHOICE * pipeline.join.most_drives
 
 
-def worth_a_search(
+def drives_to_search(
     store: Store, members: Sequence[Member], later: Mapping[int, Sequence[Any]], state: PlaceState,
     pipeline: Pipeline, execution: Execution = Execution(),
 ) -> dict[int, Container[int]]:  # fmt: skip
@@ -70,7 +70,7 @@ def worth_a_search(
     So what a drive more costs grows as a query of the map does, not with its drives. Maps without an index, which are
     those of other recognisers and those on object stores, are searched drive by drive.
     """
-    most = most_searched(pipeline)
+    most = max_drives_searched(pipeline)
     searched: dict[int, Container[int]] = {number: range(number) for number in later}
     if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
         return searched
@@ -80,7 +80,7 @@ def worth_a_search(
         if number <= most:
             continue
         before = [replace(part, numbers=np.where(part.numbers < number, part.numbers, -1)) for part in parts]
-        _, drive, credit = credits_of(best_places(before, state, views, PLACES_A_VIEW, execution))
+        _, drive, credit = drive_credits(best_places(before, state, views, PLACES_A_VIEW, execution))
         like = np.bincount(drive, credit, number)
         best = np.lexsort((np.arange(number), -like))[:most]
         searched[number] = set(best[like[best] > 0].tolist())

@@ -21,6 +21,7 @@ import numpy as np
 from vplog.cache.code_hash import code_of
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
+from vplog.graph.refine import about_odometry
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.storage.damage import DamagedDriveError, reading_drive
 from vplog.maps.storage.layout import key_of
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from vplog.data import Closures, Odometry
     from vplog.execution.execution import Execution
     from vplog.graph.refine import Refined
-    from vplog.maps.joining.drive_pairs import Joins
+    from vplog.maps.joining.drive_pairs import JoinState
     from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
@@ -46,11 +47,11 @@ class Drives:
     """The drives of a map that may be joined, in its order."""
 
     members: list[Member]
-    joins: list[Joins]
+    joins: list[JoinState]
     """The place of each in the order, and the drives that it was verified against."""
     keys: dict[str, str]
     """Keys of drive.json, by ID."""
-    apart: dict[str, str]
+    excluded: dict[str, str]
     """Why others are not joined, by ID."""
     library: str
     number: dict[str, int]
@@ -63,7 +64,7 @@ class Drives:
 
 
 @dataclass(frozen=True)
-class Tie:
+class PairLedger:
     """A pair of drives with a ledger."""
 
     later: str
@@ -77,26 +78,28 @@ class Tie:
 
 @dataclass(frozen=True)
 class Group:
-    """Drives that verified closures join, if the solve does not think otherwise."""
+    """Drives connected by verified closures, before the solve decides which of them it joins."""
 
     drives: tuple[str, ...]
-    """In the map's order."""
-    ties: tuple[Tie, ...]
-    """All between them, those of few closures too."""
+    """IDs in the map's order."""
+    pair_ledgers: tuple[PairLedger, ...]
+    """Ledgers of all pairs of them, those of few closures too."""
     key: str
     """sha256 over all that the solve depends on."""
 
 
 def _settings(pipeline: Pipeline) -> dict[str, Any]:
-    """Those that the solve of a group depends on."""
+    """Settings that the solve of a group depends on."""
     chosen = {name: getattr(pipeline, name).model_dump(mode="json") for name in ("solve", "refine")}
     return {**chosen, "join": pipeline.join.model_dump(mode="json", include={"least_closures", "spacing"})}
 
 
-def groups_of(order: Sequence[str], keys: dict[str, str], ties: Sequence[Tie], pipeline: Pipeline) -> list[Group]:
+def groups_of(
+    order: Sequence[str], keys: dict[str, str], pair_ledgers: Sequence[PairLedger], pipeline: Pipeline
+) -> list[Group]:
     """The groups of two drives and more, in the order of their first ones. `keys` are those of drive.json."""
     at = {drive: number for number, drive in enumerate(order)}
-    good = [tie for tie in ties if tie.verified >= pipeline.join.least_closures]
+    good = [entry for entry in pair_ledgers if entry.verified >= pipeline.join.least_closures]
     number = parts(
         len(order), np.array([at[t.earlier] for t in good], np.int64), np.array([at[t.later] for t in good], np.int64)
     )
@@ -105,11 +108,11 @@ def groups_of(order: Sequence[str], keys: dict[str, str], ties: Sequence[Tie], p
     for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
         drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
         inside = set(drives)
-        between = [tie for tie in ties if {tie.later, tie.earlier} <= inside]
-        own = tuple(sorted(between, key=lambda tie: (at[tie.later], at[tie.earlier])))
+        between = [entry for entry in pair_ledgers if {entry.later, entry.earlier} <= inside]
+        own = tuple(sorted(between, key=lambda entry: (at[entry.later], at[entry.earlier])))
         made_from = {
             "drives": [[drive, keys[drive]] for drive in drives],
-            "ledgers": [[tie.later, tie.earlier, tie.key] for tie in own],
+            "ledgers": [[entry.later, entry.earlier, entry.key] for entry in own],
             "settings": _settings(pipeline),
             "code": code,
         }
@@ -130,7 +133,7 @@ def solve_group(
         with reading_drive(drive):
             drives.append(_drive(drive, runs[drive]))
     at = {drive: number for number, drive in enumerate(group.drives)}
-    ledgers = {(at[tie.later], at[tie.earlier]): _ledger(tie) for tie in group.ties}
+    ledgers = {(at[entry.later], at[entry.earlier]): _ledger(entry) for entry in group.pair_ledgers}
     joined, ledgers = solve_drives(drives, ledgers, pipeline)
     header, components = tables.TableMetadata(_settings(pipeline), library), []
     for members, refined in joined.solved.items():
@@ -148,7 +151,11 @@ def solve_group(
         run_record.write_run_json(made / "component.json", _record(group, names, joins, refined))  # last: it is whole
         components.append({"folder": folder, "drives": names})
     apart = [
-        {"query_drive": group.ties[pair].later, "match_drive": group.ties[pair].earlier, "reason": reason.strip()}
+        {
+            "query_drive": group.pair_ledgers[pair].later,
+            "match_drive": group.pair_ledgers[pair].earlier,
+            "reason": reason.strip(),
+        }
         for pair, reason in sorted(joined.apart.items())
     ]
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
@@ -158,23 +165,21 @@ def _drive(name: str, run: Path) -> SolvedDrive:
     """A drive from its run folder. Raises ResultError."""
     keyframes, poses = tables.read_keyframes(run / "keyframes.parquet")
     graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
-    odometry = run_record.read_run_json(run / "run.json").get("odometry")
-    factor = odometry.get("sigma_factor") if isinstance(odometry, dict) else None
-    if not isinstance(factor, int | float) or not factor > 0:
-        raise ResultError(f"{run}/run.json lacks odometry.sigma_factor. Run `vplog batch` with the drive's log again.")
 
     def read_odometry() -> Odometry:
         with reading_drive(name):
             return tables.read_trajectory(run / "trajectory.parquet")[1]
 
-    own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"), float(factor))
+    own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"))
     return SolvedDrive(keyframes, own, read_odometry)
 
 
-def _ledger(tie: Tie) -> Closures:
-    ledger = tables.read_joins(tie.path).get((tie.later, tie.earlier))
+def _ledger(entry: PairLedger) -> Closures:
+    ledger = tables.read_joins(entry.path).get((entry.later, entry.earlier))
     if ledger is None:
-        raise ResultError(f"{tie.path} is not of {tie.later} in {tie.earlier}. Move it out of the map, and run again.")
+        raise ResultError(
+            f"{entry.path} is not of {entry.later} in {entry.earlier}. Move it out of the map, and run again."
+        )
     return ledger
 
 
@@ -185,16 +190,16 @@ def _record(group: Group, drives: Sequence[str], joins: Sequence[dict[str, Any]]
         "drives": drives,
         "joins": joins,
         "solution": {name: getattr(refined.solution, name) for name in names},
-        "odometry": {"sigma_factor": float(np.sqrt(refined.noise)), "scale": refined.scale},
+        "odometry": about_odometry(refined),
         "made_from": group.key,
     }
 
 
 def solve_groups(
-    store: Store, drives: Drives, ties: Sequence[Tie], pipeline: Pipeline, execution: Execution
+    store: Store, drives: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline, execution: Execution
 ) -> dict[str, Any]:
-    """Solve the groups that are not solved yet, and let joint.json say so; then the folders of others go."""
-    groups = groups_of([member.drive for member in drives.members], drives.keys, ties, pipeline)
+    """Solve the groups that are not solved yet, write joint.json, and remove the folders of other groups."""
+    groups = groups_of([member.drive for member in drives.members], drives.keys, pair_ledgers, pipeline)
     known = {group["key"]: group for group in _joint(store).get("groups", [])}
     folder, solved = store.root / "joint", []
     for done, group in enumerate(groups):
@@ -205,9 +210,9 @@ def solve_groups(
         solved.append(known[group.key])
     execution.progress("solve together", len(groups), len(groups))
     together = {drive for group in solved for component in group["components"] for drive in component["drives"]}
-    alone = sorted([*(one.drive for one in drives.members if one.drive not in together), *drives.apart])
+    alone = sorted([*(one.drive for one in drives.members if one.drive not in together), *drives.excluded])
     keys = {drive: drives.keys[drive] for drive in sorted(together)}
-    record = {"groups": solved, "alone": alone, "apart": drives.apart, "keys": keys}
+    record = {"groups": solved, "alone": alone, "apart": drives.excluded, "keys": keys}
     if solved or (store.root / "joint.json").exists():
         write_joint(store.root, record)
     named = {component["folder"] for group in solved for component in group["components"]}

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _CODE = ("vplog.sessions.inter_session", "vplog.features.extraction", "vplog.features.sift", "vplog.results.tables")
 """Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
 less than another search of all drives is worth, and drive.json has them."""
-KEPT = ("camera.json", "features.parquet")
+DRIVE_FILES = ("camera.json", "features.parquet")
 """Files that depend on the drive alone, not on its name or the other drives."""
 _SEARCH = "vplog.maps.joining.candidate_drives"
 """The module that chooses the drives that one is searched in."""
@@ -116,8 +116,7 @@ def ledger_path(store: Store, later: str, earlier: str) -> Path:
 
 def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
     """Write the table of `compute_pair` as a whole. Raises ResultError."""
-    _make(store, task.later.drive)
-    with replacing(ledger_path(store, task.later.drive, task.earlier.drive)) as stream:
+    with replacing(ledger_path(store, task.later.drive, task.earlier.drive), parents=True) as stream:
         stream.write(data)
 
 
@@ -144,7 +143,7 @@ def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrus
 def put_camera(store: Store, member: Member, pipeline: Pipeline, camera: CameraTrust) -> None:
     """Store the camera of a drive. Raises ResultError."""
     record = {"drive": member.drive, **asdict(camera), "made_from": _camera_key(member, pipeline)}
-    run_record.write_run_json(_make(store, member.drive) / "camera.json", record, checksum=True)
+    run_record.write_run_json(folder_of(store, member.drive) / "camera.json", record)
 
 
 def _camera_key(member: Member, pipeline: Pipeline) -> str:
@@ -153,7 +152,7 @@ def _camera_key(member: Member, pipeline: Pipeline) -> str:
 
 
 @dataclass(frozen=True)
-class Joins:
+class JoinState:
     """joins.json: after which drives one came, and which of them it was verified against."""
 
     position: int
@@ -177,7 +176,7 @@ def search_key(member: Member, pipeline: Pipeline) -> str:
     return key_of({"member": member.key, **depends(pipeline), "search": search_code()})
 
 
-def read_joins(store: Store, drive: str) -> Joins | None:
+def read_joins(store: Store, drive: str) -> JoinState | None:
     """joins.json; None where there is none, without pairs where these are damaged."""
     record = _read(folder_of(store, drive) / "joins.json")
     position, member, made_from, pairs = (record.get(name) for name in ("position", "member", "made_from", "pairs"))
@@ -187,16 +186,16 @@ def read_joins(store: Store, drive: str) -> Joins | None:
         not isinstance(pair, dict) or any(not isinstance(pair.get(name), kind) for name, kind in _PAIR.items())
         for pair in pairs
     ):
-        return Joins(position, member)
-    return Joins(position, member, made_from, tuple(pairs))
+        return JoinState(position, member)
+    return JoinState(position, member, made_from, tuple(pairs))
 
 
-def put_joins(store: Store, drive: str, joins: Joins) -> None:
+def put_joins(store: Store, drive: str, joins: JoinState) -> None:
     """Write joins.json. Raises ResultError."""
-    run_record.write_run_json(_make(store, drive) / "joins.json", {"drive": drive, **asdict(joins)}, checksum=True)
+    run_record.write_run_json(folder_of(store, drive) / "joins.json", {"drive": drive, **asdict(joins)})
 
 
-def forget(store: Store, drive: str, but: set[str]) -> None:
+def remove_stale_ledgers(store: Store, drive: str, but: set[str]) -> None:
     """Remove the ledgers of a drive in other drives than these, and files that a killed writer left."""
     folder = folder_of(store, drive)
     known = {ledger_path(store, drive, earlier) for earlier in but}
@@ -210,12 +209,3 @@ def _read(path: Path) -> dict[str, Any]:
         return run_record.read_run_json(path)
     except ResultError:
         return {}
-
-
-def _make(store: Store, drive: str) -> Path:
-    folder = folder_of(store, drive)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"Cannot make the folder {folder}: {error.strerror}.") from None
-    return folder

@@ -17,13 +17,14 @@ from vplog.data import Verdict
 from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
-from vplog.execution.tasks import each_done
-from vplog.execution.timing import Watch
+from vplog.execution.tasks import run_tasks
+from vplog.execution.timing import StageTimer
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
-from vplog.maps.joining.components import Drives, Tie, solve_groups
-from vplog.maps.joining.members import apart, member_of
-from vplog.maps.storage.contents import left_out, without_damaged
+from vplog.maps.joining.components import Drives, PairLedger, solve_groups
+from vplog.maps.joining.members import member_of, why_not_joined
+from vplog.maps.storage.contents import damage_warnings, skip_damaged
+from vplog.maps.storage.layout import PICTURES
 from vplog.maps.storage.map_store import reading, writing
 from vplog.pipeline import Pipeline
 from vplog.results import tables
@@ -40,13 +41,13 @@ if TYPE_CHECKING:
     from vplog.sessions.inter_session import DrivePair
     from vplog.stages import PlaceState
 
-_KEEP_EVERY_S = 300.0
+_FLUSH_EVERY_S = 300.0
 """Interval at which ledgers are sent to a map on an object store, each time with a copy of those there."""
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What the steps of a join have in common."""
+    """Inputs that all steps of a join take."""
 
     store: Store
     drives: Drives
@@ -93,7 +94,7 @@ def join(
         new = [at for at in range(len(drives.members)) if not _is_up_to_date(store, drives, at, pipeline)]
         return _join(_Work(store, drives, new, pipeline, execution, executor), places)
 
-    return without_damaged(store, joined)
+    return skip_damaged(store, joined)
 
 
 def join_map(root: Path, execution: Execution = Execution()) -> dict[str, Any]:
@@ -106,16 +107,16 @@ def join_map(root: Path, execution: Execution = Execution()) -> dict[str, Any]:
 
 
 def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any]:
-    store, drives, pipeline, watch = work.store, work.drives, work.pipeline, Watch()
+    store, drives, pipeline, watch = work.store, work.drives, work.pipeline, StageTimer()
     with watch.stage("search"):
         wanted = _search(work, places)
     with watch.stage("verify"):
         computed, reasons = _verify(work, wanted)
-        _remember(work, wanted, reasons)
+        _record_pairs(work, wanted, reasons)
     with watch.stage("solve"), limited(work.execution.threads):
-        ties = _settled_ties(store, drives)
-        record = solve_groups(store, drives, ties, pipeline, work.execution)
-    unjoined = [f"{later} in {earlier} was left out. {reason}" for (later, earlier), reason in reasons.items()]
+        pair_ledgers = _current_ledgers(store, drives)
+        record = solve_groups(store, drives, pair_ledgers, pipeline, work.execution)
+    unjoined = [f"{later} and {earlier} were not verified. {reason}" for (later, earlier), reason in reasons.items()]
     for group in record["groups"]:
         unjoined += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
         unjoined += [
@@ -124,14 +125,14 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
         ]
     cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in drives.members]
     if uncalibrated := [drive for drive, known in cameras if known is not None and known.camera["matrix"] is None]:
-        unjoined.append(f"No calibration, so no closure with metres that could join them: {', '.join(uncalibrated)}.")
+        unjoined.append(f"No camera calibration, so no metric closure joins these drives: {', '.join(uncalibrated)}.")
     return {
         "searched": [drives.members[at].drive for at in work.new],
-        "pairs": len(ties),
+        "pairs": len(pair_ledgers),
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
         "alone": record["alone"],
-        "warnings": [*left_out(store), *drives.apart.values(), *unjoined],
+        "warnings": [*damage_warnings(store), *drives.excluded.values(), *unjoined],
         "stages": watch.stages,
     }
 
@@ -142,12 +143,15 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     members: dict[str, Member] = {}
     reasons, known = dict[str, str](), store.drives()
     for drive, about in known.items():
+        if about.get(PICTURES):
+            reasons[drive] = f"{drive} has no odometry: it can be found, and is joined with no other drive."
+            continue
         try:
             member = member_of(store, {**about, "log": urls.get(drive, about["log"])})
         except VplogError as error:
             reasons[drive] = f"{drive} is joined with no other drive. {error}"
             continue
-        if why := apart(member, library, about["library"]):
+        if why := why_not_joined(member, library, about["library"]):
             reasons[drive] = why
         else:
             members[drive] = member
@@ -155,7 +159,7 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     last = max((one.position for one in stored.values() if one is not None), default=-1)
     placed = {drive: own for drive, own in stored.items() if own is not None and own.member == members[drive].key}
     for number, drive in enumerate([drive for drive in members if drive not in placed], start=last + 1):
-        placed[drive] = drive_pairs.Joins(number, members[drive].key)
+        placed[drive] = drive_pairs.JoinState(number, members[drive].key)
         drive_pairs.put_joins(store, drive, placed[drive])
     order = sorted(placed, key=lambda drive: (placed[drive].position, drive))
     keys = {drive: about["key"] for drive, about in known.items()}
@@ -205,16 +209,16 @@ def _verify(work: _Work, wanted: Sequence[DrivePair]) -> tuple[int, dict[tuple[s
             if not drive_pairs.is_stored(store, task):
                 yield task
 
-    computed, kept_at = 0, time.monotonic()
-    for task, data, why in each_done(drive_pairs.compute_pair, tasks(), work.executor):
+    computed, flushed_at = 0, time.monotonic()
+    for task, data, why in run_tasks(drive_pairs.compute_pair, tasks(), work.executor):
         if data is None:
             reasons[task.later.drive, task.earlier.drive] = why
         else:
             drive_pairs.put_ledger(store, task, data)
             computed += 1
-        if time.monotonic() - kept_at > _KEEP_EVERY_S:
-            store.keep()
-            kept_at = time.monotonic()
+        if time.monotonic() - flushed_at > _FLUSH_EVERY_S:
+            store.flush()
+            flushed_at = time.monotonic()
     progress("verify between drives", len(wanted), len(wanted))
     return computed, reasons
 
@@ -231,7 +235,7 @@ def _cameras(work: _Work, wanted: Sequence[DrivePair]) -> tuple[dict[int, Camera
     cameras = {at: camera for at, camera in known.items() if camera is not None}
     missing, failed = [at for at in numbers if at not in cameras], dict[int, str]()
     compute = partial(drive_pairs.compute_camera, pipeline=pipeline, execution=work.quiet)
-    done = each_done(compute, [members[at] for at in missing], work.executor)
+    done = run_tasks(compute, [members[at] for at in missing], work.executor)
     for at, (member, camera, why) in zip(missing, done, strict=True):
         if camera is None:
             failed[at] = why
@@ -241,7 +245,7 @@ def _cameras(work: _Work, wanted: Sequence[DrivePair]) -> tuple[dict[int, Camera
     return cameras, failed
 
 
-def _remember(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[str, str], str]) -> None:
+def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[str, str], str]) -> None:
     """Write the pairs of each new drive."""
     store, drives = work.store, work.drives
     for at in work.new:
@@ -260,21 +264,21 @@ def _remember(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[str,
                 **({"reason": why} if why else {}),
             })  # fmt: skip
         key = drive_pairs.search_key(member, work.pipeline)
-        drives.joins[at] = drive_pairs.Joins(drives.joins[at].position, member.key, key, tuple(pairs))
+        drives.joins[at] = drive_pairs.JoinState(drives.joins[at].position, member.key, key, tuple(pairs))
         drive_pairs.put_joins(store, member.drive, drives.joins[at])
 
 
-def _settled_ties(store: Store, drives: Drives) -> list[Tie]:
+def _current_ledgers(store: Store, drives: Drives) -> list[PairLedger]:
     """The pairs that count; the ledgers of others, as of drives that are gone, are removed."""
-    ties = []
+    pair_ledgers = []
     for at, (member, joins) in enumerate(zip(drives.members, drives.joins, strict=True)):
         held = [pair for pair in joins.pairs if pair["ledger"] and drives.counts(at, pair)]
-        drive_pairs.forget(store, member.drive, {pair["match"] for pair in held})
+        drive_pairs.remove_stale_ledgers(store, member.drive, {pair["match"] for pair in held})
         for pair in held:
             path = drive_pairs.ledger_path(store, member.drive, pair["match"])
             if pair["candidates"]:
-                ties.append(Tie(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
+                pair_ledgers.append(PairLedger(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
     for folder in store.root.glob("joins/drive=*"):
         if not (store.root / "runs" / folder.name).is_dir():
             shutil.rmtree(folder, ignore_errors=True)
-    return ties
+    return pair_ledgers

@@ -50,16 +50,13 @@ def _is_component(record: Any) -> bool:
     return isinstance(drives, list) and is_below(record.get("folder")) and all(isinstance(one, str) for one in drives)
 
 
-def components_of(root: Path) -> list[dict[str, Any]]:
-    """The components that count: `folder` in MAP/joint and `drives`, in order of their first drives."""
-    return [component for group in read_joint(root).get("groups", []) for component in group["components"]]
-
-
 def components_in(store: Store) -> list[dict[str, Any]] | None:
-    """`components_of` of any map; None where nothing was joined yet. Raises ResultError where the record is damaged."""
+    """The components that count: `folder` in MAP/joint and `drives`, in order of their first drives; None where nothing
+    was joined yet. Raises ResultError where the record is damaged."""
     if store.mirror is not None:
         store.mirror.rest(["joint.json"])
-    return components_of(store.root) if (store.root / "joint.json").is_file() else None
+    groups = read_joint(store.root).get("groups")
+    return groups and [component for group in groups for component in group["components"]]
 
 
 def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,27 +11,26 @@ import numpy as np
 
 from vplog import logs
 from vplog.cache.input_hashes import hash_inputs
-from vplog.data import Camera
 from vplog.errors import LogError, ResultError
-from vplog.features.extraction import extract_frames
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
 from vplog.loops.verify import calibration_share, drive_of
 from vplog.maps.storage.layout import folder_name, key_of
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
-from vplog.results.kept_features import KeptFeatures, write_features
+from vplog.results.camera_record import camera_from
+from vplog.results.feature_table import FeatureTable, write_features
 from vplog.run.feature_extraction import stored_features
 from vplog.run.provenance import stored_log
+from vplog.run.reextraction import ReextractedFeatures
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import scratch
-from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from vplog.data import Features, Int32s, Ints
+    from vplog.data import Int32s, Ints
     from vplog.execution.execution import Execution
     from vplog.loops.candidate import Drive
     from vplog.loops.verify import VerifySettings
@@ -43,18 +40,8 @@ if TYPE_CHECKING:
 
     Fetch = Callable[[Int32s | Ints], None]
 
-_BLOCK = 16
-"""Keyframes extracted together where one was not announced: its neighbours are needed next, and to read a log again
-costs as much as several."""
-_CAMERA: dict[str, Callable[[Any], Any]] = {
-    "name": str, "distortion_model": str, "width": int, "height": int, "disparity_zero_px": float, "baseline_m": float,
-    "matrix": lambda rows: np.array(rows, np.float64).reshape(3, 3),
-    "distortion": lambda values: np.array(values, np.float64).reshape(-1),
-    "body_from_camera": lambda rows: np.array(rows, np.float64).reshape(4, 4),
-}  # fmt: skip
-"""Fields of a camera, from plain values."""
-_FRONT = ("keyframes", "features", "stereo", "places")
-"""Settings that a drive's keyframes, features and places depend on; what follows them is not asked for here."""
+_FRONT_END = ("keyframes", "features", "stereo", "places")
+"""Settings that a drive's keyframes, features and places depend on, unlike those of later stages."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +84,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
         "code": about.get("code"),
         "topics": about.get("topics"),
         "gps": pipeline.gps.use,
-        **{name: settings.get(name) for name in _FRONT},
+        **{name: settings.get(name) for name in _FRONT_END},
     }
     return Member(
         drive, file, store.root / ".cache" / folder_name(drive),
@@ -126,7 +113,7 @@ def check_unchanged(member: Member) -> None:
         raise LogError(f"The log of {member.drive}, {path}, has changed since. Run `vplog batch` with it again.")
 
 
-def apart(member: Member, library: str, made_by: str) -> str:
+def why_not_joined(member: Member, library: str, made_by: str) -> str:
     """Why a drive is joined with no other; empty where it may be."""
     if made_by != library:
         return (
@@ -135,8 +122,8 @@ def apart(member: Member, library: str, made_by: str) -> str:
         )
     if member.pipeline.gps.use:
         return (
-            f"{member.drive} was solved with GPS, which holds one drive at a time: it keeps its own place on earth and "
-            "is joined with no other drive."
+            f"{member.drive} was solved with GPS factors, which are for one drive at a time: it keeps its own "
+            "georeference and is joined with no other drive."
         )
     return ""
 
@@ -174,10 +161,10 @@ def keep_features(member: Member, verify: VerifySettings) -> None:
         write_features(member.features, len(found), found.__getitem__, verify.matching.features, member.key)
 
 
-def _stored(member: Member, verify: VerifySettings) -> KeptFeatures | None:
+def _stored(member: Member, verify: VerifySettings) -> FeatureTable | None:
     """The features that the map stores of the drive, unless they are of another state of it or too few."""
     try:
-        stored = KeptFeatures(member.features, member.key, verify.matching.features)
+        stored = FeatureTable(member.features, member.key, verify.matching.features)
     except ResultError:
         return None
     if len(stored) == len(tables.read_keyframes(member.keyframes)[0].stamp_ns):
@@ -203,64 +190,15 @@ def opened_drive(
     where that is gone or another one.
     """
     keyframes, _ = tables.read_keyframes(member.keyframes)
-    keyframes, camera = replace(keyframes, drive=member.drive), camera_from(known.camera)
+    keyframes, camera = replace(keyframes, drive=member.drive), camera_from(known.camera, "Run `vplog map join` again.")
 
-    def checked(features: Callable[[int], Features]) -> Drive:
-        return drive_of(keyframes, camera, features, verify, camera.baseline_m)
-
-    stored = _stored(member, verify)
-    if stored is not None:
-        with contextlib.closing(stored):
-            yield checked(stored.__getitem__), lambda _: None
-        return
-    cached = _from_run(member)
-    if cached is not None:
-        yield checked(cached.__getitem__), lambda _: None
-        return
-    log = opened_log(member)
-    check_unchanged(member)
-    with scratch("features") as folder, FeatureStore(folder / "features") as store:
-        extracted = ReextractedFeatures(log, keyframes.stamp_ns, member, store, execution)
-        yield checked(extracted.__getitem__), extracted.fetch
-
-
-class ReextractedFeatures:
-    """Features of keyframes, extracted from the log on demand. Reads are safe from any thread."""
-
-    def __init__(self, log: Log, stamp_ns: Ints, member: Member, store: FeatureStore, execution: Execution) -> None:
-        self._log, self._stamp_ns, self._member, self._execution = log, stamp_ns, member, execution
-        self._store, self._at = store, dict[int, int]()
-        self._lock = threading.Lock()
-
-    def fetch(self, rows: Iterable[int]) -> None:
-        """Extract the features of those rows that lack them, in one pass of the log. Raises LogError."""
-        with self._lock:
-            missing = [row for row in sorted({int(row) for row in rows}) if row not in self._at]
-            if not missing:
-                return
-            pipeline, frames = self._member.pipeline, self._log.frames(self._stamp_ns[missing])
-            found = extract_frames(frames, pipeline.features, self._execution, pipeline.stereo)
-            for row, (stamp_ns, _, features, why) in zip(missing, found, strict=False):
-                if features is None or stamp_ns != self._stamp_ns[row]:
-                    raise LogError(
-                        f"{shown(self._member.log)} does not have keyframe {row} of {self._member.drive}. {why}"
-                    )
-                self._store.append(features)
-                self._at[row] = len(self._store) - 1
-            if missing[-1] not in self._at:
-                raise LogError(f"{shown(self._member.log)} does not have all keyframes of {self._member.drive}.")
-
-    def __getitem__(self, row: int) -> Features:
-        if row not in self._at:
-            first = row - row % _BLOCK
-            self.fetch(range(first, min(first + _BLOCK, len(self._stamp_ns))))
-        return self._store[self._at[row]]
-
-
-def camera_from(values: dict[str, Any]) -> Camera:
-    """The camera of plain values. Raises ResultError where the values are not one."""
-    try:
-        known = {name: kind(values[name]) for name, kind in _CAMERA.items() if values[name] is not None}
-        return Camera(**{"matrix": None, "baseline_m": None, **known})
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultError(f"A camera in MAP/joins is damaged: {error}. Move that folder away, and run again.") from None
+    with ExitStack() as stack:
+        features: Any = _stored(member, verify)
+        if features is not None:
+            stack.enter_context(closing(features))
+        elif (features := _from_run(member)) is None:
+            log = opened_log(member)
+            check_unchanged(member)
+            store = stack.enter_context(FeatureStore(stack.enter_context(scratch("features")) / "features"))
+            features = ReextractedFeatures(log, keyframes.stamp_ns, member.pipeline, store, execution)
+        yield drive_of(keyframes, camera, features.__getitem__, verify), getattr(features, "fetch", lambda _: None)

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
-    from vplog.maps.search.index import Part
+    from vplog.maps.search.index import SegmentView
     from vplog.places.bobb import Place
     from vplog.places.code_search import Pairing
     from vplog.stages import CodedState
 
-NONE = np.float32(-np.inf)
+NO_SCORE = np.float32(-np.inf)
 """Score of no answer."""
 _PARTS_A_TASK = 4
 """Some 600 MB of a large map: seconds of work for the views of a log, against a second to send and start a task."""
@@ -52,16 +52,16 @@ class Answers:
     @property
     def count(self) -> Ints:
         """(Q,) how many of the K there are."""
-        return (self.score > NONE).sum(axis=1)
+        return (self.score > NO_SCORE).sum(axis=1)
 
 
 def no_answers(views: int, top: int) -> Answers:
     """(Q, K) none, to be written to."""
     drive, keyframe, support = np.zeros((3, views, top), np.int32)
-    return Answers(drive, keyframe, np.full((views, top), NONE, np.float32), support)
+    return Answers(drive, keyframe, np.full((views, top), NO_SCORE, np.float32), support)
 
 
-def answers_of(rankings: Iterable[tuple[Ranking, Int32s]], views: int, drive: int, top: int) -> Answers:
+def answers_in_drive(rankings: Iterable[tuple[Ranking, Int32s]], views: int, drive: int, top: int) -> Answers:
     """Answers in one drive, from the ranking of its rows and their support for each view in order."""
     found = no_answers(views, top)
     found.drive[:] = drive
@@ -97,8 +97,8 @@ class Shard:
 
 
 def best_places(
-    parts: Sequence[Part], state: CodedState, views: Sequence[Place], top: int, execution: Execution = Execution(),
-    executor: Executor | None = None,
+    parts: Sequence[SegmentView], state: CodedState, views: Sequence[Place], top: int,
+    execution: Execution = Execution(), executor: Executor | None = None,
 ) -> Answers:  # fmt: skip
     """The `top` best of all places for each of Q views. With an executor its workers search, each some of the parts,
     whose files they must see under the same path. The same answers for any execution."""

@@ -2,7 +2,7 @@
 
 It grows as a log-structured index does: new drives make a new segment, which takes in those not larger than itself, so
 that there are few of them and a place is written again only as often as the map doubles. A segment names its drives by
-content, so MAP/index alone tells which segments serve. The folder may be removed at any time.
+content, so MAP/index alone determines which segments serve. The folder may be removed at any time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import pyarrow as pa
 from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
-from vplog.maps.storage.contents import other_library
+from vplog.maps.storage.contents import library_mismatch
 from vplog.maps.storage.damage import DamagedDriveError, reading_drive
 from vplog.maps.storage.layout import ADD_AGAIN
 from vplog.results import tables
@@ -42,7 +42,7 @@ _LEFT_OVER_S = 86_400.0
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class SegmentView:
     """A segment as a search uses it."""
 
     segment: Segment
@@ -53,13 +53,13 @@ class Part:
 
     @property
     def places(self) -> int:
-        """Those that count."""
+        """Number of places that the map still has."""
         return int(np.diff(self.segment.first)[self.numbers >= 0].sum())
 
 
 def update_index(
     store: Store, drives: Mapping[str, Mapping[str, Any]], state: CodedState, execution: Execution = Execution()
-) -> tuple[list[Part], list[str]]:
+) -> tuple[list[SegmentView], list[str]]:
     """The parts that together have every place of the drives once, and warnings.
 
     Missing segments are made and written; those that no drive needs any more are removed. A map that cannot be written
@@ -68,8 +68,8 @@ def update_index(
     """
     wanted = list(execution.map(lambda drive: content_of(store, drive, drives[drive]["key"]), drives))
     known, useless, warnings = _open_all(store, state)
-    parts, missing = _cover(known, wanted)
-    absorbed, groups = _plan(parts, missing, {one: store.rows("descriptors", one.drive) for one in missing})
+    parts, missing = _assign_drives(known, wanted)
+    absorbed, groups = _plan_compaction(parts, missing, {one: store.rows("descriptors", one.drive) for one in missing})
     parts = [part for part in parts if part not in absorbed]
     numbers = {one: number for number, one in enumerate(wanted)}
     done = 0
@@ -81,7 +81,7 @@ def update_index(
         except (ResultError, OSError) as error:
             path = None
             warnings += [] if done else [f"The index is not stored, so every query builds it again. {error}"]
-        parts.append(Part(segment, path, np.array([numbers[one] for one in group], np.int32)))
+        parts.append(SegmentView(segment, path, np.array([numbers[one] for one in group], np.int32)))
         done += len(group)
         execution.progress("index", done, sum(map(len, groups)))
     used = {part.path for part in parts}
@@ -139,20 +139,22 @@ def _open_all(store: Store, state: CodedState) -> tuple[list[tuple[Segment, Path
     return known, useless, warnings
 
 
-def _cover(known: Sequence[tuple[Segment, Path]], wanted: Sequence[Content]) -> tuple[list[Part], list[Content]]:
-    """Every drive from one segment, the largest that has it; and the drives that none has."""
+def _assign_drives(
+    known: Sequence[tuple[Segment, Path]], wanted: Sequence[Content]
+) -> tuple[list[SegmentView], list[Content]]:
+    """Assign every drive to one segment, the largest that has it; and the drives that none has."""
     left = {one: number for number, one in enumerate(wanted)}
     parts = []
     for segment, path in sorted(known, key=lambda one: (-len(one[0]), one[1].name)):
         numbers = np.array([left.pop(one, -1) for one in segment.contents], np.int32)
         if np.any(numbers >= 0):
-            parts.append(Part(segment, path, numbers))
+            parts.append(SegmentView(segment, path, numbers))
     return parts, list(left)
 
 
-def _plan(
-    parts: Sequence[Part], missing: Sequence[Content], places: dict[Content, int]
-) -> tuple[list[Part], list[list[Content]]]:
+def _plan_compaction(
+    parts: Sequence[SegmentView], missing: Sequence[Content], places: dict[Content, int]
+) -> tuple[list[SegmentView], list[list[Content]]]:
     """Which parts are put into new ones, and the drives of each new one, in order of IDs."""
     absorbed, total = [], sum(places[one] for one in missing)
     for part in sorted(parts, key=lambda part: part.places):
@@ -199,7 +201,7 @@ def read_column(store: Store, drive: str, state: PlaceState) -> pa.Array:
     with reading_drive(drive):
         column, made_by = tables.read_descriptors(path)
         if made_by != state.hash:
-            raise LibraryError(other_library(store, drive, made_by, state.hash))
+            raise LibraryError(library_mismatch(store, drive, made_by, state.hash))
     try:
         return column.cast(state.arrow_type)  # the names of list items change in Parquet, nothing else may
     except pa.ArrowException:

@@ -1,4 +1,4 @@
-"""Where in a map the views of a log are."""
+"""Queries: the places of a map that are most like the views of a log."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import update_index
-from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, likely_drives
+from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
-from vplog.maps.storage.contents import left_out, without_damaged
+from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.layout import PICTURES
 from vplog.pipeline import Pipeline
 from vplog.places.sequence import SequenceSettings
+from vplog.places.views import views_of
 from vplog.results import tables
+from vplog.results.run_record import read_run_json
 from vplog.run.keyframes import select_keyframes
-from vplog.stages import CodedState
+from vplog.stages import CodedState, FrameState, StoredState
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from concurrent.futures import Executor
     from pathlib import Path
 
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Ints
     from vplog.maps.search.exact import Answers
-    from vplog.maps.search.index import Part
+    from vplog.maps.search.index import SegmentView
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.map_store import Store
     from vplog.stages import Log, PlaceState
@@ -74,16 +77,19 @@ def query_map(
         if query.sequence is not None:
             settings = SequenceSettings.read({**settings.model_dump(), "length": query.sequence}, "--sequence")
         log = logs.open(path, topics)
+        if query.sequence is None and log.file_names() is not None and log.odometry() is None:
+            settings = settings.model_copy(update={"length": 1})  # pictures are spaced as they come
         stamps, descriptors, warnings = describe_log(log, pipeline, state, execution)
 
-        def look() -> tuple[list[str], Answers, list[str], pa.Table]:
-            drives = map_store.one_library(store)[1]
-            short = _short(store, drives, settings.length)
+        def attempt() -> tuple[list[str], Answers, list[str], pa.Table, list[dict[str, Any]]]:
+            drives = map_store.common_library(store)[1]
+            short = _short_drives(store, drives, settings.length)
             answers, more = search(store, drives, state, descriptors, query, settings, execution)
-            return list(drives), answers, short + more, _table(store, list(drives), answers, stamps)
+            table = _table(store, list(drives), answers, stamps)
+            return list(drives), answers, short + more, table, _named(store, drives, table, log)
 
-        drives, answers, more, table = without_damaged(store, look)
-        warnings += left_out(store)
+        drives, answers, more, table, named = skip_damaged(store, attempt)
+        warnings += damage_warnings(store)
     if out is not None:
         pipeline = pipeline.model_copy(update={"sequence": settings})
         tables.write_placed(out, table, tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash))
@@ -100,7 +106,7 @@ def query_map(
         "answered": int(answered.sum()),
         "best_by_drive": {drive: int((best == number).sum()) for number, drive in enumerate(drives)},
         "warnings": log.warnings + warnings + more,
-        "answers": table.to_pylist(),
+        "answers": named,
     }
 
 
@@ -114,11 +120,11 @@ def index_map(root: Path, execution: Execution = Execution(), cache: Cache | Non
         if not isinstance(state, CodedState):
             raise ResultError(f"{root} is of another recogniser than bobb, and is searched without an index.")
 
-        def update() -> tuple[dict[str, Any], list[Part], list[str]]:
-            drives = map_store.one_library(store)[1]
+        def update() -> tuple[dict[str, Any], list[SegmentView], list[str]]:
+            drives = map_store.common_library(store)[1]
             return drives, *update_index(store, drives, state, execution)
 
-        drives, parts, warnings = without_damaged(store, update)
+        drives, parts, warnings = skip_damaged(store, update)
         files = [part.path for part in parts if part.path is not None]
         return {
             "map": str(root),
@@ -126,13 +132,13 @@ def index_map(root: Path, execution: Execution = Execution(), cache: Cache | Non
             "places": sum(part.places for part in parts),
             "segments": [str(path) for path in files],
             "bytes": sum(path.stat().st_size for path in files),
-            "warnings": left_out(store) + warnings,
+            "warnings": damage_warnings(store) + warnings,
         }
 
 
 def open_map(store: Store, execution: Execution) -> tuple[dict[str, dict[str, Any]], Pipeline, PlaceState]:
     """The drives of a map, its settings, and the library that describes its places. Raises VplogError."""
-    library, drives = map_store.one_library(store)
+    library, drives = map_store.common_library(store)
     pipeline = Pipeline.read(store.head().settings, f"{store}/map.json")
     folder = store.library(library)
     if not (folder / "library.json").is_file():
@@ -154,16 +160,11 @@ def describe_log(
     if odometry is not None and len(odometry.stamp_ns) > 1:
         keyframes, warnings = select_keyframes(log.name, stamps, odometry, pipeline.keyframes)
         stamps = keyframes.stamp_ns
-    else:
+    elif log.file_names() is None:  # pictures never have any
         warnings.append(f"{log.name} has no odometry, so every frame is a query.")
-    frames = extract_frames(log.frames(stamps), pipeline.features, execution, pipeline.stereo)
-
-    def describe(found: Any) -> tuple[int, Any, str]:
-        stamp_ns, _, features, why = found
-        return stamp_ns, None if features is None else state.describe(features), why
-
     described, descriptors, lost = [], [], []
-    for stamp_ns, descriptor, why in execution.counted("describe", execution.map(describe, frames), len(stamps)):
+    found = _descriptors(log, stamps, pipeline, state, execution)
+    for stamp_ns, descriptor, why in execution.counted("describe", found, len(stamps)):
         if descriptor is None:
             lost.append(why)
         else:
@@ -174,6 +175,28 @@ def describe_log(
     if lost:
         warnings.append(f"{len(lost)} of {len(stamps)} views were lost to damaged images. First: {lost[0]}")
     return np.array(described, np.int64), descriptors, warnings
+
+
+def _descriptors(
+    log: Log, stamps: Ints, pipeline: Pipeline, state: PlaceState, execution: Execution
+) -> Iterator[tuple[int, Any, str]]:
+    """Stamp and descriptor of each frame, which is None, with the reason, where it does not decode."""
+    if isinstance(state, FrameState | StoredState):
+        views = views_of(state, log, stamps, lambda _: None, query=True)
+
+        def view(given: tuple[int, Any]) -> tuple[int, Any, str]:
+            try:
+                return given[0], views.describe(views.load(given[1])), ""
+            except LogError as error:
+                return given[0], None, str(error)
+
+        return execution.map(view, zip(stamps.tolist(), views.items, strict=True), ahead=2)
+
+    def features(found: Any) -> tuple[int, Any, str]:
+        stamp_ns, _, features, why = found
+        return stamp_ns, None if features is None else state.describe(features), why
+
+    return execution.map(features, extract_frames(log.frames(stamps), pipeline.features, execution, pipeline.stereo))
 
 
 def search(
@@ -199,7 +222,7 @@ def search(
             return best_places(parts, state, descriptors, min(query.top, places), execution, executor), warnings
         if places > EXACT_PLACES:
             single = best_places(parts, state, descriptors, PLACES_A_VIEW, execution, executor)
-            numbered = {number: numbered[number] for number in likely_drives(single, settings.length).tolist()}
+            numbered = {number: numbered[number] for number in drives_by_credit(single, settings.length).tolist()}
             count = f"{len(numbered)} of {len(drives)}"
             warnings.append(f"Sequences were searched in the {count} drives most like single views.")
         elif executor is not None:
@@ -207,7 +230,7 @@ def search(
     return best_lines(store, numbered, state, descriptors, min(query.top, places), settings, execution), warnings
 
 
-def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
+def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:
     """A warning where a window of views is longer than drives: they have too few places for its statistics."""
     short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
     if not short:
@@ -217,6 +240,26 @@ def _short(store: Store, drives: Iterable[str], length: int) -> list[str]:
         f"{short[0]}{more} fewer places than the window of {length} views, so matches there are missed. Search "
         "single views: --sequence 1"
     ]
+
+
+def _named(
+    store: Store, drives: Mapping[str, Mapping[str, Any]], table: pa.Table, log: Log
+) -> list[dict[str, Any]]:  # fmt: skip
+    """The answers as records, with the file names of pictures, as `query_name` and `match_name`."""
+    own = log.file_names()
+    row = {} if own is None else dict(zip(log.stamps().tolist(), own, strict=True))
+    known: dict[str, Any] = {}
+    for drive in set(table["drive"].to_pylist()):
+        if drives[drive].get(PICTURES):
+            known[drive] = read_run_json(store.file(drive, "run.json")).get("names")
+    records = table.to_pylist()
+    for one in records:
+        if (name := row.get(one["query_stamp_ns"])) is not None:
+            one["query_name"] = name
+        names = known.get(one["drive"])
+        if isinstance(names, list) and one["keyframe"] < len(names):
+            one["match_name"] = str(names[one["keyframe"]])
+    return records
 
 
 def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:

@@ -6,7 +6,7 @@
     arrays       those of `CodeLists`, little endian, each from a multiple of 64 bytes on; zeros between
     4 bytes      CRC-32 of all before, little endian: it is summed up at 2.6 GB/s, sha256 at an eighth of that
 
-The header tells the size of every array, so a file is as long as its header says or it is refused. It is named by the
+The header has the size of every array, and a file of another length than follows from it is refused. It is named by the
 hash of its header: drives of the same content make the same file under the same name.
 """
 
@@ -51,7 +51,7 @@ class Content:
     key: str
     """Key in drive.json: hash of all that the drive was made from."""
     mark: str
-    """Hash of the footer of its descriptors.parquet, which tells another table even where the key is the same; on an
+    """Hash of the footer of its descriptors.parquet, which differs between tables even where the key is the same; on an
     object store that of the whole file, which its manifest has."""
 
 
@@ -91,12 +91,8 @@ def write_segment(folder: Path, segment: Segment) -> Path:
     """Write a segment under its name, whole or not at all. Raises ResultError where the folder cannot be written."""
     path = folder / segment.name
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe. Move it away.")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"Cannot write {folder}: {error.strerror}.") from None
-    with replacing(path) as stream:
+        raise ResultError(f"Cannot write {path}: it is a link, a folder or a pipe, and a file is written there.")
+    with replacing(path, parents=True) as stream:
         total = 0
         for block in _blocks(segment):
             total = zlib.crc32(block, total)
@@ -157,7 +153,7 @@ def open_segment(path: Path) -> Segment:
     except OSError as error:
         raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
     except ResultError as error:
-        raise ResultError(f"{path} is damaged. {error} Move it away: the next query builds it again.") from None
+        raise ResultError(f"{path} is damaged. {error} Remove it: the next query builds it again.") from None
     except _OtherVersionError:
         raise ResultError(f"{path} is of another version of vplog. The index is built again without it.") from None
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.execution.execution import Execution
-from vplog.maps.search.exact import NONE, Answers, answers_of, merge, no_answers
+from vplog.maps.search.exact import NO_SCORE, Answers, answers_in_drive, merge, no_answers
 from vplog.maps.search.index import read_column
 from vplog.maps.storage.damage import reading_drive
 from vplog.places.sequence import rank_places
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 EXACT_PLACES = 200_000
 """Up to so many places lines are drawn in every drive: some minutes of one core for a log of a thousand views."""
 PLACES_A_VIEW = 100
-"""Best places of each single view that speak for their drives."""
+"""Best places of each single view that vote for their drives."""
 _DRIVES_A_STRETCH = 8
 """Drives chosen for each stretch of views as long as a window."""
 
@@ -53,16 +53,16 @@ def best_lines(
             index = index_of_part(state, state.from_arrow(column))
         stops = np.full(len(descriptors), len(column), np.int64)
         rankings = rank_places(index, descriptors, stops, top, settings, Execution(execution.threads))
-        best = merge([best, answers_of(rankings, len(descriptors), number, top)], top)
+        best = merge([best, answers_in_drive(rankings, len(descriptors), number, top)], top)
     return best
 
 
-def likely_drives(single: Answers, length: int) -> Ints:
+def drives_by_credit(single: Answers, length: int) -> Ints:
     """Numbers of the drives in which lines may be, rising, by the best places of each single view.
 
     Stretches of `length` views, each half over the last, name the drives with most credit.
     """
-    view, drive, credit = credits_of(single)
+    view, drive, credit = drive_credits(single)
     chosen = []
     for start in range(0, len(single.score), max(length // 2, 1)):
         part = slice(*np.searchsorted(view, [start, start + length]))
@@ -72,14 +72,14 @@ def likely_drives(single: Answers, length: int) -> Ints:
     return np.unique(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
 
 
-def credits_of(single: Answers) -> tuple[Ints, Int32s, Floats]:
-    """(C,) views, rising, drives, and how much each view says for the drive.
+def drive_credits(single: Answers) -> tuple[Ints, Int32s, Floats]:
+    """(C,) views, rising, drives, and the vote of each view for the drive.
 
-    That is by how much the drive's best place is above the last of the view's places: a view that is like everything
-    says little.
+    A vote is the score of the drive's best place less that of the last of the view's places, so a view that resembles
+    everything has little weight.
     """
     top = single.score.shape[1]
-    there = single.score > NONE
+    there = single.score > NO_SCORE
     least = np.where(there, single.score, np.inf).min(axis=1, initial=np.inf)
     full = there.sum(axis=1) == top
     credit = np.where(there, single.score - np.where(full, least, 0.0)[:, None] + np.float32(1e-6), 0.0)

@@ -12,9 +12,9 @@ import pyarrow as pa
 
 import vplog
 from vplog.errors import LibraryError, NewerError, ResultError
-from vplog.maps.geo_bounds import earth_from_plain, earth_of_run
-from vplog.maps.storage.damage import DamagedDriveError, check_at_hand, damaged_files, reading_drive
-from vplog.maps.storage.layout import ADD_AGAIN, AT_HAND, FORMAT, HASH, drive_record, folder_name, write_changed
+from vplog.maps.geo_bounds import earth_from_record, earth_of_run
+from vplog.maps.storage.damage import DamagedDriveError, check_run_tables, damaged_files, reading_drive
+from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
 from vplog.maps.storage.upload import send_rest, write_json
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
@@ -75,7 +75,7 @@ class Store:
         """Hidden folder on the map's file system, where a writer makes what it renames in."""
         return self.root / ".staging"
 
-    def run(self, drive: str, names: Iterable[str] = AT_HAND) -> Path:
+    def run(self, drive: str, names: Iterable[str] = RUN_TABLES) -> Path:
         """The run folder; of a map on a store with these of its files."""
         if self.mirror is not None:
             self.mirror.fetch(drive, names)
@@ -85,14 +85,14 @@ class Store:
         """One file of the run folder, where it has one of this name."""
         return self.run(drive, [name]) / name
 
-    def whole(self, drive: str) -> Path:
+    def full_run(self, drive: str) -> Path:
         """The run folder with all files."""
         return self.run(drive, () if self.mirror is None else self.sizes(drive))
 
-    def forget(self, drive: str) -> None:
+    def evict(self, drive: str) -> None:
         """Free the disk of what was fetched of a drive."""
         if self.mirror is not None:
-            self.mirror.forget(drive)
+            self.mirror.evict(drive)
 
     def table(self, name: str, drive: str) -> Path:
         """One table of a drive, under its data set; of a map on a store, in the run folder."""
@@ -116,9 +116,9 @@ class Store:
     def damaged_files(self, drive: str) -> list[str]:
         """A line for each file of a drive that is not as it was written; of a map on a store, of those in AT_HAND and
         of those that are gone. Raises UnreachableError."""
-        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive, AT_HAND)
+        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive, RUN_TABLES)
 
-    def is_whole(self, drive: str) -> bool:
+    def is_present(self, drive: str) -> bool:
         """Whether nothing of a drive is removed yet. Of one that failed there is only its entry in failures.json."""
         if self.mirror is None:
             return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
@@ -137,13 +137,13 @@ class Store:
                 raise ResultError(f"{path} cannot be read: {why} Check its permissions, or {ADD_AGAIN}") from None
 
     def earth(self, drive: str) -> Earth | None:
-        """Where on earth a drive is, None where nothing says so. Raises DamagedDriveError."""
+        """The georeference of a drive, None where it has none. Raises DamagedDriveError."""
         with reading_drive(drive):
             about = drive_record(self.root / "runs" / folder_name(drive))
-            return earth_from_plain(about["earth"]) if "earth" in about else earth_of_run(self.whole(drive))
+            return earth_from_record(about["earth"]) if "earth" in about else earth_of_run(self.full_run(drive))
 
-    def keep(self) -> None:
-        """Of a map on an object store, send what was made so far beside drives; where that fails it is sent later.
+    def flush(self) -> None:
+        """Upload what was written so far beside drives to a map on an object store; where that fails, later.
         Raises SettingsError where another writer has the map now."""
         if self.mirror is not None:
             self.mirror.check_lock()
@@ -155,10 +155,10 @@ class Store:
         removed = set(map(folder_name, self.removed()))
         found = dict[str, dict[str, Any]]()
         for folder in sorted(self.root.glob("runs/drive=*")):
-            if folder.name in removed or not any((folder / name).exists() for name in ("drive.json", *AT_HAND)):
+            if folder.name in removed or not any((folder / name).exists() for name in ("drive.json", *RUN_TABLES)):
                 continue
             try:
-                record = self._sound_record(folder)
+                record = self._checked_record(folder)
             except NewerError:
                 raise
             except ResultError as error:
@@ -168,30 +168,30 @@ class Store:
                     found[record["drive"]] = record
         return dict(sorted(found.items()))
 
-    def _sound_record(self, folder: Path) -> dict[str, Any]:
+    def _checked_record(self, folder: Path) -> dict[str, Any]:
         """drive.json of a run folder whose tables are there. Raises ResultError."""
         record = drive_record(folder)
         if self.mirror is None:
             try:
-                check_at_hand(folder, record)
+                check_run_tables(folder, record)
             except ResultError:
                 if _identity(folder) is None:
                     raise
                 record = drive_record(folder)  # of a folder that was replaced meanwhile
-                check_at_hand(folder, record)
+                check_run_tables(folder, record)
         return record
 
-    def read(self, drive: str, of: Callable[[Path], T], names: Iterable[str] = AT_HAND) -> T:
-        """`of` the run folder with these files, all of one state of the drive: it is called again where a writer
-        replaced the folder meanwhile. Raises ResultError."""
+    def read(self, drive: str, reader: Callable[[Path], T], names: Iterable[str] = RUN_TABLES) -> T:
+        """The result of `reader` on the run folder with these files, all of one state of the drive: it is called again
+        where a writer replaced the folder meanwhile. Raises ResultError."""
         folder = self.run(drive, names)
         if self.mirror is not None:
-            return of(folder)  # of one generation, always
+            return reader(folder)  # of one generation, always
         for number in range(_TRIES):
             time.sleep(_PAUSE_S * (2**number - 1))
             before = _identity(folder)
             try:
-                found = of(folder)
+                found = reader(folder)
             except ResultError:
                 if before is not None and _identity(folder) == before:
                     with reading_drive(drive):
@@ -206,7 +206,7 @@ class Store:
         path = self.root / "removed.json"
         drives = run_record.read_run_json(path).get("drives") if path.exists() else []
         if not isinstance(drives, list) or not all(isinstance(drive, str) for drive in drives):
-            raise ResultError(f"{path} is damaged. Move it away: the drives that it named are in the map then.")
+            raise ResultError(f"{path} is damaged. Move it out of the map: the drives that it named are in it then.")
         return drives
 
     def write_removed(self, drives: Sequence[str]) -> None:
@@ -221,7 +221,7 @@ class Store:
         path = self.root / "failures.json"
         found = run_record.read_run_json(path) if path.exists() else {}
         if any(not isinstance(one, dict) or not isinstance(one.get("error"), str) for one in found.values()):
-            raise ResultError(f"{path} is damaged. Move it away: the next batch tries what failed again.")
+            raise ResultError(f"{path} is damaged. Move it out of the map: the next batch tries what failed again.")
         return found
 
     def head(self) -> Head:
@@ -239,9 +239,9 @@ class Store:
             raise ResultError(f"{path} lacks a valid library or settings. Write it again: vplog batch LOG -o {self}")
         return Head(library, settings)
 
-    def sound_head(self) -> Head:
-        """`head`, where map.json is damaged as the drives have it: their library and, where all have the same, their
-        settings. Raises ResultError where there is no such drive."""
+    def recovered_head(self) -> Head:
+        """`head`; where map.json is damaged, the library and settings that all drives have in common. Raises
+        ResultError where they have none."""
         try:
             return self.head()
         except NewerError:
@@ -257,7 +257,7 @@ class Store:
             return Head(libraries.pop(), found[0])
 
     def write_head(self, head: Head) -> None:
-        """map.json, unless it says that already."""
+        """Write map.json, unless it holds that already."""
         record = {"format": FORMAT, "vplog": vplog.__version__, "library": head.library, "settings": head.settings}
         self._write("map.json", record)
 
@@ -271,7 +271,7 @@ class Store:
             write_json(self.mirror, name)
 
 
-def without_damaged(store: Store, work: Callable[[], T]) -> T:
+def skip_damaged(store: Store, work: Callable[[], T]) -> T:
     """The result of `work` on a map, which is called again without each drive that it finds damaged."""
     while True:
         try:
@@ -282,8 +282,8 @@ def without_damaged(store: Store, work: Callable[[], T]) -> T:
             store.damaged[error.drive] = str(error)
 
 
-def left_out(store: Store) -> list[str]:
-    """Each damaged drive of a map in a sentence, with what to do in a map in place of what the reader advises."""
+def damage_warnings(store: Store) -> list[str]:
+    """A warning for each damaged drive of a map, with the remedy that fits a map."""
     dropped = f"{store.joint_damage}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
     return [dropped] * bool(store.joint_damage) + [
         f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
@@ -292,7 +292,7 @@ def left_out(store: Store) -> list[str]:
     ]
 
 
-def other_library(store: Store, drive: str, found: str, wanted: str | None) -> str:
+def library_mismatch(store: Store, drive: str, found: str, wanted: str | None) -> str:
     """Why a drive's places may not be mixed with those of the map, in one line."""
     return (
         f"{drive} in {store} was described with library {found[:12]}, and the map's is {str(wanted)[:12]}: their "
@@ -300,7 +300,7 @@ def other_library(store: Store, drive: str, found: str, wanted: str | None) -> s
     )
 
 
-def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
+def common_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
     """The library of a map, and its drives, all described with it. Raises LibraryError where one is not, and
     ResultError where there is none."""
     head, drives = store.head(), store.drives()
@@ -308,7 +308,7 @@ def one_library(store: Store) -> tuple[str, dict[str, dict[str, Any]]]:
         raise ResultError(f"{store} has no finished drive yet. Add some: vplog batch LOG... -o {store}")
     for drive, about in drives.items():
         if about["library"] != head.library:
-            raise LibraryError(other_library(store, drive, about["library"], head.library))
+            raise LibraryError(library_mismatch(store, drive, about["library"], head.library))
     return head.library, drives
 
 

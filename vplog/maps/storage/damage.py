@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, NewerError, ResultError
-from vplog.maps.geo_bounds import earth_of_made
-from vplog.maps.storage.layout import AT_HAND, FORMAT, drive_record, sha256_of
-from vplog.results import run_record
+from vplog.maps.geo_bounds import earth_of_run, earth_record
+from vplog.maps.storage.layout import FORMAT, RUN_TABLES, drive_record, sha256_of
+from vplog.results import run_record, tables
 from vplog.storage.folders import is_below
 from vplog.storage.scratch import files_in
 
@@ -40,11 +40,11 @@ def reading_drive(drive: str) -> Iterator[None]:
         raise DamagedDriveError(str(error), drive) from None
 
 
-def check_at_hand(folder: Path, record: dict[str, Any]) -> None:
+def check_run_tables(folder: Path, record: dict[str, Any]) -> None:
     """Raises ResultError where run.json or a table of a drive is missing or, tables by their length, not as drive.json
     has it. A drive.json of an older vplog has no lengths: then damage is found when the file is read."""
     files = _files(record)
-    for name in AT_HAND if files else ():
+    for name in RUN_TABLES if files else ():
         if wrong := _difference(folder / name, files.get(name, {}), hashed=name == "run.json"):
             raise ResultError(wrong)
 
@@ -55,7 +55,7 @@ def damaged_files(folder: Path) -> list[str]:
         files = _files(drive_record(folder))
     except ResultError as error:
         return [str(error)]
-    lines = (_difference(folder / name, files.get(name, {})) for name in sorted({*AT_HAND, *files}))
+    lines = (_difference(folder / name, files.get(name, {})) for name in sorted({*RUN_TABLES, *files}))
     return [line for line in lines if line]
 
 
@@ -65,7 +65,7 @@ def complete_record(made: Path, hashed: bool) -> None:
     about = {**drive_record(made), "format": FORMAT}
     about.pop("files", None)  # of the map that it comes from
     if "earth" not in about:
-        about["earth"] = earth_of_made(made)
+        about["earth"] = earth_record(earth_of_run(made), tables.read_keyframes(made / "keyframes.parquet")[1])
     try:
         if hashed:
             about["files"] = {
@@ -75,7 +75,7 @@ def complete_record(made: Path, hashed: bool) -> None:
             }
     except OSError as error:
         raise ResultError(f"Cannot read {error.filename or made}: {error.strerror or error}.") from None
-    run_record.write_run_json(made / "drive.json", about, checksum=True)
+    run_record.write_run_json(made / "drive.json", about)
 
 
 def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:

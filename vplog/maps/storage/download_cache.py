@@ -14,15 +14,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import threading
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.errors import SettingsError
+from vplog.cache.user_cache import cache_folder, max_bytes, trim
 from vplog.maps.storage.layout import HASH, link, sha256_of
 from vplog.storage.remote_path import s3_place
 
@@ -31,13 +29,6 @@ if TYPE_CHECKING:
 
     from vplog.storage.remote_path import RemotePath
 
-VARIABLE = "VPLOG_CACHE"
-"""Environment variable that names the cache, unless a verb does."""
-MOST_GB = 20.0
-"""Default size in 10^9 bytes: the index and the descriptors of 80 million places at 240 bytes each, and little of
-today's disks."""
-_LEFT_OVER_S = 86_400.0
-"""Age of a half-written file of a process that was killed: no download takes a day."""
 _RECORD_BYTES = 10**5
 """Longest record of a library's few files."""
 
@@ -47,7 +38,7 @@ class Cache:
     """A user's cache of maps, for one process."""
 
     root: Path
-    most_bytes: int
+    max_bytes: int
 
     @property
     def open_folders(self) -> Path:
@@ -57,7 +48,7 @@ class Cache:
         """The folder for the index of the map at this place."""
         return self.root / "index" / hashlib.sha256(f"{s3_place()} {place}".encode()).hexdigest()[:32]
 
-    def take(self, digest: str, target: Path) -> bool:
+    def fetch_to(self, digest: str, target: Path) -> bool:
         """Link the file with this sha256 to `target`, which is not there yet; False where the cache lacks it."""
         cached, part = self.root / "objects" / digest, target.with_name(f".{target.name}.part")
         try:
@@ -90,7 +81,7 @@ class Cache:
             )
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return False
-        return sound and all(self.take(content, target / name) for name, content in files.items())
+        return sound and all(self.fetch_to(content, target / name) for name, content in files.items())
 
     def keep_library(self, digest: str, files: dict[str, str], source: Path) -> None:
         """Keep the files of a library, whose sha256 are given by name."""
@@ -102,24 +93,9 @@ class Cache:
         return self.root / "libraries" / f"{digest}.json"
 
     def trim(self) -> None:
-        """Remove least recently used files until the rest is within `most_bytes`, and within half of what the disk
+        """Remove least recently used files until the rest is within `max_bytes`, and within half of what the disk
         would have free without it. Other processes keep their links until they end."""
-        found = []
-        for path in (file for name in ("objects", "libraries", "index") for file in (self.root / name).rglob("*")):
-            with suppress(OSError):
-                about = path.stat()
-                if path.suffix == ".part" and about.st_mtime < time.time() - _LEFT_OVER_S:
-                    path.unlink(missing_ok=True)
-                elif path.suffix != ".part" and not path.is_dir():
-                    found.append((about.st_mtime_ns, path, about.st_size))
-        total = sum(size for *_, size in found)
-        most = min(self.most_bytes, (total + shutil.disk_usage(self.root).free) // 2)
-        for _, path, size in sorted(found):
-            if total <= most:
-                return
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
-                total -= size
+        trim([self.root / name for name in ("objects", "libraries", "index")], self.max_bytes)
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
@@ -133,33 +109,12 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
         part.unlink(missing_ok=True)
 
 
-def cache_in(folder: Path | None, most_gb: float | None = None) -> Cache | None:
-    """The cache in this folder or, where none is named, in the user's; of MOST_GB by default. None where it may hold
+def cache_in(folder: Path | None, max_gb: float | None = None) -> Cache | None:
+    """The cache in this folder or, where none is named, in the user's; of DEFAULT_GB by default. None where it may hold
     nothing, or where the user's cannot be made. Raises SettingsError where the folder named cannot be used."""
-    most_gb = MOST_GB if most_gb is None else most_gb
-    place = folder or _users()
-    if most_gb <= 0 or place is None:
+    place = cache_folder(folder, "maps", max_gb)
+    if place is None:
         return None
-    cache, problem = Cache(place.absolute() / "maps", int(most_gb * 1e9)), "it belongs to another user"
-    try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        cache.open_folders.mkdir(parents=True, exist_ok=True)
-        if place.stat().st_uid == os.getuid() and os.access(cache.open_folders, os.W_OK):
-            return cache
-    except OSError as error:
-        problem = error.strerror or str(error)
-    if folder is None:
-        return None
-    raise SettingsError(f"Cannot use the cache {folder}: {problem}. Choose another folder with --cache.")
-
-
-def _users() -> Path | None:
-    """By the XDG Base Directory Specification, 0.8."""
-    if named := os.environ.get(VARIABLE):
-        return Path(named)
-    if (named := os.environ.get("XDG_CACHE_HOME")) and Path(named).is_absolute():
-        return Path(named) / "vplog"
-    try:
-        return Path.home() / ".cache" / "vplog"
-    except RuntimeError:  # a user without a home
-        return None
+    cache = Cache(place, max_bytes(max_gb))
+    cache.open_folders.mkdir(parents=True, exist_ok=True)
+    return cache

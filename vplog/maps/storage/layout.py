@@ -1,4 +1,4 @@
-"""The names in a map, what its records must say, and what drives are called and made from."""
+"""Names of files and drives in a map, required fields of its records, and the keys of drives."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ FORMAT = run_record.FORMAT
 """Version of this layout. A reader refuses a newer one."""
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 """Data sets of a map: each is a file of this name in every run folder."""
-AT_HAND = (*(f"{name}.parquet" for name in TABLES), "run.json")
+RUN_TABLES = (*(f"{name}.parquet" for name in TABLES), "run.json")
 """Files of a run folder that are fetched from an object store to work with the drive: not its report and figures."""
 HASH = re.compile(r"[0-9a-f]{64}")
 """Name of a library: sha256 over all that descriptors depend on."""
 ADD_AGAIN = "compute the drive again: vplog batch LOG -o MAP"
-"""What to do about a damaged drive: nothing is removed for it."""
-_NOT_IN_KEY = ("key", "log", "earth", "format", "files")
+"""Remedy for a damaged drive in messages."""
+PICTURES = "pictures"
+"""Field in drive.json of a folder of images without odometry: its places have no poses."""
+_NOT_IN_KEY = ("key", "log", "earth", "format", "files", PICTURES)
 """Fields of drive.json that its key does not depend on."""
 _MOST_NAME = 200
 """Characters of a drive's name in a file's; what stands around them takes up to thirty more."""
@@ -54,10 +56,10 @@ def quoted(drive: str) -> str:
 
 def drive_record(folder: Path) -> dict[str, Any]:
     """drive.json of a run folder in a map. Raises ResultError."""
-    return sound_record(run_record.read_run_json(folder / "drive.json"), folder)
+    return checked_record(run_record.read_run_json(folder / "drive.json"), folder)
 
 
-def sound_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
+def checked_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The record of drive.json in `folder`, checked. Raises ResultError."""
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
@@ -146,7 +148,7 @@ def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
     return {**record, "drive": drive, "key": key_of({**made_from, "drive": drive}) if own else record["key"]}
 
 
-def name_keyframes(path: Path, drive: str) -> None:
+def set_drive_id(path: Path, drive: str) -> None:
     """Give keyframes.parquet of a drive the ID that it has in the map. Raises ResultError."""
     header = tables.read_metadata(path)
     keyframes, world_from_body = tables.read_keyframes(path)

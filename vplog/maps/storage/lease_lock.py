@@ -2,7 +2,7 @@
 
 On S3 the store itself decides who gets it (conditional writes, by boto3), so two can never hold it. Elsewhere, and
 without boto3, a writer writes its name, waits and reads whether it is still there: two that start within a round trip
-of each other are told apart by that, but not with certainty. Nothing in a map breaks where two do write: see
+of each other are detected by that, but not with certainty. Nothing in a map breaks where two do write: see
 remote_map.py.
 """
 
@@ -35,7 +35,7 @@ enough to wait for after a kill on another machine."""
 RENEWALS = 6
 """Renewals within a lease: five may fail in a row."""
 _SETTLE_S = 2.0
-"""How long a name must stay where the store decides nothing: some round trips."""
+"""How long a name must stay on a store without conditional writes: some round trips."""
 
 
 @dataclass
@@ -44,13 +44,13 @@ class Lock:
 
     place: RemotePath
     name: dict[str, Any]
-    """Who holds it, as the object says."""
+    """Identity of the holder, as the object has it."""
     renewed: int = 0
     lost: str = ""
     """Why it is not held any more."""
-    tag: str | None = None
-    """Of the object as it was last written; None where the store decides nothing."""
-    over: threading.Event = field(default_factory=threading.Event)
+    etag: str | None = None
+    """ETag of the object as it was last written; None where the store has no conditional writes."""
+    released: threading.Event = field(default_factory=threading.Event)
 
     def check(self) -> None:
         """Raises ResultError where another writer has taken the lock over."""
@@ -62,9 +62,11 @@ class Lock:
 def held(root: RemotePath) -> Iterator[Lock]:
     """The lock of a map. Raises SettingsError where another writer holds it, or where nothing can be written."""
     place = root / NAME
-    lock = Lock(place, {"token": secrets.token_hex(8), **_here()})
+    # this process, so that on its own machine it is known to have ended without waiting for its lease
+    process = {"host": _machine(), "pid": os.getpid(), "started": _started(os.getpid())}
+    lock = Lock(place, {"token": secrets.token_hex(8), **process})
     try:
-        _take(lock, root)
+        _acquire(lock, root)
     except OSError as error:
         raise SettingsError(f"Cannot write to {root}: {reason(error)}. Choose another place with -o.") from None
     renewing = threading.Thread(target=_renew, args=(lock,), daemon=True)
@@ -72,15 +74,10 @@ def held(root: RemotePath) -> Iterator[Lock]:
     try:
         yield lock
     finally:
-        lock.over.set()
+        lock.released.set()
         renewing.join()
         if not lock.lost:
             _release(lock)
-
-
-def _here() -> dict[str, Any]:
-    """This process, so that on its own machine it is known to have ended without waiting for its lease."""
-    return {"host": _machine(), "pid": os.getpid(), "started": _started(os.getpid())}
 
 
 def _machine() -> str:
@@ -100,25 +97,25 @@ def _started(pid: int) -> str | None:
         return None
 
 
-def _take(lock: Lock, root: RemotePath) -> None:
-    found = objects.get_tagged(lock.place)
+def _acquire(lock: Lock, root: RemotePath) -> None:
+    found = objects.get_with_etag(lock.place)
     if found is not None:
-        _refuse_held(found[0], found[2], root)
-    if objects.decides(lock.place):
+        _check_expired(found[0], found[2], root)
+    if objects.has_conditional_writes(lock.place):
         _write(lock, None if found is None else found[1])
         if not lock.lost and objects.put_if(lock.place, _content(lock), None) is not None:
-            lock.tag = None  # it is there, so a store that decides refuses to make it
+            lock.etag = None  # it exists, so a store with conditional writes refuses to create it
     else:
         objects.put(lock.place, _content(lock))
-    if lock.tag is None and not lock.lost:
+    if lock.etag is None and not lock.lost:
         time.sleep(_SETTLE_S)
-        _check_mine(lock)
+        _read_back(lock)
     if lock.lost:
         raise SettingsError(f"Another vplog process has just begun to write to {root}. Wait for it to end.")
 
 
 def _content(lock: Lock) -> bytes:
-    """Bytes of the lock object. The count makes every renewal another object, so that a tag tells them apart."""
+    """Bytes of the lock object. The count gives every renewal another ETag."""
     return json.dumps({**lock.name, "renewed": lock.renewed}).encode()
 
 
@@ -131,24 +128,24 @@ def _holder(found: bytes) -> dict[str, Any]:
     return holder if isinstance(holder, dict) else {}
 
 
-def _write(lock: Lock, tag: str | None) -> None:
-    """Where the lock has this tag. A refusal may be the echo of a write whose answer was lost, so it is read back."""
-    lock.tag = objects.put_if(lock.place, _content(lock), tag)
-    if lock.tag is None:
-        lock.tag = _check_mine(lock)
+def _write(lock: Lock, etag: str | None) -> None:
+    """Write the lock where it has this ETag. A refusal is read back: it may follow a write whose response was lost."""
+    lock.etag = objects.put_if(lock.place, _content(lock), etag)
+    if lock.etag is None:
+        lock.etag = _read_back(lock)
 
 
-def _check_mine(lock: Lock) -> str | None:
+def _read_back(lock: Lock) -> str | None:
     """Read the lock back: its tag. It is lost where another writer's name is in it."""
-    found = objects.get_tagged(lock.place)
+    found = objects.get_with_etag(lock.place)
     if found is None or _holder(found[0]).get("token") != lock.name["token"]:
         lock.lost = f"Another writer has taken {lock.place} over."
         return None
     return found[1] or None
 
 
-def _refuse_held(found: bytes, age_s: float, root: RemotePath) -> None:
-    """Raises SettingsError where the lock is somebody's who may be alive."""
+def _check_expired(found: bytes, age_s: float, root: RemotePath) -> None:
+    """Raises SettingsError where the lock is held by a process that may be alive."""
     holder = _holder(found)
     if not holder.get("token") or age_s > LEASE_S:
         return
@@ -162,23 +159,23 @@ def _refuse_held(found: bytes, age_s: float, root: RemotePath) -> None:
 
 
 def _renew(lock: Lock) -> None:
-    """Write it again, which makes the lock young, until it is over or somebody else's."""
+    """Renew the lease until the lock is released or lost."""
     last = time.monotonic()
-    while not lock.lost and not lock.over.wait(LEASE_S / RENEWALS):
+    while not lock.lost and not lock.released.wait(LEASE_S / RENEWALS):
         lock.renewed += 1
         try:
-            if lock.tag is not None:
-                _write(lock, lock.tag)
+            if lock.etag is not None:
+                _write(lock, lock.etag)
             else:
-                _put_if_mine(lock, _content(lock))
+                _put_if_held(lock, _content(lock))
             last = time.monotonic()
         except OSError as error:
             if time.monotonic() - last > LEASE_S:
                 lock.lost = f"{lock.place} could not be renewed for {LEASE_S:.0f} s: {reason(error)}."
 
 
-def _put_if_mine(lock: Lock, data: bytes) -> None:
-    _check_mine(lock)
+def _put_if_held(lock: Lock, data: bytes) -> None:
+    _read_back(lock)
     if not lock.lost:
         objects.put(lock.place, data)
 
@@ -186,7 +183,7 @@ def _put_if_mine(lock: Lock, data: bytes) -> None:
 def _release(lock: Lock) -> None:
     """Leave the lock without a holder. Where that fails the lease ends by itself."""
     with suppress(OSError):
-        if lock.tag is not None:
-            objects.put_if(lock.place, b"{}", lock.tag)
+        if lock.etag is not None:
+            objects.put_if(lock.place, b"{}", lock.etag)
         else:
-            _put_if_mine(lock, b"{}")
+            _put_if_held(lock, b"{}")

@@ -56,11 +56,11 @@ def locked(root: Path) -> Iterator[None]:
                 (root / ".lock").unlink(missing_ok=True)
 
 
-def settle(store: Store) -> None:
+def recover(store: Store) -> None:
     """Put in what a killed writer had finished: a folder with drive.json, which is written last. Drives that are being
     removed are taken out first, so what is left of them here is tables without a run folder."""
     for file in sorted(store.staging.glob("*/drive.json")):
-        drive = _whole(file.parent)
+        drive = _finished_drive(file.parent)
         if drive is not None and not store.run(drive).exists():
             publish(store, drive, file.parent)
     shutil.rmtree(store.staging, ignore_errors=True)
@@ -76,7 +76,7 @@ def settle(store: Store) -> None:
             store.damaged[drive] = str(error)
 
 
-def _whole(made: Path) -> str | None:
+def _finished_drive(made: Path) -> str | None:
     """The drive of a folder that a writer had finished; None of one that it had not."""
     try:
         record = drive_record(made)
@@ -99,11 +99,11 @@ def publish(store: Store, drive: str, made: Path) -> None:
         sync_all(made)
         if not run.exists():
             made.rename(run)
-        elif exchanged(made, run):
+        elif exchange_folders(made, run):
             made.rename(replaced)
         else:
             run.rename(replaced)
-            (replaced / "drive.json").unlink(missing_ok=True)  # so that nobody takes it for a new one
+            (replaced / "drive.json").unlink(missing_ok=True)  # so that no writer takes it for a new one
             made.rename(run)
         sync(run.parent)
     except OSError as error:
@@ -112,7 +112,7 @@ def publish(store: Store, drive: str, made: Path) -> None:
     link_tables(store, drive)
 
 
-def exchanged(one: Path, other: Path) -> bool:
+def exchange_folders(one: Path, other: Path) -> bool:
     """Let two folders change their names in one step; False where the system cannot."""
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     return rename is not None and rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0
@@ -131,14 +131,11 @@ def link_tables(store: Store, drive: str) -> None:
         part = store.staging / f"{name}-{os.getpid()}.parquet"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ResultError(f"Cannot make {path.parent}: {error.strerror}. Make room, and run again.") from None
-        try:
             part.unlink(missing_ok=True)
             os.link(source, part)
             part.replace(path)
-        except OSError:  # no hard links here; what else is wrong, the copy says
-            with replacing(path) as stream, source.open("rb") as whole:
+        except OSError:  # no hard links here; any other error is raised by the copy
+            with replacing(path, parents=True) as stream, source.open("rb") as whole:
                 shutil.copyfileobj(whole, stream)
 
 
@@ -154,7 +151,7 @@ def check_removable(store: Store, drives: Sequence[str]) -> None:
                 )
 
 
-def take_out(store: Store, drives: Sequence[str]) -> None:
+def remove_drives(store: Store, drives: Sequence[str]) -> None:
     """Rename the run folders of drives out of the data set, all or none, then remove them and all that bears their
     names. Raises OSError; the drives are as they were where that is at a rename."""
     moved: list[tuple[Path, Path]] = []

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps.storage import lease_lock, local, upload
-from vplog.maps.storage.contents import Head, Store, one_library
+from vplog.maps.storage.contents import Head, Store, common_library
 from vplog.maps.storage.damage import complete_record
 from vplog.maps.storage.layout import HASH, TABLES, drive_record, folder_name
 from vplog.maps.storage.remote_map import Mirror
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from vplog.maps.storage.download_cache import Cache
 
-__all__ = ["TABLES", "Head", "Store", "add_library", "folder_name", "one_library", "publish", "reading", "remove"]
+__all__ = ["TABLES", "Head", "Store", "add_library", "common_library", "folder_name", "publish", "reading", "remove"]
 __all__ += ["relocate", "writing"]
 
 
@@ -72,8 +72,8 @@ def writing(root: Path) -> Iterator[Store]:
         return
     with local.locked(root):
         store = Store(root)
-        _sweep(store)
-        local.settle(store)
+        _finish_removals(store)
+        local.recover(store)
         yield store
         shutil.rmtree(store.staging, ignore_errors=True)
 
@@ -84,7 +84,7 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
     with lease_lock.held(root) as lock, scratch("map") as folder:
         mirror = Mirror(root, folder, lock)
         store = Store(folder, mirror, mirror.damaged)
-        _sweep(store)
+        _finish_removals(store)
         mirror.rest()
         upload.begin(mirror)
         store.staging.mkdir()
@@ -110,12 +110,16 @@ def publish(store: Store, drive: str, made: Path) -> None:
 
 
 def relocate(store: Store, drive: str, log: str) -> None:
-    """Note where the log of a drive is now; nothing else of the drive depends on it. Raises ResultError."""
+    """Note where the log of a drive is now, if it was moved; nothing else of the drive depends on it. Raises
+    ResultError."""
     run = store.root / "runs" / folder_name(drive)
-    if store.mirror is None:
-        run_record.write_run_json(run / "drive.json", {**drive_record(run), "log": log}, checksum=True)
+    record = drive_record(run)
+    if record["log"] == log:
         return
-    upload.relocate(store.mirror, drive, log)
+    if store.mirror is None:
+        run_record.write_run_json(run / "drive.json", {**record, "log": log})
+    else:
+        upload.relocate(store.mirror, drive, log)
 
 
 def remove(store: Store, drives: Sequence[str]) -> None:
@@ -126,24 +130,24 @@ def remove(store: Store, drives: Sequence[str]) -> None:
         local.check_removable(store, drives)
     store.write_removed(drives)
     try:
-        _sweep(store)
+        _finish_removals(store)
     except ResultError as error:
         out = f"{error} {named} out of {store}; the next command that writes to it deletes what is left of the files."
-        if all(map(store.is_whole, drives)):
+        if all(map(store.is_present, drives)):
             with suppress(ResultError):  # where that cannot be taken back they are out
                 store.write_removed([])
                 out = f"{error} {named} in {store} as before."
         raise ResultError(out) from None
 
 
-def _sweep(store: Store) -> None:
+def _finish_removals(store: Store) -> None:
     """Remove the files of drives whose removal is decided. Raises ResultError; of a folder they are as they were."""
     drives = store.removed()
     if not drives:
         return
     if store.mirror is None:
         try:
-            local.take_out(store, drives)
+            local.remove_drives(store, drives)
         except OSError as error:
             where = error.filename or store
             raise ResultError(f"Cannot remove {where}: {error.strerror}. Check its permissions.") from None

@@ -1,4 +1,8 @@
-"""Objects of a store by URL (s3://, gs://): each appears whole or not at all, and none is changed in place."""
+"""Objects of a store by URL (s3://, gs://): each appears whole or not at all, and none is changed in place.
+
+pyarrow reads and writes, boto3 adds conditional writes: both find credentials in the files of AWS's own tools, which
+obstore 0.12 does not read.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ if TYPE_CHECKING:
     from vplog.storage.remote_path import RemotePath
 
 _BLOCK_BYTES = 1 << 20
-"""Of a copy to or from the store."""
+"""Bytes copied to or from the store at once."""
 _TRIES = 5
 """A manifest is replaced once by a writer, and read in some 20 ms."""
 
@@ -32,7 +36,7 @@ def put(path: RemotePath, data: bytes) -> None:
 
 def get(path: RemotePath) -> bytes | None:
     """The bytes of an object, None where there is none. Raises OSError."""
-    found = get_tagged(path)
+    found = get_with_etag(path)
     return None if found is None else found[0]
 
 
@@ -62,7 +66,7 @@ def fetch(path: RemotePath, target: Path, most: int) -> str:
 
 @contextmanager
 def _opened(path: RemotePath) -> Iterator[Any]:
-    """The stream of an object. One that goes away after it was opened is not there: FileNotFoundError."""
+    """The stream of an object. Raises FileNotFoundError also where it is removed after it was opened."""
     from pyarrow.fs import FileType
 
     system, place = path.place
@@ -78,7 +82,7 @@ def _opened(path: RemotePath) -> Iterator[Any]:
 
 
 def copy(source: RemotePath, target: RemotePath) -> None:
-    """Within the store, without a byte coming here. Raises OSError."""
+    """Copy an object within the store. Raises OSError."""
     system, place = target.place
     system.copy_file(source.place[1], place)
 
@@ -106,8 +110,8 @@ def files_below(path: RemotePath) -> dict[str, datetime]:
     return {one.path[len(place) + 1 :]: one.mtime for one in found if one.type == FileType.File}
 
 
-def decides(path: RemotePath) -> bool:
-    """Whether `put_if` is at hand: on S3 with boto3, which alone asks for conditional writes."""
+def has_conditional_writes(path: RemotePath) -> bool:
+    """Whether `put_if` works: on S3 with boto3, as pyarrow has no conditional writes."""
     if path.scheme != "s3":
         return False
     try:
@@ -117,26 +121,26 @@ def decides(path: RemotePath) -> bool:
     return True
 
 
-def put_if(path: RemotePath, data: bytes, tag: str | None) -> str | None:
+def put_if(path: RemotePath, data: bytes, etag: str | None) -> str | None:
     """Write an object where it has this tag, or where there is none yet (tag None); its new tag, or None where that is
     not so. The store decides, so that of several writers one wins. Raises OSError.
 
     Conditional writes of S3: docs.aws.amazon.com/AmazonS3/latest/userguide/conditional-writes.html. A store that
     knows none writes in any case.
     """
-    condition = {"IfNoneMatch": "*"} if tag is None else {"IfMatch": tag}
+    condition = {"IfNoneMatch": "*"} if etag is None else {"IfMatch": etag}
     answer = _request("put_object", path, Body=data, **condition)
     return None if answer is None else answer["ETag"]
 
 
-def get_tagged(path: RemotePath) -> tuple[bytes, str, float] | None:
+def get_with_etag(path: RemotePath) -> tuple[bytes, str, float] | None:
     """The bytes of an object, its tag (empty where the store has none) and its age in seconds; None where there is
     none. Raises OSError.
 
     All of one state, also while it is replaced: one request of boto3 has that by itself; pyarrow asks for the length
     before, and what is read by another object's length is read again.
     """
-    if not decides(path):
+    if not has_conditional_writes(path):
         return _get_whole(path)
     from botocore.exceptions import BotoCoreError
 

@@ -31,7 +31,7 @@ from pydantic import BaseModel, Field, StrictInt
 from vplog.errors import NewerError, ResultError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
-from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, folder_name, sound_record
+from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, checked_record, folder_name
 from vplog.results import run_record
 from vplog.storage.folders import is_below
 from vplog.storage.remote_path import names_below, reason
@@ -81,7 +81,7 @@ class Mirror:
         """Drives whose manifest is damaged or missing, and why."""
         self.rest_manifest: dict[str, Any] = {}
         self.rest_damage = ""
-        """What is damaged of all else, where a writer goes on without it."""
+        """Damage of the files beside drives, where a writer goes on without them."""
         self._fetched: set[str] = set()
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         with store_errors(remote):
@@ -110,13 +110,13 @@ class Mirror:
             self.damaged[drive] = str(error)
             return
         if found is not None:
-            self.lay(found)
+            self.write_drive_record(found)
         elif any(objects.files_below(self.remote / name / drive_folder) for name in TABLES):
             self.damaged[drive] = f"{place}/drive.json is not there."
 
     def fetch(self, drive: str, names: Iterable[str]) -> None:
-        """Have these files of a drive in the local folder, all of one generation. Raises DamagedDriveError where one is
-        gone or damaged, and ResultError."""
+        """Download these files of a drive into the local folder, all of one generation. Raises DamagedDriveError where
+        one is gone or damaged, and ResultError."""
         with self._locks[drive]:
             for _ in range(3):
                 if drive not in self.manifests:
@@ -125,14 +125,14 @@ class Mirror:
                     self._fetch(drive, names)
                     return
                 except FileNotFoundError:
-                    self._again(drive)
+                    self._reread_manifest(drive)
             raise ResultError(f"{self.remote}: {drive} is replaced faster than it can be read. Try again later.")
 
     def _fetch(self, drive: str, names: Iterable[str]) -> None:
         manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
         for name in names:
             path = place / manifest["generation"] / name
-            if why := self._bring(path, self.run(drive) / name, manifest["files"].get(name)):
+            if why := self._fetch_file(path, self.run(drive) / name, manifest["files"].get(name)):
                 raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
         self._fetched.add(drive)
 
@@ -149,15 +149,15 @@ class Mirror:
             return sorted({*gone, str(error)})
         return sorted(gone)
 
-    def forget(self, drive: str) -> None:
-        """Free the disk of a drive's files; they are fetched anew where they are asked for again."""
+    def evict(self, drive: str) -> None:
+        """Delete the local copies of a drive's files; they are fetched again when they are needed."""
         with self._locks[drive]:
             shutil.rmtree(self.run(drive), ignore_errors=True)
             self._fetched.discard(drive)
             if drive in self.manifests:
-                self.lay(self.manifests[drive])
+                self.write_drive_record(self.manifests[drive])
 
-    def _again(self, drive: str) -> None:
+    def _reread_manifest(self, drive: str) -> None:
         """Read the manifest of a drive whose files are gone. Raises ResultError where some of them were handed out."""
         place = self.remote / "runs" / folder_name(drive)
         with store_errors(self.remote):
@@ -173,10 +173,10 @@ class Mirror:
             raise ResultError(f"{drive} was removed from {self.remote} while it was read. Run again.")
         if drive in self._fetched:
             raise ResultError(f"{drive} was replaced in {self.remote} while it was read. Run again.")
-        self.lay(found)
+        self.write_drive_record(found)
 
     def library(self, digest: str) -> None:
-        """Have a library in the local folder, if the map has it. Raises ResultError."""
+        """Download a library into the local folder, if the map has it. Raises ResultError."""
         target, place = self.local / "libraries" / digest, self.remote / "libraries" / digest
         if target.exists() or not HASH.fullmatch(digest):
             return
@@ -194,7 +194,7 @@ class Mirror:
         part.rename(target)
 
     def rest(self, names: Collection[str] = ()) -> None:
-        """Have all else that the map has in the local folder, or what of it has these names.
+        """Download all other files of the map into the local folder, or those of these names.
 
         Raises ResultError where some of it is damaged. A writer goes on without that and without the joint graphs,
         which `map join` makes again; `rest_damage` says why.
@@ -225,7 +225,7 @@ class Mirror:
                     data = objects.get(self.remote / "rest.json")
                 if data is None:
                     return ""
-                manifest = sound_manifest(data, self.remote / "rest.json")
+                manifest = checked_manifest(data, self.remote / "rest.json")
             except UnreachableError:
                 raise
             except ResultError as error:
@@ -235,7 +235,9 @@ class Mirror:
             damaged, gone = list[str](), list[str]()
             for name in sorted(wanted):
                 try:
-                    damaged += filter(None, [self._bring(place / name, self.local / name, manifest["files"][name])])
+                    damaged += filter(
+                        None, [self._fetch_file(place / name, self.local / name, manifest["files"][name])]
+                    )
                 except FileNotFoundError:
                     gone.append(f"{place / name} is not there")
             if not gone or manifest["generation"] == before:
@@ -250,13 +252,13 @@ class Mirror:
         known = {folder_name(drive) for drive in self.manifests}
         return all(part in known for part in PurePosixPath(name).parts if part.startswith("drive="))
 
-    def _bring(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
+    def _fetch_file(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
         """Fetch an object, if the manifest names it and it is not here yet; what is wrong with it, if anything. Raises
         FileNotFoundError where it is gone, and UnreachableError."""
         if about is None or target.exists():
             return ""
         target.parent.mkdir(parents=True, exist_ok=True)
-        if self.cache is not None and self.cache.take(about["sha256"], target):
+        if self.cache is not None and self.cache.fetch_to(about["sha256"], target):
             return ""
         part = target.with_name(f".{target.name}.part")
         try:
@@ -274,13 +276,15 @@ class Mirror:
         return ""
 
     def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
-        """As it is now; None where there is none. Raises OSError, and ResultError where it is damaged."""
+        """The current manifest of a drive, None without one. Raises OSError, and ResultError where it is damaged."""
         place = self.remote / "runs" / drive_folder
         data = objects.get(place / "drive.json")
-        return None if data is None else sound_record(sound_manifest(data, place / "drive.json"), cast("Path", place))
+        return (
+            None if data is None else checked_record(checked_manifest(data, place / "drive.json"), cast("Path", place))
+        )
 
-    def lay(self, manifest: dict[str, Any]) -> None:
-        """The drive's folder with its drive.json."""
+    def write_drive_record(self, manifest: dict[str, Any]) -> None:
+        """Make the drive's local folder with its drive.json."""
         folder = self.run(manifest["drive"])
         folder.mkdir(parents=True, exist_ok=True)
         own = {key: manifest[key] for key in manifest if key not in _NOT_IN_FOLDER}
@@ -288,8 +292,8 @@ class Mirror:
         (folder / "drive.json").write_text(text, encoding="utf-8")
         self.manifests[manifest["drive"]] = manifest
 
-    def take(self, manifest: dict[str, Any], made: Path) -> None:
-        """The folder of a drive that was just sent."""
+    def adopt(self, manifest: dict[str, Any], made: Path) -> None:
+        """Move the folder of a drive that was just uploaded into the local folder."""
         folder = self.run(manifest["drive"])
         shutil.rmtree(folder, ignore_errors=True)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -312,7 +316,7 @@ def store_errors(remote: RemotePath) -> Iterator[None]:
         raise UnreachableError(f"Cannot read or write {remote}: {reason(error)}.") from None
 
 
-def sound_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
+def checked_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
     """A manifest whose names stay within the map. Raises ResultError."""
     try:
         manifest = json.loads(data)

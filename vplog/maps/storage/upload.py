@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from vplog.errors import NewerError, ResultError, SettingsError
 from vplog.maps.storage import objects
-from vplog.maps.storage.layout import AT_HAND, TABLES, folder_name, sha256_of
+from vplog.maps.storage.layout import RUN_TABLES, TABLES, folder_name, sha256_of
 from vplog.maps.storage.remote_map import store_errors
 from vplog.results import run_record
 from vplog.storage.remote_path import names_below
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from vplog.storage.remote_path import RemotePath
 
 _LEFT_OVER = timedelta(days=1)
-"""Age of an object that no manifest names, from which it is nobody's: far beyond any upload."""
+"""Age from which an object that no manifest names is removed: far beyond any upload."""
 _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
 _KNOWN = ("runs", "libraries", "map.json", "failures.json", "removed.json", *TABLES)
@@ -47,22 +47,22 @@ def begin(mirror: Mirror) -> None:
             named = folder_name(drive)
             copied = all(f"{named}/{name}.parquet" in there[name] for name in TABLES)
             if not copied or any(name.startswith(f"{named}/{manifest['replaces']}/") for name in there["runs"]):
-                _after_manifest(mirror, drive, manifest)
+                _finish_publish(mirror, drive, manifest)
         rest = mirror.rest_manifest
         before = f"{rest.get('replaces')}/"
         if known := [name.removeprefix(before) for name in there["rest"] if name.startswith(before)]:
-            _after_rest(remote, rest, rest["files"], known)
+            _finish_rest(remote, rest, rest["files"], known)
         damaged = {folder_name(drive) for drive in mirror.damaged}  # what their manifests name is not known
         drives = {folder_name(drive): one["generation"] for drive, one in mirror.manifests.items()}
         current = {"runs": {f"{drive}/{one}" for drive, one in drives.items()}, "rest": {rest.get("generation")}}
         for top, files in there.items():
-            for left in _left_over(files, 2 if top == "runs" else 1, current.get(top, set(drives))):
+            for left in _abandoned(files, 2 if top == "runs" else 1, current.get(top, set(drives))):
                 if left.split("/")[0] not in damaged:
                     objects.remove(remote / top / left)
 
 
-def _left_over(files: dict[str, datetime], depth: int, named: set[Any]) -> list[str]:
-    """Folders, `depth` names deep, that no manifest names, and that nobody is writing any more."""
+def _abandoned(files: dict[str, datetime], depth: int, named: set[Any]) -> list[str]:
+    """Folders, `depth` names deep, that no manifest names and that were not written to for a day."""
     newest: dict[str, datetime] = {}
     for name, written in files.items():
         parts = name.split("/")
@@ -95,10 +95,10 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
         mirror.check_lock()
         put_json(place / "drive.json", manifest)
     for name in sent:
-        if name not in (*AT_HAND, "drive.json"):  # a batch would fill the disk
+        if name not in (*RUN_TABLES, "drive.json"):  # a batch would fill the disk
             (made / name).unlink()
-    mirror.take(manifest, made)
-    _after_manifest(mirror, drive, manifest)
+    mirror.adopt(manifest, made)
+    _finish_publish(mirror, drive, manifest)
 
 
 def relocate(mirror: Mirror, drive: str, log: str) -> None:
@@ -107,7 +107,7 @@ def relocate(mirror: Mirror, drive: str, log: str) -> None:
     mirror.check_lock()
     with store_errors(mirror.remote):
         put_json(mirror.remote / "runs" / folder_name(drive) / "drive.json", manifest)
-    mirror.lay(manifest)
+    mirror.write_drive_record(manifest)
 
 
 def _send_all(names: list[str], folder: Path, place: RemotePath) -> dict[str, dict[str, Any]]:
@@ -128,7 +128,7 @@ def _rows(file: Path) -> int:
         raise ResultError(f"{file} cannot be read: {str(error).splitlines()[0]}. Run again.") from None
 
 
-def _after_manifest(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> None:
+def _finish_publish(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> None:
     """Copy the tables to their data sets, then remove the generation that was replaced. Idempotent."""
     named, remote = folder_name(drive), mirror.remote
     place, old = remote / "runs" / named, manifest["replaces"]
@@ -144,7 +144,7 @@ def write_json(mirror: Mirror, name: str) -> None:
     """Send map.json or failures.json of the local folder. Of several writers of a first map.json one wins."""
     data, place = (mirror.local / name).read_bytes(), mirror.remote / name
     with store_errors(mirror.remote):
-        if name == "map.json" and objects.decides(place) and objects.get(place) is None:
+        if name == "map.json" and objects.has_conditional_writes(place) and objects.get(place) is None:
             if objects.put_if(place, data, None) is None:
                 raise ResultError(f"Another writer has just made {place}. Run again.")
             return
@@ -201,12 +201,12 @@ def send_rest(mirror: Mirror) -> None:
         manifest = {"generation": generation, "replaces": old.get("generation"), "files": dict(sorted(files.items()))}
         put_json(remote / "rest.json", manifest)
         mirror.rest_manifest = manifest
-        _after_rest(remote, manifest, [name for name in files if name not in same], known)
+        _finish_rest(remote, manifest, [name for name in files if name not in same], known)
 
 
-def _after_rest(remote: RemotePath, manifest: dict[str, Any], new: Iterable[str], known: Iterable[str]) -> None:
+def _finish_rest(remote: RemotePath, manifest: dict[str, Any], new: Iterable[str], known: Iterable[str]) -> None:
     """Copy what is `new` to its own name, remove what was `known` before and is gone, and last the generation that was
-    replaced, which tells a later writer that this was not done to its end."""
+    replaced: while it exists, a later writer repeats this."""
     place = remote / "rest" / manifest["generation"]
     for name in new:
         if name.endswith((".parquet", ".json")):

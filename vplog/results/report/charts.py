@@ -28,7 +28,7 @@ _MAP_WIDTH, _MAP_HEIGHT = 720.0, 520.0
 _MOST_POINTS = 2000
 """Points of a path: more than a screen has pixels across adds nothing but bytes."""
 _MOST_SEGMENTS = 3000
-"""Closures drawn on the map, evenly chosen."""
+"""Closures drawn on the map, subsampled."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Chart:
     size: tuple[str, str] = (f"{_WIDTH:.0f}", f"{_HEIGHT:.0f}")
 
 
-def evenly(rows: NDArray[Any], most: int) -> NDArray[Any]:
-    """At most so many rows (N, ...), evenly, the first and the last among them."""
+def subsampled(rows: NDArray[Any], most: int) -> NDArray[Any]:
+    """At most so many rows (N, ...), evenly spaced, the first and the last among them."""
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
@@ -68,9 +68,9 @@ def trajectory_map(
         moved = (points @ view.T - low) * scale
         return np.stack([margin + moved[..., 0], height - 50.0 - moved[..., 1]], axis=-1)
 
-    drawn = [(f"dot {kind}", _dots(place(evenly(points, _MOST_POINTS)))) for kind, points in dots]
-    drawn += [(f"edge {kind}", _segments(place(evenly(ends, _MOST_SEGMENTS)))) for kind, ends in segments]
-    drawn += [(f"track {kind}", _line(place(evenly(points, _MOST_POINTS)))) for kind, points in paths]
+    drawn = [(f"dot {kind}", _dots(place(subsampled(points, _MOST_POINTS)))) for kind, points in dots]
+    drawn += [(f"edge {kind}", _segments(place(subsampled(ends, _MOST_SEGMENTS)))) for kind, ends in segments]
+    drawn += [(f"track {kind}", _line(place(subsampled(points, _MOST_POINTS)))) for kind, points in paths]
     bar_m = _round_length(float(extent.max()) / 4.0)
     bar = f"M20 {height - 22:.1f}h{bar_m * scale:.1f}m0 -4v8M20 {height - 26:.1f}v8"
     label = (f"{28 + bar_m * scale:.1f}", f"{height - 18:.1f}", "start", f"{bar_m:g} m ({axes})")
@@ -104,15 +104,15 @@ def histogram(above: Floats, below: Floats, label: str, thresholds: Sequence[tup
     high = max([*ends, *(at * 1.1 for _, at in thresholds)])
     high = high if high > low else low + 1.0
     edges, width = np.linspace(low, high, _BINS + 1), _ACROSS / _BINS
-    middle, half = _TOP + _DOWN / 2.0, _DOWN / 2.0
+    middle, height = _TOP + _DOWN / 2.0, _DOWN / 2.0
     paths, texts = [], []
     for kind, group, sign in (("yes", groups[0], -1.0), ("no", groups[1], 1.0)):
         counts = np.histogram(np.clip(group, low, high), edges)[0]
         most = int(counts.max())
-        tall = (sign * half * counts / max(most, 1)).tolist()
+        tall = (sign * height * counts / max(most, 1)).tolist()
         bars = "".join(_bar(_LEFT + bin * width, middle, width, rise) for bin, rise in enumerate(tall) if rise)
         paths.append((f"fill {kind}", bars))
-        texts.append(_label(_LEFT - 5, middle + sign * half + (8.0 if sign < 0 else -1.0), "end", str(most)))
+        texts.append(_label(_LEFT - 5, middle + sign * height + (8.0 if sign < 0 else -1.0), "end", str(most)))
     for name, at in thresholds:
         x = _LEFT + (at - low) / (high - low) * _ACROSS
         paths.append(("bound", f"M{x:.1f} {_TOP - 4:.0f}V{_HEIGHT - _BOTTOM:.0f}"))
@@ -128,7 +128,7 @@ def curves(named: Sequence[tuple[str, Floats]]) -> Chart:
     paths = []
     for kind, points in named:
         x, y = _LEFT + points[:, 0] * _ACROSS, _TOP + (1.0 - points[:, 1]) * _DOWN
-        paths.append((f"track {kind}", _line(evenly(np.stack([x, y], 1), _MOST_POINTS))))
+        paths.append((f"track {kind}", _line(subsampled(np.stack([x, y], 1), _MOST_POINTS))))
     return _with_axes("precision over recall", paths, [], (0.0, 1.0), "recall", (0.0, 1.0), "precision")
 
 

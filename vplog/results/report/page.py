@@ -15,7 +15,7 @@ from vplog.results.report import charts
 if TYPE_CHECKING:
     from vplog.data import Bools, Closures, Floats, Keyframes, Trajectory
     from vplog.results.geo import Earth
-    from vplog.results.mcap_read import Found
+    from vplog.results.mcap_read import McapContent
 
 _TAKEN = (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY)
 """Verdicts of closures that the solve used, at least in part."""
@@ -39,7 +39,7 @@ _FIGURES = (
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class TruthComparison:
     """A run compared with the truth."""
 
     name: str
@@ -70,7 +70,7 @@ class Tracks:
     before: Trajectory
     """The odometry, laid on the first solved keyframe."""
     after: Trajectory
-    found: Found
+    found: McapContent
     """What result.mcap holds beside."""
     earth: Earth | None
     """Where the trajectory is on earth, None without satellite fixes."""
@@ -83,10 +83,12 @@ class Content:
     record: dict[str, Any]
     """What run.json holds."""
     tracks: Tracks
+    covariance: Floats
+    """(N, 6, 6) of the solved keyframes, NaN where unknown."""
     closures: Closures
     pictures: dict[int, bytes]
     """JPEG of a candidate closure by its row."""
-    judged: Judged | None = None
+    judged: TruthComparison | None = None
 
 
 def page(content: Content) -> str:
@@ -99,6 +101,7 @@ def page(content: Content) -> str:
         "report.html",
         record=record,
         drive=content.tracks.keyframes.drive,
+        certainty=_certainty(content),
         tiles=_tiles(content),
         warnings=_list(record.get("warnings")),
         losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
@@ -131,6 +134,20 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
     ]
+
+
+def _certainty(content: Content) -> list[str]:
+    """Whether the solution is the best there is for the closures kept, and how well keyframes are known."""
+    found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
+    known = content.covariance[np.isfinite(content.covariance).all((1, 2))]
+    if len(known):
+        sigma_m = np.sqrt(np.maximum(np.linalg.eigvalsh(known[:, 3:, 3:])[:, -1], 0.0))
+        to = "where GPS measures them" if content.record.get("gps") else "the first keyframe"
+        found.append(
+            f"Positions of keyframes relative to {to}, one sigma along the worst axis: median "
+            f"{figure(float(np.median(sigma_m)), 3)} m, largest {figure(float(sigma_m.max()), 3)} m."
+        )
+    return found
 
 
 def _loss(loss: dict[str, Any], content: Content) -> list[str]:
@@ -170,7 +187,7 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
     return legend, charts.trajectory_map(*drawn)
 
 
-def _truth(judged: Judged) -> list[list[str]]:
+def _truth(judged: TruthComparison) -> list[list[str]]:
     """Errors of the odometry and of the result, one figure a row."""
     scores = judged.scores
     rows = [
@@ -181,7 +198,7 @@ def _truth(judged: Judged) -> list[list[str]]:
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
 
 
-def _curves(judged: Judged) -> charts.Chart | None:
+def _curves(judged: TruthComparison) -> charts.Chart | None:
     """Precision over recall by score and by inliers, None where nothing was revisited."""
     return charts.curves(list(zip(("after", "other"), judged.curves.values(), strict=False))) if judged.curves else None
 

@@ -1,0 +1,71 @@
+"""Folders of pictures without odometry or times as drives of a map: they are found again by file name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from vplog import logs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+
+FRAMES = 14
+QUICK = ("--set", "features.max_features=250", "--set", "features.max_megapixels=0.06", "--set", "library.size=8")
+
+
+@pytest.fixture(scope="module")
+def pictures(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folders `day`, whose images are in folders of their own, and `dusk`, the same views with noise."""
+    root, rng = tmp_path_factory.mktemp("pictures"), np.random.default_rng(0)
+    log = logs.open(drive.log)
+    for number, frame in enumerate(log.frames(log.stamps()[:FRAMES])):
+        image = frame.decode().image
+        dusk = np.clip(0.8 * image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+        for folder, picture in ((root / "day" / f"place {number}", image), (root / "dusk", dusk)):
+            folder.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / f"view_{number}.png"), picture)
+    return root
+
+
+def test_pictures_are_put_into_a_map_and_found(pictures: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    root = tmp_path / "map"
+    said = verb("batch", pictures / "day", "-o", root, "--json", *QUICK)
+    assert said.code == 0, said.err
+    (found,) = said.json["drives"]
+    assert (found["state"], found["keyframes"], found["error"]) == ("computed", FRAMES, "")
+    assert verb("batch", pictures / "day", "-o", root, "--json", *QUICK).json["drives"][0]["state"] == "unchanged"
+    answers = verb("map", "query", root, pictures / "dusk", "--top", 1, "--json").json
+    assert (answers["sequence"], answers["views"]) == (1, FRAMES)
+    assert not answers["warnings"]
+    names = [(one["query_name"], one["match_name"]) for one in answers["answers"]]
+    right = sum(match == f"place {at}/view_{at}.png" for at, (_, match) in enumerate(names))
+    assert [query for query, _ in names] == [f"view_{number}.png" for number in range(FRAMES)]
+    assert right >= FRAMES - 2
+    assert "place 3/view_3.png" in verb("map", "query", root, pictures / "dusk").out
+    assert verb("map", "info", root, "--check").code == 0
+    assert verb("map", "export", root, "-o", tmp_path / "places.parquet").code == 0
+    assert pq.read_metadata(tmp_path / "places.parquet").num_rows == FRAMES
+
+
+def test_pictures_are_joined_with_no_drive(
+    pictures: Path, drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    said = verb("batch", pictures / "day", pictures / "dusk", "-o", tmp_path / "map", "--json", *QUICK).json
+    assert not said["joined"]["components"]
+    assert sum("has no odometry" in warning for warning in said["joined"]["warnings"]) == 2
+    assert verb("map", "join", tmp_path / "map").code == 0
+
+
+def test_a_recording_needs_odometry_as_before(pictures: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
+    assert "has no odometry" in verb("run", pictures / "dusk", "-o", tmp_path / "run").error
+    assert "vplog batch" in verb("info", pictures / "dusk").out

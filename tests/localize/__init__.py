@@ -1,0 +1,1 @@
+"""Pictures localised in runs and maps."""

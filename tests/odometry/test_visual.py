@@ -1,0 +1,114 @@
+"""Visual odometry of the demo's street, with depth and with a stereo pair, and where nothing is to be seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from vplog.data import Frame, Odometry
+from vplog.demo.scene import Scene, make_scene, take_picture
+from vplog.demo.settings import DemoSettings
+from vplog.geometry import se3
+from vplog.odometry.sensor import disparities, follow
+from vplog.odometry.visual import visual_odometry
+
+FRAMES = 20
+BASELINE_M = 0.3
+SETTINGS = DemoSettings(laps=0.5, frame_rate_hz=6, width=384, height=216, seed=3)
+
+
+@cache
+def scene(stereo: bool) -> Scene:
+    made = make_scene(SETTINGS)
+    return replace(made, camera=replace(made.camera, baseline_m=BASELINE_M)) if stereo else made
+
+
+@cache
+def frames(stereo: bool) -> list[Frame]:
+    street, found = scene(stereo), []
+    for row in range(FRAMES):
+        image, depth = take_picture(street, row)
+        right = take_picture(street, row, BASELINE_M)[0] if stereo else None
+        found.append(Frame(int(street.stamp_ns[row]), street.camera, image, None if stereo else depth, right))
+    return found
+
+
+def odometry_of(drive: list[Frame]) -> Odometry:
+    found = visual_odometry(drive, drive[0].camera)
+    assert found is not None
+    return found
+
+
+def blank(frame: Frame) -> Frame:
+    return replace(frame, image=np.full_like(frame.image, 90))
+
+
+def steps_off(odometry: Odometry, rows: np.ndarray) -> np.ndarray:
+    """(T-1, 6) error of every step in the body that moves; `rows` (T,) are the frames of the poses."""
+    truth = scene(stereo=False).world_from_body[rows]
+    moved = se3.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])
+    return se3.log(se3.between(se3.between(truth[:-1], truth[1:]), moved))
+
+
+@pytest.mark.parametrize("stereo", [False, True])
+def test_the_body_is_followed_in_metres(stereo: bool) -> None:
+    odometry = odometry_of(frames(stereo))
+    assert odometry.stamp_ns.tolist() == [frame.stamp_ns for frame in frames(stereo)]
+    assert odometry.breaks is not None and not len(odometry.breaks)
+    truth = scene(stereo).world_from_body[:FRAMES]
+    path_m = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    off = se3.between(se3.between(truth[0], truth[-1]), se3.between(*odometry.odom_from_body[[0, -1]]))
+    assert np.linalg.norm(off[:3, 3]) < 0.015 * path_m
+    assert np.degrees(se3.angle(off)) < 1.0
+
+
+@pytest.mark.parametrize("stereo", [False, True])
+def test_steps_are_as_sure_as_their_covariance(stereo: bool) -> None:
+    odometry = odometry_of(frames(stereo))
+    assert odometry.covariance is not None
+    assert odometry.covariance.shape == (FRAMES, 6, 6)
+    squared = se3.mahalanobis2(steps_off(odometry, np.arange(FRAMES)), odometry.covariance[1:])
+    assert np.median(squared) < 12.6  # chi-square, 6 degrees of freedom, 95 %
+    sigma_m = np.sqrt(np.trace(odometry.covariance[:, 3:, 3:], axis1=1, axis2=2))
+    assert np.median(sigma_m) < 0.2  # of steps of a metre
+
+
+def test_the_same_frames_give_the_same_bytes() -> None:
+    once, twice = (odometry_of(frames(stereo=False)[:8]) for _ in range(2))
+    assert once.odom_from_body.tobytes() == twice.odom_from_body.tobytes()
+    assert once.covariance is not None and twice.covariance is not None
+    assert once.covariance.tobytes() == twice.covariance.tobytes()
+
+
+def test_a_blurred_frame_is_passed_over() -> None:
+    drive = [blank(frame) if row == 5 else frame for row, frame in enumerate(frames(stereo=False)[:10])]
+    odometry = odometry_of(drive)
+    assert drive[5].stamp_ns not in odometry.stamp_ns
+    assert odometry.breaks is not None and not len(odometry.breaks)
+    assert np.abs(steps_off(odometry, np.array([0, 1, 2, 3, 4, 6, 7, 8, 9]))[:, 3:]).max() < 0.1
+
+
+def test_the_drive_goes_on_as_another_piece() -> None:
+    """Two seconds without a picture, after which the street looks otherwise: the pose is held there."""
+    drive = [blank(frame) if 4 <= row < 16 else frame for row, frame in enumerate(frames(stereo=False))]
+    odometry = odometry_of(drive)
+    assert odometry.breaks is not None
+    assert odometry.breaks.tolist() == [4]
+    assert len(odometry.stamp_ns) == 8
+    before, behind = odometry.odom_from_body[3:5]
+    np.testing.assert_allclose(before, behind)
+
+
+def test_a_dark_drive_has_none() -> None:
+    assert visual_odometry([blank(frame) for frame in frames(stereo=False)[:3]], scene(stereo=False).camera) is None
+
+
+def test_points_without_a_counterpart_are_unknown() -> None:
+    image = frames(stereo=False)[0].image
+    px = np.array([[100.0, 100.0], [200.0, 80.0]], np.float32)
+    assert np.isnan(disparities(image, np.full_like(image, 90), px)).all()
+    assert follow(image, image, px[:0], px[:0]).shape == (0, 2)
+    np.testing.assert_allclose(follow(image, image, px, px), px, atol=1e-3)

@@ -1,0 +1,123 @@
+"""Features of the frames of a drive in files that later comparisons of the same drive find."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from vplog.cache.code_hash import code_of
+from vplog.cache.feature_shards import Extracted, packed
+from vplog.cache.input_hashes import stat_signature
+from vplog.cache.stage_cache import AbsentError, DamagedError, check_file, file_name, key_of, sealed
+from vplog.cache.user_cache import cache_folder, max_bytes, trim
+from vplog.features.extraction import extract_frames
+from vplog.results.previews import PictureSettings, preview
+from vplog.run.feature_extraction import PART_KEYFRAMES, image_topics
+from vplog.storage.scratch import replacing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from vplog.data import Bytes, Features, Float32s, Frame, Ints
+    from vplog.execution.execution import Execution
+    from vplog.logs import TopicChoice
+    from vplog.stages import Extractor, Log
+
+
+@dataclass(frozen=True)
+class CacheChoice:
+    """Where features are kept between calls."""
+
+    folder: Path | None = None
+    """None for the user's cache."""
+    max_gb: float | None = None
+    """Largest size in 10^9 bytes, None for the default; 0 keeps nothing."""
+
+    def open(self) -> Path | None:
+        """The folder for features, None where nothing is kept. Raises SettingsError where it cannot be used."""
+        return cache_folder(self.folder, "features", self.max_gb)
+
+    def trim(self) -> None:
+        """Remove what was not used for longest, down to the largest size."""
+        if (folder := self.open()) is not None:
+            trim([folder], max_bytes(self.max_gb))
+
+
+@dataclass(frozen=True)
+class FeatureFolder:
+    """A folder for the features of one drive, and what these are made from beside its frames."""
+
+    folder: Path
+    made_from: dict[str, Any] = field(default_factory=dict)
+    """Plain values; the same ones stand for the same features."""
+
+    @classmethod
+    def of(cls, folder: Path, path: Path, topics: TopicChoice | None, extractor: Any) -> FeatureFolder:
+        """For the drive at `path`, known by lengths and times of its files."""
+        return cls(folder, {
+            "files": stat_signature(path),
+            "topics": None if topics is None else image_topics(topics),
+            "features": extractor.model_dump(mode="json"),
+            **code_of(__name__, "vplog.logs.detect", type(extractor).__module__),
+        })  # fmt: skip
+
+    def extract(self, log: Log, stamp_ns: Ints, extractor: Extractor, execution: Execution) -> Extracted:
+        """Features and pictures of the frames with these stamps (N,), those that are not there yet from the log."""
+        parts = [stamp_ns[at : at + PART_KEYFRAMES] for at in range(0, len(stamp_ns), PART_KEYFRAMES)]
+        keys = [key_of({**self.made_from, "drive": log.name, "stamps": part.tolist()}) for part in parts]
+        missing = [(part, key) for part, key in zip(parts, keys, strict=True) if not self._holds(key)]
+        wanted = [stamp for part, _ in missing for stamp in part.tolist()]
+        done = len(stamp_ns) - len(wanted)
+        spent: list[float] = []
+
+        def timed(image: Bytes, depth_m: Float32s | None = None) -> Features:
+            began = time.thread_time()
+            features = extractor(image, depth_m)
+            spent.append(round(1e3 * (time.thread_time() - began), 3))
+            return features
+
+        frames = extract_frames(log.frames(stamp_ns[:0] if not wanted else _among(stamp_ns, wanted)), timed, execution)
+        counted = execution.part(done, len(stamp_ns)).counted(f"extract {log.name}", frames, len(stamp_ns))
+        for part, key in missing:
+            content = _content(islice(counted, len(part)), spent)
+            with replacing(self._path(key)) as stream:
+                stream.write(sealed(key, content))
+        found = Extracted()
+        for key in keys:
+            os.utime(self._path(key))  # used now
+            found.add(self._path(key))
+        return found
+
+    def _path(self, key: str) -> Path:
+        return self.folder / file_name("frames", key)
+
+    def _holds(self, key: str) -> bool:
+        """Whether a part is there and whole; a damaged one is made again."""
+        try:
+            check_file(self._path(key), key)
+            Extracted().add(self._path(key))
+        except (AbsentError, DamagedError):
+            return False
+        return True
+
+
+def _among(stamp_ns: Ints, wanted: list[int]) -> Ints:
+    """The stamps that are wanted."""
+    chosen = set(wanted)
+    return stamp_ns[[stamp in chosen for stamp in stamp_ns.tolist()]]
+
+
+def _content(frames: Iterable[tuple[int, Frame | None, Features | None, str]], spent: list[float]) -> bytes:
+    """The file of a part of the frames; takes the times measured so far."""
+    found, lost = [], []
+    for stamp_ns, frame, features, why in frames:
+        if frame is None or features is None:
+            lost.append(why)
+        else:
+            found.append((stamp_ns, features, preview(frame.image, PictureSettings())))
+    times, spent[:] = spent[:], []
+    return packed(found, lost, [], times)

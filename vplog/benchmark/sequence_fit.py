@@ -1,0 +1,71 @@
+"""Whether the lines that sequences run along are those of the truth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from vplog.evaluate.pairs import Pairs
+    from vplog.places.sequence import SequenceSettings
+
+_TRIED = 200
+"""Queries that are looked at, spread evenly: a share of a half is then known within 7 % (two sigmas)."""
+_OFF_ROWS = 1
+"""Rows that a view may lie off the line: lines are rounded to rows."""
+
+
+def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) -> list[str]:
+    """A sentence where most windows of the truth hold few true pairs on any line that is tried, or nothing is known of
+    it; none where sequences fit."""
+    length = f"--sequence {settings.length}"
+    if settings.length == 1:
+        return []
+    if not has_truth:
+        return [f"{length} takes query and map to advance alike, frame by frame; without a truth that is not checked."]
+    queries = np.flatnonzero(pairs.positive)
+    queries = queries[np.unique(np.linspace(0, len(queries) - 1, min(_TRIED, len(queries))).astype(int))]
+    shares = np.array(
+        [share for query in queries.tolist() if (share := _on_a_line(pairs, query, settings)) is not None]
+    )
+    if not len(shares) or np.median(shares) >= 0.5:
+        return []
+    ratio = _rows_a_view(pairs)
+    advance = "run back or jump" if ratio is None else f"advance by {ratio:.2g} frames of the map a frame of the query"
+    remedy = "Leave --sequence out"
+    if ratio is not None and 0.1 <= ratio <= 9:
+        remedy += f", or set sequence.slowest={0.9 * ratio:.2g} and sequence.fastest={1.1 * ratio:.2g}"
+    tried = f"{settings.slowest:g} to {settings.fastest:g}"
+    return [
+        f"{length} harms here: true matches {advance}, and lines of {tried} are tried. In half of the windows "
+        f"{np.median(shares):.0%} of the views or fewer are on such a line. {remedy}."
+    ]
+
+
+def _on_a_line(pairs: Pairs, query: int, settings: SequenceSettings) -> float | None:
+    """Largest share of the other views of a window that lie on one line through a true row of its middle, of those with
+    a true row; None where no other has one."""
+    half = settings.length // 2
+    views = [view for view in range(query - half, query + half + 1) if 0 <= view < len(pairs) and view != query]
+    true = {view: rows for view in views if len(rows := pairs.rows(view))}
+    if not true:
+        return None
+    runs = slice(pairs.start[query], pairs.start[query + 1])
+    middles = (pairs.first[runs] + pairs.stop[runs] - 1) // 2
+    best = 0
+    for line in settings.offsets():
+        for middle in middles.tolist():
+            at = ((view, middle + line[view - query + half]) for view in true)
+            best = max(best, sum(np.abs(true[view] - row).min() <= _OFF_ROWS for view, row in at))
+    return best / len(true)
+
+
+def _rows_a_view(pairs: Pairs) -> float | None:
+    """Median rows that the first true run advances from a view to the next; None where it is no advance."""
+    queries = np.flatnonzero(pairs.positive)
+    first = pairs.start[queries]
+    middle = (pairs.first[first] + pairs.stop[first] - 1) / 2
+    steps = np.diff(middle)[np.diff(queries) == 1]
+    ratio = float(np.median(steps)) if len(steps) else 0.0
+    return ratio if ratio > 0 and np.mean(np.abs(steps - ratio) <= max(0.5 * ratio, 1.0)) >= 0.5 else None

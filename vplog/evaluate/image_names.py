@@ -1,0 +1,89 @@
+"""Truth in the names of image files: a number, a position on earth, the place whose folder they are in."""
+
+from __future__ import annotations
+
+import re
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.errors import TruthError
+from vplog.geometry.utm_name import FORM, utm_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from vplog.data import Floats, Ints
+
+_MOST_DEG = 1e4
+"""Degrees; a heading beyond is something else."""
+_DIGITS = 9
+"""Longest number that counts images; longer ones are times."""
+
+
+def numbers_of(query: Sequence[str], match: Sequence[str]) -> tuple[Ints, Ints] | None:
+    """(Q,) and (M,) numbers in the names of two sets: in each the last that no other of the set has.
+
+    None where one has no such number, or its names are times.
+    """
+    here, there = _own_numbers(query), _own_numbers(match)
+    return None if here is None or there is None else (here, there)
+
+
+def _own_numbers(names: Sequence[str]) -> Ints | None:
+    stems = [PurePosixPath(name).stem for name in names]
+    if any(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):
+        return None
+    found = [re.findall(r"\d+", stem) for stem in stems]
+    for at in range(1, 1 + min(map(len, found), default=0)):
+        column = [numbers[-at] for numbers in found]
+        if max(map(len, column)) <= _DIGITS and len(set(map(int, column))) == len(column):
+            return np.array(column, np.int64)
+    return None
+
+
+def folders_of(names: Sequence[str], drive: str) -> list[str]:
+    """The folder of each image below that of the set. Raises TruthError where one is in none."""
+    folders = [str(PurePosixPath(name).parent) for name in names]
+    if "." in folders:
+        raise TruthError(
+            f"{drive}: {names[folders.index('.')]} is in no folder of its own, and --truth labels takes the folders "
+            "of images for their places. Give the places in a table with the header `image,label`."
+        )
+    return folders
+
+
+def utm_of(names: Sequence[str]) -> tuple[Floats, Floats]:
+    """(N, 3) m east, north and a number far apart for each zone, and (N,) headings in degrees, NaN where unknown.
+
+    Raises TruthError for the first name that gives no position.
+    """
+    positions, headings = np.zeros((len(names), 3)), np.full(len(names), np.nan)
+    for row, name in enumerate(names):
+        found = utm_name(name)
+        if found is None:
+            raise TruthError(f"{name} gives no position, as --truth utm needs. Names are {FORM}")
+        south = found.letter.upper() < "N" if found.letter.isalpha() else False
+        zone = int(found.zone[:2]) + 100 * south if found.zone.isascii() and found.zone.isdigit() else 0
+        positions[row] = found.east, found.north, 1e9 * zone
+        if abs(found.heading_deg) < _MOST_DEG:
+            headings[row] = found.heading_deg
+    return positions, headings
+
+
+def row_finder(names: Sequence[str] | None, drive: str) -> Callable[[str], int | None]:
+    """The row of an image by its path below the set, with the set's own name before it or not, or by its name or stem
+    where no other image has it; None for what is no image of the set."""
+    rows: dict[str, int] = {}
+    for kind in (str, lambda name: PurePosixPath(name).name, lambda name: PurePosixPath(name).stem):
+        found: dict[str, int] = {}
+        for row, name in enumerate(names or ()):
+            found[kind(name)] = row if kind(name) not in found else -1
+        rows = {**{name: row for name, row in found.items() if row >= 0}, **rows}
+
+    def find(field: str) -> int | None:
+        plain = field.replace("\\", "/").removeprefix("./")
+        return rows.get(plain, rows.get(plain.removeprefix(f"{drive}/")))
+
+    return find

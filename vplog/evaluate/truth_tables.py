@@ -1,0 +1,269 @@
+"""Tables of the truth: pairs of images or labels in CSV, and pairs in NumPy files as VPR-Bench has them."""
+
+from __future__ import annotations
+
+import csv
+import pickletools
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from vplog.errors import TruthError
+from vplog.evaluate.image_names import row_finder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from vplog.data import Ints
+    from vplog.errors import VplogError
+    from vplog.stages import Log
+
+_LINE_LIMIT = 4096
+"""Characters: two paths; a file without line ends is not read whole."""
+_FILE_BYTES = 2**28
+"""Longest table that is read: ten million pairs of names."""
+_MOST_PAIRS = 10**8
+"""Pairs of a NumPy file, which may name one list many times over."""
+_CSV = (
+    "A table has the header `query,match` and a pair of frame numbers, from 0, or of file names a line, or the header "
+    "`image,label` and the place of an image a line."
+)
+_NPY = "It should hold pairs, as VPR-Bench's [query, [match, ...]] a row, or a matrix of queries by frames of the map."
+
+
+def read_table(path: Path) -> tuple[list[str], list[tuple[str, str, str]]]:
+    """The header of a CSV, and of each line its two fields and where it is. Blank lines are skipped.
+
+    Raises TruthError with the number of the first line that does not fit.
+    """
+    header, rows = list[str](), list[tuple[str, str, str]]()
+    for where, fields in read_lines(path):
+        if not header:
+            header = fields
+            if header not in (["query", "match"], ["image", "label"]):
+                raise TruthError(f"{where} is not the header. {_CSV}")
+        elif len(fields) != 2 or not fields[0]:
+            raise TruthError(f"{where} does not hold two fields. {_CSV}")
+        else:
+            rows.append((fields[0], fields[1], where))
+    if not rows:
+        raise TruthError(f"{path} holds no pair. {_CSV}")
+    return header, rows
+
+
+def read_lines(path: Path, form: str = _CSV, error: type[VplogError] = TruthError) -> Iterator[tuple[str, list[str]]]:
+    """The place in the file and the cells of each line of a CSV that is not blank; `form` ends each message.
+
+    Raises `error` with the first line that is too long, or where the file cannot be read.
+    """
+    try:
+        if path.stat().st_size > _FILE_BYTES:
+            raise error(f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of pairs. {form}")
+        with path.open(encoding="utf-8-sig", newline="") as lines:
+            number = 0
+            while line := lines.readline(_LINE_LIMIT):
+                number += 1
+                if len(line) >= _LINE_LIMIT:
+                    raise error(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {form}")
+                if line.strip():
+                    yield f"{path}:{number}", [cell.strip() for cell in next(csv.reader([line]))]
+    except OSError as fault:
+        raise error(f"Cannot read {path}: {fault.strerror}. {form}") from None
+    except (UnicodeDecodeError, csv.Error):
+        raise error(f"{path} is not text, and so not a CSV file. {form}") from None
+
+
+def _check_size(path: Path) -> None:
+    if path.stat().st_size > _FILE_BYTES:
+        raise TruthError(f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of true pairs.")
+
+
+def listed_rows(rows: Sequence[tuple[str, str, str]], query: Log, other: Log) -> Ints:
+    """(P, 2) rows of the pairs of a table `query,match`; a line with no match names a query that has none.
+
+    A column of whole numbers is of frame numbers, any other of file names. Raises TruthError for the first field that
+    is no frame of its drive.
+    """
+    paired = [row for row in rows if row[1]]
+    columns = [
+        _rows_of([(row[at], row[2]) for row in paired], log, name)
+        for at, log, name in ((0, query, "query"), (1, other, "map"))
+    ]
+    _rows_of([(row[0], row[2]) for row in rows], query, "query")  # those without a match are checked, too
+    return np.array(columns, np.int64).reshape(2, -1).T
+
+
+def _rows_of(fields: Sequence[tuple[str, str]], log: Log, name: str) -> list[int]:
+    count, find = len(log.stamps()), row_finder(log.file_names(), log.name)
+    if all(field.isascii() and field.isdigit() and len(field) < 10 for field, _ in fields):
+        for field, where in fields:
+            if int(field) >= count:
+                named = "" if log.file_names() is None else " To name images, write their whole file names."
+                text = f"{where}: {field} is not a frame of the {name}, whose {count} frames count from 0.{named}"
+                raise TruthError(text)
+        return [int(field) for field, _ in fields]
+    found = [find(field) for field, _ in fields]
+    if None in found:
+        field, where = fields[found.index(None)]
+        raise TruthError(f"{where}: {field!r} is neither a frame number nor an image of the {name} {log.name}. {_CSV}")
+    return [row for row in found if row is not None]
+
+
+def labels_by_row(rows: Iterable[tuple[str, str, str]], log: Log) -> list[str | None]:
+    """The label of each frame by a table `image,label`; None of a frame that it does not name.
+
+    Lines about images of another set are passed over: one table may serve all.
+    """
+    find, labels = row_finder(log.file_names(), log.name), list[str | None]([None] * len(log.stamps()))
+    for image, label, where in rows:
+        row = find(image)
+        if row is not None and labels[row] not in (None, label):
+            raise TruthError(
+                f"{where}: {image} is at {label!r} here, and at {labels[row]!r} before. Give it one label."
+            )
+        if row is not None:
+            labels[row] = label
+    return labels
+
+
+def read_array(path: Path, queries: int, matches: int) -> Ints:
+    """(P, 2) pairs of a NumPy file, frame numbers below `queries` and `matches`: (P, 2) whole numbers, VPR-Bench's rows
+    of a query and the list of its matches, a list of matches for each query, or a matrix of queries by matches.
+
+    No pickle is executed. Raises TruthError.
+    """
+    try:
+        _check_size(path)
+        with path.open("rb") as stream:
+            values = _array(stream)
+    except OSError as error:
+        raise TruthError(f"Cannot read {path}: {error.strerror}. {_NPY}") from None
+    except Exception as error:  # whatever bytes do to a reader
+        reason = " ".join(str(error).split())[:100]
+        raise TruthError(f"{path} is not an array of whole numbers that can be read: {reason}. {_NPY}") from None
+    if isinstance(values, np.ndarray) and values.shape == (queries, matches) and values.shape[1] != 2:
+        return np.argwhere(values != 0).astype(np.int64)
+    pairs = _pairs(values, path)
+    for at, count, name in ((0, queries, "query"), (1, matches, "map")):
+        if len(pairs) and not 0 <= pairs[:, at].min() <= pairs[:, at].max() < count:
+            wrong = pairs[:, at][(pairs[:, at] < 0) | (pairs[:, at] >= count)][0]
+            raise TruthError(f"{path}: {wrong} is not a frame of the {name}, whose {count} frames count from 0.")
+    return pairs
+
+
+def _array(stream: BinaryIO) -> Any:
+    """An array of numbers, or the lists that an array of objects holds."""
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(stream)
+    if kind.hasobject:
+        values = _literals(stream)
+        return (
+            [values[at : at + 2] for at in range(0, len(values), 2)] if shape[1:] == (2,) else list(enumerate(values))
+        )
+    stream.seek(0)
+    values = np.load(stream, allow_pickle=False)
+    if values.dtype.kind not in "iub" or values.ndim != 2:
+        raise ValueError(f"it holds {values.dtype} of shape {values.shape}")
+    return values
+
+
+def _pairs(values: Any, path: Path) -> Ints:
+    if isinstance(values, np.ndarray):
+        if values.shape[1] != 2:
+            raise TruthError(f"{path} has shape {values.shape}, which is not one of pairs. {_NPY}")
+        return values.astype(np.int64)
+    pairs = []
+    for query, found in values:
+        matches = found if isinstance(found, list | tuple) else [found]
+        if type(query) is not int or not all(type(match) is int for match in matches):
+            raise TruthError(f"{path} does not hold whole numbers alone. {_NPY}")
+        if len(pairs) + len(matches) > _MOST_PAIRS:
+            raise TruthError(f"{path} holds more than {_MOST_PAIRS} pairs.")
+        pairs += [(query, match) for match in matches]
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+class _Name(str):
+    """A name that a pickle asks for; it is compared, never looked up."""
+
+    __slots__ = ()
+
+
+def _literals(stream: BinaryIO) -> list[Any]:  # noqa: PLR0912 (a case an opcode)
+    """The content of a pickled array of numbers and lists, from the opcodes: nothing is imported or called.
+
+    Raises ValueError for anything else.
+    """
+    stack: list[Any] = []
+    marks: list[int] = []
+    memo: dict[int, Any] = {}
+    for opcode, argument, _ in pickletools.genops(stream):
+        match opcode.name:
+            case "PROTO" | "FRAME":
+                pass
+            case "STOP":
+                return stack.pop()
+            case "MARK":
+                marks.append(len(stack))
+            case "GLOBAL":
+                stack.append(_Name(str(argument).rpartition(" ")[2]))
+            case "STACK_GLOBAL":
+                stack[-2:] = [_Name(stack[-1])]
+            case "MEMOIZE":
+                memo[len(memo)] = stack[-1]
+            case "PUT" | "BINPUT" | "LONG_BINPUT":
+                memo[int(str(argument))] = stack[-1]
+            case "GET" | "BINGET" | "LONG_BINGET":
+                stack.append(memo[int(str(argument))])
+            case "NONE" | "NEWTRUE" | "NEWFALSE":
+                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[opcode.name])
+            case "EMPTY_LIST" | "EMPTY_TUPLE":
+                stack.append([])
+            case "APPEND":
+                item = stack.pop()
+                stack[-1].append(item)
+            case "APPENDS" | "LIST" | "TUPLE":
+                at = marks.pop()
+                stack[at:], items = [], stack[at:]
+                stack[-1].extend(items) if opcode.name == "APPENDS" else stack.append(items)
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                count = int(opcode.name[-1])
+                stack[-count:] = [stack[-count:]]
+            case "REDUCE":
+                stack[-2:] = [_called(*stack[-2:])]
+            case "BUILD":
+                state = stack.pop()
+                _build(stack[-1], state)
+            case _ if argument is not None and isinstance(argument, int | str | bytes):
+                stack.append(argument)
+            case name:
+                raise ValueError(f"it has {name}, which no list of numbers needs")
+    raise ValueError("it ends early")
+
+
+def _called(name: Any, given: Any) -> Any:
+    """The value that one of the four calls in a pickled array stands for."""
+    if not isinstance(name, _Name):
+        raise ValueError("it calls what is no name")
+    match str(name):
+        case "_reconstruct":
+            return []
+        case "dtype" if str(given[0]).lstrip("<>=|")[:1] in ("i", "u", "O", "b"):
+            return [str(given[0])]
+        case "scalar":
+            return int(np.frombuffer(given[1], np.dtype(given[0][0]))[0])
+        case "encode":
+            return str(given[0]).encode("latin1")
+    raise ValueError(f"it asks for {str(name)[:40]!r}")
+
+
+def _build(made: Any, state: Any) -> None:
+    """Fill an array with (version, shape, type, order, content); of a type the byte order is all that matters."""
+    if made and isinstance(made[0], str):
+        made[0] = (">" if state[1] == ">" else "<") + made[0].lstrip("<>=|")
+    elif isinstance(state[4], bytes):
+        made.extend(np.frombuffer(state[4], np.dtype(state[2][0])).tolist())
+    else:
+        made.extend(state[4])

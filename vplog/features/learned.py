@@ -1,0 +1,111 @@
+"""Local features of a network in an ONNX file that gives points and descriptors: SuperPoint, ALIKED, XFeat and others.
+
+Descriptors become bytes as SIFT's are: whole numbers that are not negative, of length 512. Each value has two, one for
+its positive and one for its negative part, so that distances between like values stay, and histograms' kernels and
+L1 distances mean what they mean for SIFT.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vplog.data import Features
+from vplog.errors import LibraryError
+from vplog.features.sift import depth_at, thumbnail_of_image
+from vplog.networks.onnx_model import NetworkInput, NetworkSettings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vplog.data import Bytes, Float32s
+
+_LENGTH = np.float32(512)
+"""Length of a descriptor, as of SIFT's by OpenCV, for which thresholds are meant."""
+_MOST_VALUES = 1024
+"""Values of a descriptor: four times SuperPoint's."""
+
+
+class LocalNetwork(NetworkInput):
+    """Input of a network of local features, and the names of its outputs."""
+
+    points: str = "keypoints"
+    """Name of the output with (N, 2) x and y in px of the image that it gets, (0, 0) the centre of the first."""
+    descriptors: str = "descriptors"
+    """Name of the output with (N, D) or (D, N) descriptors."""
+    scores: str = ""
+    """Name of the output with (N,) scores, the strongest first of which are kept; empty where they come in order."""
+    diameter_px: float = Field(default=16.0, gt=0)
+    """Diameter of the neighbourhood that a feature describes, in px of the network's input: 16 is two cells of most."""
+
+
+class OnnxFeatureSettings(NetworkSettings):
+    """Local features of a network, which gets the grey image in each of its channels."""
+
+    LOCATIONS: ClassVar = NetworkSettings.LOCATIONS
+
+    kind: Literal["onnx"] = "onnx"
+    """Name of the extractor."""
+    network: LocalNetwork = LocalNetwork()  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Its input and outputs; left out, they are read from the YAML."""
+    max_features: int = Field(default=2000, ge=1)
+    """Features kept of an image."""
+
+    def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
+        """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points.
+
+        Raises LibraryError where the network does not take it, or gives something else.
+        """
+        network, (height, width) = self.network, image.shape
+        names = [name for name in (network.points, network.descriptors, network.scores) if name]
+        pixels = np.repeat(image[..., None], 1 if network.colour == "grey" else 3, axis=2)
+        found = [one[0] if one.ndim > 1 and len(one) == 1 else one for one in self.run(pixels, names)]
+        points, descriptors = self._paired(found[0], found[1])
+        order = np.arange(len(points))
+        if network.scores:
+            if found[2].shape != (len(points),):
+                raise self._wrong("scores", found[2])
+            order = np.lexsort((points[:, 1], points[:, 0], -found[2]))
+        taken = network.taken(height, width)
+        scale = np.array([width / taken[1], height / taken[0]], np.float32)
+        points = (points.astype(np.float32) + 0.5) * scale - 0.5
+        inside = np.all((points > -0.5) & (points < np.array([width, height]) - 0.5), axis=1)
+        order = order[inside[order]][: self.max_features]
+        points = points[order]
+        return Features(
+            points=points,
+            sizes=np.full(len(points), network.diameter_px * np.sqrt(scale[0] * scale[1]), np.float32),
+            descriptors=as_bytes(descriptors[order]),
+            depth_m=depth_at(points, depth_m),
+            width=width,
+            height=height,
+            thumbnail=thumbnail_of_image(image),
+        )
+
+    def _paired(self, points: NDArray[Any], descriptors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """(N, 2) and (N, D)."""
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise self._wrong("points", points)
+        if descriptors.ndim == 2 and len(descriptors) != len(points):
+            descriptors = descriptors.T
+        fits = descriptors.ndim == 2 and descriptors.dtype.kind == "f" and len(descriptors) == len(points)
+        if not fits or not 1 <= descriptors.shape[1] <= _MOST_VALUES or not np.isfinite(descriptors).all():
+            raise self._wrong("descriptors", descriptors)
+        return points, descriptors
+
+    def _wrong(self, name: str, found: NDArray[Any]) -> LibraryError:
+        shape = " x ".join(map(str, found.shape))
+        return LibraryError(
+            f"{self.model}: output {getattr(self.network, name)} has {shape} values of {found.dtype}, or such as are "
+            f"not finite, which are no {name}. Name the right outputs in its .yaml."
+        )
+
+
+def as_bytes(descriptors: NDArray[Any]) -> Bytes:
+    """(N, 2 D) uint8 of (N, D) floats: at length 512 the positive parts, then the negative ones."""
+    values = descriptors.astype(np.float32)
+    values *= _LENGTH / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-9))
+    both = np.concatenate([np.maximum(values, 0), np.maximum(-values, 0)], axis=1)
+    return np.minimum(np.rint(both), 255).astype(np.uint8)

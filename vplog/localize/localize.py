@@ -1,0 +1,202 @@
+"""Localisation of pictures: the likeliest places, the pose by their landmarks, and what is said of each picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import Verdict
+from vplog.errors import LibraryError, LogError
+from vplog.geometry import se3
+from vplog.loops.localize import Localization, localize
+from vplog.results.geo import on_earth
+from vplog.stages import FrameState, StoredState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from vplog.data import Camera, Features, Frame, Ints
+    from vplog.execution.execution import Execution
+    from vplog.localize.places import Places
+    from vplog.stages import EncodedFrame, Log
+
+TOP = 10
+"""Places that a picture is verified against."""
+_AROUND = 2
+"""Keyframes before and after the likeliest of each drive that are looked at too: they see the same landmarks."""
+_BLOCK = 64
+"""Pictures whose features are in memory at once, some 20 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedPicture:
+    """The answer for one picture: its pose, or why there is none."""
+
+    name: str
+    stamp_ns: int
+    camera: Camera | None
+    """None of a picture that does not decode."""
+    found: Localization
+    sentence: str
+    drive: str | None = None
+    """Drive of the place that explains it best."""
+    keyframe: int | None = None
+    frame: str | None = None
+    """Frame of the pose: the first of the drives that the drive is joined with."""
+    earth_deg_m: tuple[float, float, float] | None = None
+    """Longitude and latitude in degrees and altitude in m, WGS84."""
+
+    @property
+    def localized(self) -> bool:
+        return self.found.world_from_camera is not None
+
+    def record(self) -> dict[str, Any]:
+        """As plain values."""
+        pose, covariance = self.found.world_from_camera, self.found.covariance
+        values: dict[str, Any] = {}
+        if pose is not None and covariance is not None:
+            quaternion = se3.quaternion(pose[None, :3, :3])[0]
+            names = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+            values = dict(zip(names, [*pose[:3, 3].tolist(), *quaternion.tolist()], strict=True))
+            sigma_m, sigma_deg = sigmas(self.found)
+            values |= {"covariance": covariance.tolist(), "sigma_m": sigma_m, "sigma_deg": sigma_deg}
+            if self.earth_deg_m is not None:
+                values |= dict(zip(("longitude", "latitude", "altitude_m"), self.earth_deg_m, strict=True))
+        return {
+            "picture": self.name, "stamp_ns": self.stamp_ns, "localized": self.localized,
+            "verdict": self.found.verdict.value, "sentence": self.sentence, "drive": self.drive,
+            "keyframe": self.keyframe, "frame": self.frame, "matches": self.found.matches,
+            "inliers": self.found.inliers, "places": self.found.places, **values,
+        }  # fmt: skip
+
+
+def sigmas(found: Localization) -> tuple[float, float]:
+    """Standard deviation of a pose's position in m and of its rotation in degrees, along the worst axis."""
+    if found.covariance is None:
+        return float("nan"), float("nan")
+    turn, shift = (np.linalg.eigvalsh(found.covariance[part, part])[-1] for part in (slice(3), slice(3, 6)))
+    return float(np.sqrt(shift)), float(np.degrees(np.sqrt(turn)))
+
+
+def localize_log(
+    places: Places, log: Log, stamp_ns: Ints, execution: Execution, top: int = TOP
+) -> Iterator[LocalizedPicture]:
+    """The frames of a log with these stamps (N,), in order; progress counts them."""
+    names = dict(zip(log.stamps().tolist(), log.file_names() or [], strict=False))
+    frames, done = _described(places, log.frames(stamp_ns), execution), 0
+    while block := list(islice(frames, _BLOCK)):
+        for found in _localized(places, block, execution, top, names):
+            done += 1
+            execution.progress("localize", done, len(stamp_ns))
+            yield found
+
+
+def localize_frame(places: Places, frame: Frame, execution: Execution, top: int = TOP) -> LocalizedPicture:
+    """One picture."""
+    picture = _describe(places, frame)
+    return next(_localized(places, [picture], execution, top, {}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A decoded picture."""
+
+    stamp_ns: int
+    camera: Camera | None
+    features: Features | None
+    descriptor: Any = None
+    problem: str = ""
+
+
+def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execution) -> Iterator[_Picture]:
+    """Features and descriptor of each frame."""
+    colour = isinstance(places.state, FrameState) and places.state.colour
+
+    def work(encoded: EncodedFrame) -> _Picture:
+        try:
+            return _describe(places, encoded.decode(colour))
+        except LogError as error:
+            return _Picture(encoded.stamp_ns, None, None, problem=str(error))
+
+    return execution.map(work, frames, ahead=2)
+
+
+def _describe(places: Places, frame: Frame) -> _Picture:
+    state, pipeline = places.state, places.pipeline
+    if isinstance(state, StoredState):
+        raise LibraryError(
+            f"The places of {places.name} have descriptors from a file, which new pictures lack. Make the map with a "
+            "recogniser that describes pictures: --set places.kind=bobb."
+        )
+    features = pipeline.features(frame.image, frame.depth)  # depths of a pair would cost as much again, and add little
+    descriptor = state.describe_frame(frame) if isinstance(state, FrameState) else state.describe(features)
+    return _Picture(frame.stamp_ns, frame.camera, features, descriptor)
+
+
+def _localized(
+    places: Places, block: Sequence[_Picture], execution: Execution, top: int, names: dict[int, str]
+) -> Iterator[LocalizedPicture]:
+    """Some pictures, in order."""
+    sound = [one for one in block if one.features is not None]
+    likely = dict(zip(map(id, sound), places.search([one.descriptor for one in sound], top), strict=True))
+    for drive in sorted({drive for found in likely.values() for drive, _ in found}):
+        _ = places.drives[drive].loaded  # before workers wait for it
+
+    def work(one: _Picture) -> LocalizedPicture:
+        return _answer(places, one, likely.get(id(one), []), names.get(one.stamp_ns, str(one.stamp_ns)))
+
+    return execution.map(work, block)
+
+
+def _answer(places: Places, one: _Picture, likely: list[tuple[int, int]], name: str) -> LocalizedPicture:
+    if one.features is None or one.camera is None:
+        return LocalizedPicture(name, one.stamp_ns, None, Localization(Verdict.TOO_FEW_MATCHES, -1, 0, 0), one.problem)
+    verify = places.pipeline.verify
+    likely = _with_neighbours(places, likely)
+    # poses in frames of their own are not compared: the likeliest place's frame is
+    frames = list(dict.fromkeys(places.drives[drive].frame for drive, _ in likely)) or [""]
+    tried = []
+    for frame in frames:
+        own = [(drive, row) for drive, row in likely if places.drives[drive].frame == frame]
+        views = [places.drives[drive].loaded.landmarks(row, verify) for drive, row in own]
+        tried.append((localize(one.features, one.camera, views, verify), own))
+    found, own = max(tried, key=lambda pair: (pair[0].world_from_camera is not None, pair[0].inliers))
+    if found.place < 0:
+        return LocalizedPicture(name, one.stamp_ns, one.camera, found, _sentence(found, "", 0))
+    drive, row = own[found.place]
+    known, pose, where = places.drives[drive], found.world_from_camera, None
+    if pose is not None and (earth := known.loaded.earth) is not None:
+        where = tuple(on_earth(earth, pose[None])[0].tolist())
+    sentence = _sentence(found, known.name, row)
+    return LocalizedPicture(name, one.stamp_ns, one.camera, found, sentence, known.name, row, known.frame, where)
+
+
+def _with_neighbours(places: Places, likely: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The places and those around the first of each drive."""
+    first, found = dict(reversed(likely)), list(likely)
+    for drive, row in first.items():
+        count = len(places.drives[drive].loaded.world_from_body)
+        found += [(drive, other) for other in range(max(row - _AROUND, 0), min(row + _AROUND + 1, count))]
+    return list(dict.fromkeys(found))
+
+
+def _sentence(found: Localization, drive: str, keyframe: int) -> str:
+    """The verdict in words."""
+    if found.world_from_camera is not None:
+        sigma_m, sigma_deg = sigmas(found)
+        places = "1 keyframe" if found.places == 1 else f"{found.places} keyframes"
+        return (
+            f"Localised by {found.inliers} landmarks of {places} around {keyframe} of {drive}, to {sigma_m:.2g} m and "
+            f"{sigma_deg:.2g} degrees (1 sigma)."
+        )
+    if found.verdict is Verdict.NO_CALIBRATION:
+        return "The picture has no calibration, so it has no pose in metres. Give one with --calibration FILE."
+    if found.place < 0:
+        return "No place of the map is like the picture."
+    if found.verdict is Verdict.INCONSISTENT:
+        return "Two places that are far apart explain the picture equally well, so it is at neither."
+    likeliest = f"Keyframe {keyframe} of {drive} comes closest, with {found.matches} matches."
+    return f"{likeliest} {found.verdict.sentence}"

@@ -1,0 +1,230 @@
+"""The places of a run or a map that pictures are looked for among, with their poses and landmarks."""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from vplog.errors import ResultError
+from vplog.execution.execution import Execution
+from vplog.geometry import se3
+from vplog.loops.localize import KeyframeLandmarks, landmarks_from
+from vplog.maps.geo_bounds import earth_of_run
+from vplog.maps.joining.drive_pairs import known_camera
+from vplog.maps.joining.joint_record import components_in
+from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, opened_log
+from vplog.maps.search.exact import best_places
+from vplog.maps.search.index import update_index
+from vplog.maps.search.query import open_map
+from vplog.maps.search.sequences import best_lines
+from vplog.maps.storage import map_store
+from vplog.maps.storage.contents import damage_warnings
+from vplog.maps.storage.layout import PICTURES, folder_name
+from vplog.places.sequence import SequenceSettings
+from vplog.results import run_record, tables
+from vplog.results.landmark_table import LandmarkTable
+from vplog.run.landmarks import LANDMARKS, landmark_key, run_drive, write_drive_landmarks
+from vplog.run.provenance import library_at
+from vplog.stages import CodedState
+from vplog.storage.remote_path import RemotePath
+from vplog.storage.scratch import scratch
+from vplog.verbs.report import recorded_pipeline
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from vplog.data import Floats
+    from vplog.loops.candidate import Drive
+    from vplog.loops.verify import VerifySettings
+    from vplog.maps.search.index import SegmentView
+    from vplog.maps.storage.map_store import Store
+    from vplog.pipeline import Pipeline
+    from vplog.results.geo import Earth
+    from vplog.stages import PlaceState
+
+    Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
+    """Drive and keyframe of the likeliest places of each of some descriptors, best first."""
+
+
+class Landmarked(NamedTuple):
+    """The keyframes of one drive, with their landmarks."""
+
+    world_from_body: Floats
+    """(N, 4, 4)."""
+    earth: Earth | None
+    """Where that frame is on earth."""
+    table: LandmarkTable
+
+    def landmarks(self, row: int, settings: VerifySettings) -> KeyframeLandmarks:
+        """The landmarks of a keyframe. Raises ResultError where their file is damaged."""
+        (features, sigma), camera = self.table[row], self.table.camera
+        measured, pixel_sigma = self.table.scale != "odometry", settings.landmarks.pixel_sigma
+        landmarks = landmarks_from(features, sigma, camera, pixel_sigma, measured)
+        return KeyframeLandmarks(self.world_from_body[row] @ camera.body_from_camera, features, landmarks)
+
+
+class PlacesOfDrive:
+    """One drive, which is read when a picture may be in it: a map has thousands."""
+
+    def __init__(self, name: str, frame: str, load: Callable[[], Landmarked]) -> None:
+        """`frame` names that of its poses, which drives that closures join share: the first of them."""
+        self.name, self.frame, self._load = name, frame, load
+        self._loaded: Landmarked | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def loaded(self) -> Landmarked:
+        """Its keyframes, with landmarks that are made where they are not stored. Raises VplogError."""
+        with self._lock:
+            if self._loaded is None:
+                self._loaded = self._load()
+            return self._loaded
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The run or map in which pictures are localised."""
+
+    name: str
+    state: PlaceState
+    pipeline: Pipeline
+    drives: Sequence[PlacesOfDrive]
+    search: Search
+    warnings: list[str]
+
+
+@contextmanager
+def opened(root: Path, execution: Execution) -> Iterator[Places]:
+    """A run folder or a map. Raises VplogError where it is neither, or a map by URL."""
+    with ExitStack() as stack:
+        if isinstance(root, RemotePath):
+            raise ResultError(f"{root} is read from a local folder to localise in it. Copy it to this machine.")
+        is_map = (root / "map.json").exists()
+        yield stack.enter_context((_of_map if is_map else _of_run)(root, execution))
+
+
+@contextmanager
+def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
+    record = run_record.read_single_run(folder)
+    pipeline = recorded_pipeline(folder, record)
+    with library_at(folder, record) as library:
+        state = pipeline.places.load(library, Execution(execution.threads))
+    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    index = state.index(state.from_arrow(column))
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+
+    def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
+        found = execution.map(lambda one: index.query(one, top).rows, descriptors)
+        return [[(0, row) for row in rows.tolist()] for rows in found]
+
+    key = landmark_key(folder, record, pipeline)
+    with ExitStack() as stack:
+
+        def load() -> Landmarked:
+            drive = partial(run_drive, folder, record, pipeline, execution)
+            table = _stored_or_made(folder / LANDMARKS, key, drive, stack, execution)
+            return Landmarked(world_from_body, earth_of_run(folder), table)
+
+        own = PlacesOfDrive(keyframes.drive, keyframes.drive, load)
+        yield Places(str(folder), state, pipeline, [own], search, [])
+
+
+@contextmanager
+def _of_map(root: Path, execution: Execution) -> Iterator[Places]:
+    with map_store.reading(root) as store, ExitStack() as stack:
+        known, pipeline, state = open_map(store, execution)
+        joint = {
+            drive: (root / "joint" / one["folder"], one["drives"][0])
+            for one in components_in(store) or []
+            for drive in one["drives"]
+        }
+
+        def load(name: str, first: str) -> Landmarked:
+            table = _map_landmarks(store, known[name], pipeline, stack, execution)
+            return Landmarked(_keyframes(store, joint, name), _map_earth(store, joint, first), table)
+
+        first = {name: joint[name][1] if name in joint else name for name in known}
+        drives = [PlacesOfDrive(name, first[name], partial(load, name, first[name])) for name in known]
+        search, warnings = _map_search(store, known, state, execution)
+        yield Places(str(store), state, pipeline, drives, search, warnings + damage_warnings(store))
+
+
+def _keyframes(store: Store, joint: Mapping[str, tuple[Path, str]], drive: str) -> Floats:
+    """(N, 4, 4) of a drive, in the frame that it shares with those it is joined with."""
+    path = store.file(drive, "keyframes.parquet")
+    if drive in joint:
+        path = joint[drive][0] / folder_name(drive) / "keyframes.parquet"
+    return tables.read_keyframes(path)[1]
+
+
+def _map_earth(store: Store, joint: Mapping[str, tuple[Path, str]], first: str) -> Earth | None:
+    """The georeference of the frame of a drive and those joined with it, by its own run's."""
+    earth = store.earth(first)
+    if earth is None or first not in joint:
+        return earth
+    own = _keyframes(store, {}, first)[0] @ se3.inverse(_keyframes(store, joint, first)[0])
+    return replace(earth, enu_from_world=earth.enu_from_world @ own)
+
+
+def _map_search(
+    store: Store, known: Mapping[str, Mapping[str, Any]], state: PlaceState, execution: Execution
+) -> tuple[Search, list[str]]:
+    """The search for single views in all drives that have poses, and warnings."""
+    pictures = [number for number, about in enumerate(known.values()) if about.get(PICTURES)]
+    places, single, warnings = sum(store.rows("descriptors", one) for one in known), SequenceSettings(length=1), []
+    parts: list[SegmentView] = []
+    if isinstance(state, CodedState):
+        parts, warnings = update_index(store, known, state, execution)
+
+    def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
+        if isinstance(state, CodedState):
+            found = best_places(parts, state, descriptors, min(top, places), execution)
+        else:
+            drives = dict(enumerate(known))
+            found = best_lines(store, drives, state, descriptors, min(top, places), single, execution)
+        rows = zip(found.drive.tolist(), found.keyframe.tolist(), found.count.tolist(), strict=True)
+        every = [list(zip(drive[:count], row[:count], strict=True)) for drive, row, count in rows]
+        return [[(drive, row) for drive, row in one if drive not in pictures] for one in every]
+
+    return search, warnings
+
+
+def _map_landmarks(
+    store: Store, about: dict[str, Any], pipeline: Pipeline, stack: ExitStack, execution: Execution
+) -> LandmarkTable:
+    """The landmarks of a drive of a map, beside its features for joins."""
+    member = member_of(store, about)
+    folder = store.run(about["drive"])
+    key = landmark_key(folder, run_record.read_run_json(folder / "run.json"), member.pipeline)
+
+    @contextmanager
+    def drive() -> Iterator[Drive]:
+        camera = known_camera(store, member, pipeline)
+        camera = camera or CameraTrust(run_record.plain(dict(vars(opened_log(member).camera()))), 0.0)
+        with opened_drive(member, camera, member.pipeline.verify, execution) as (found, fetch):
+            fetch(np.arange(len(found.keyframes.stamp_ns)))
+            yield found
+
+    return _stored_or_made(member.features.with_name(LANDMARKS), key, drive, stack, execution)
+
+
+def _stored_or_made(
+    path: Path, key: str, drive: Callable[[], AbstractContextManager[Drive]], stack: ExitStack, execution: Execution
+) -> LandmarkTable:
+    """The landmarks in a file; made there first unless it is of this key, or in a scratch file where it cannot be."""
+    with suppress(ResultError):
+        return stack.enter_context(closing(LandmarkTable(path, key)))
+    above = next(folder for folder in path.parents if folder.is_dir())
+    if not os.access(above, os.W_OK):
+        path = stack.enter_context(scratch("landmarks")) / LANDMARKS
+    with drive() as found:
+        write_drive_landmarks(path, found, key, execution)
+    return stack.enter_context(closing(LandmarkTable(path, key)))

@@ -1,0 +1,136 @@
+"""`vplog localize`: pictures or a log in, their poses in a run or a map out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog import logs
+from vplog.data import Keyframes, Trajectory, Verdict
+from vplog.errors import LogError, ResultError
+from vplog.execution.execution import Execution
+from vplog.geometry import se3, tum
+from vplog.localize.localize import TOP, LocalizedPicture, localize_log
+from vplog.localize.places import opened
+from vplog.localize.trajectory import JoinedLog, join_by_odometry
+from vplog.results.localized_table import write_localized
+from vplog.results.tables import TableMetadata
+from vplog.run.keyframes import select_keyframes
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog.localize.places import Places
+    from vplog.stages import Log
+
+_AT_ODDS = "At odds with the other pictures by the log's odometry, so it has no pose."
+
+
+def localize_paths(
+    root: Path, paths: Sequence[Path], topics: logs.TopicChoice | None = None, out: Path | None = None,
+    execution: Execution = Execution(), top: int = TOP,
+) -> dict[str, Any]:  # fmt: skip
+    """The poses of pictures, or of the keyframes of a log, in a run or a map. Raises VplogError with one line.
+
+    `out` is a table (.parquet) or a trajectory (.tum): of the cameras of pictures, or of the body of a log.
+    """
+    _check_out(out)
+    log = open_pictures_or_log(paths, topics)
+    with opened(root, execution) as places:
+        stamps, keyframes, warnings = _frames(log, places)
+        found = list(localize_log(places, log, stamps, execution, top))
+        joined = None
+        if keyframes is not None:
+            found, joined = _joined(log, keyframes, found, places)
+        records = [one.record() for one in found]
+        if out is not None:
+            header = TableMetadata(places.pipeline.model_dump(mode="json"), places.state.hash)
+            _write(out, records, found, joined, header)
+        return {
+            "map": str(root),
+            "log": " ".join(map(str, paths)),
+            "pictures": len(found),
+            "localized": sum(one.localized for one in found),
+            "verdicts": dict(Counter(one.found.verdict.value for one in found)),
+            "joined_by_odometry": joined is not None,
+            "written": None if out is None else str(out),
+            "warnings": log.warnings + warnings + places.warnings,
+            "answers": records,
+        }
+
+
+def open_pictures_or_log(paths: Sequence[Path], topics: logs.TopicChoice | None) -> Log:
+    """One log, or files of pictures as one. Raises LogError."""
+    if len(paths) == 1 and not logs.is_image_file(paths[0]):
+        return logs.open(paths[0], topics)
+    return logs.open_images(paths, topics)
+
+
+def _check_out(out: Path | None) -> None:
+    """Raises ResultError where it cannot be written, before any work."""
+    if out is None:
+        return
+    if out.suffix not in (".parquet", ".tum"):
+        raise ResultError(f"Cannot write {out}: poses are a table or a trajectory. Name FILE.parquet or FILE.tum.")
+    if not out.parent.is_dir():
+        raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
+    if out.is_dir():
+        raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
+
+
+def _frames(log: Log, places: Places) -> tuple[Any, Keyframes | None, list[str]]:
+    """Stamps of the pictures: of the keyframes where there is odometry."""
+    odometry, stamps = log.odometry(), log.stamps()
+    if odometry is None or len(odometry.stamp_ns) < 2:
+        return stamps, None, []
+    keyframes, warnings = select_keyframes(log.name, stamps, odometry, places.pipeline.keyframes)
+    return keyframes.stamp_ns, keyframes, warnings
+
+
+def _joined(
+    log: Log, keyframes: Keyframes, found: list[LocalizedPicture], places: Places
+) -> tuple[list[LocalizedPicture], JoinedLog | None]:
+    """The pictures of a log, without those at odds with its odometry, and its trajectory in the frame of most; None
+    where none is localised, or no two agree with the odometry."""
+    odometry = log.odometry()
+    frames = Counter(one.frame for one in found if one.localized)
+    if odometry is None or not frames:
+        return found, None
+    frame = frames.most_common(1)[0][0]
+    rows = np.flatnonzero([one.localized and one.frame == frame for one in found])
+    poses, covariances = zip(*(_of_body(found[row]) for row in rows.tolist()), strict=True)
+    joined = join_by_odometry(odometry, keyframes, rows, np.stack(poses), np.stack(covariances), places.pipeline)
+    if not joined.agrees.any():
+        return found, None
+    for row in rows[~joined.agrees].tolist():
+        lost = replace(found[row].found, verdict=Verdict.REJECTED_BY_SOLVER, world_from_camera=None, covariance=None)
+        found[row] = replace(found[row], found=lost, sentence=_AT_ODDS, earth_deg_m=None)
+    return found, joined
+
+
+def _of_body(one: LocalizedPicture) -> tuple[Any, Any]:
+    """world_from_body (4, 4) and its covariance (6, 6) in the body."""
+    if one.camera is None or one.found.world_from_camera is None or one.found.covariance is None:
+        raise LogError(f"{one.name} is not localised.")
+    Ad = se3.adjoint(one.camera.body_from_camera)
+    return one.found.world_from_camera @ se3.inverse(one.camera.body_from_camera), Ad @ one.found.covariance @ Ad.T
+
+
+def _write(
+    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: JoinedLog | None,
+    header: TableMetadata,
+) -> None:  # fmt: skip
+    if out.suffix == ".parquet":
+        write_localized(out, records, header)
+        return
+    if joined is not None:
+        tum.write_tum(out, joined.trajectory)
+        return
+    known = {one.stamp_ns: pose for one in found if (pose := one.found.world_from_camera) is not None}
+    if not known:
+        raise ResultError(f"None of {len(found)} pictures is localised, so {out} is not written.")
+    tum.write_tum(out, Trajectory(np.array([*known], np.int64), np.stack([*known.values()])))

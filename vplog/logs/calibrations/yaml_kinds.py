@@ -1,0 +1,145 @@
+"""Calibrations in YAML: ROS camera_info, OpenCV, Kalibr's camchain, EuRoC's sensor.yaml, VSLAM-LAB and ORB-SLAM."""
+
+from __future__ import annotations
+
+import re
+import reprlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from vplog.geometry import se3
+from vplog.logs.calibrations.camera import (
+    BadCalibrationError,
+    CalibratedCamera,
+    matrix_of,
+    numbers_of,
+    pinhole,
+    rigid_of,
+    size_of,
+    text_of,
+)
+from vplog.logs.messages.records import CalibrationMessage
+
+if TYPE_CHECKING:
+    from vplog.data import Floats
+
+_MODELS = {
+    "radtan": "plumb_bob", "radtan4": "plumb_bob", "radtan5": "plumb_bob", "radial-tangential": "plumb_bob",
+    "radtan8": "rational_polynomial", "equidistant": "equidistant", "equid4": "equidistant", "none": "",
+}  # fmt: skip
+"""Kalibr's, EuRoC's and VSLAM-LAB's names of distortion models, and ROS's."""
+_FISHEYE = ("kannalabrandt8", "fisheye", "equidistant", "opencv_fisheye")
+"""Camera models of ORB-SLAM's settings whose k1 to k4 are those of a fisheye, in lower case."""
+_SECTION = re.compile(r"(Camera\d?)\.fx")
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values alone, and OpenCV's matrices as the mappings that they are."""
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)  # type: ignore[arg-type]
+
+
+def load_tree(text: str) -> dict:
+    """The top mapping of a YAML file, OpenCV's `%YAML:1.0` among them. Raises BadCalibrationError or YAMLError."""
+    text = re.sub(r"\A%YAML:.*", "", text)  # no directive of YAML's: it has no colon
+    tree = yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader
+    if not isinstance(tree, dict) or not tree:
+        raise BadCalibrationError("its top level is not a mapping of names to values")
+    return tree
+
+
+def yaml_cameras(tree: dict) -> list[CalibratedCamera]:
+    """The cameras of a tree, in its order. Raises BadCalibrationError where it is none of the known kinds."""
+    if "camera_matrix" in tree:
+        return [CalibratedCamera(text_of(tree.get("camera_name")) or "camera", "", _camera_info(tree))]
+    if "intrinsics" in tree:
+        placed = rigid_of(tree["T_BS"]) if "T_BS" in tree else None
+        return [CalibratedCamera("camera", "", _intrinsics(tree), body_from_camera=placed)]
+    if isinstance(listed := tree.get("cameras"), list):
+        return [_listed(part) for part in listed if isinstance(part, dict)]
+    if sections := [match[1] for name in tree if isinstance(name, str) and (match := _SECTION.fullmatch(name))]:
+        return _settings(tree, sections)
+    return _chain(tree)
+
+
+def _chain(tree: dict) -> list[CalibratedCamera]:
+    """Kalibr's camchain: each camera by the one before it (github.com/ethz-asl/kalibr/wiki/yaml-formats)."""
+    chain = [(name, part) for name, part in tree.items() if isinstance(part, dict) and "intrinsics" in part]
+    if not chain:
+        raise BadCalibrationError("it has neither camera_matrix nor intrinsics")
+    found, from_first = [], np.eye(4)
+    for number, (name, part) in enumerate(chain):
+        step = rigid_of(part["T_cn_cnm1"]) if "T_cn_cnm1" in part else None
+        from_first = from_first if number == 0 else (None if step is None or from_first is None else step @ from_first)
+        placed = se3.inverse(rigid_of(part["T_cam_imu"])) if "T_cam_imu" in part else None
+        topic = text_of(part.get("rostopic"))
+        found.append(CalibratedCamera(text_of(name), topic, _intrinsics(part), from_first, placed))
+    return found
+
+
+def _camera_info(tree: dict) -> CalibrationMessage:
+    """docs.ros.org/en/api/camera_calibration_parsers, and OpenCV's calibration sample, which leaves the rest out."""
+    lens = matrix_of(tree.get("distortion_coefficients", []), None)
+    size = size_of(tree.get("image_width", 0)), size_of(tree.get("image_height", 0))
+    k, p, r = (
+        matrix_of(tree.get(f"{name}_matrix", unset.ravel().tolist()), unset.size).reshape(unset.shape)
+        for name, unset in (("camera", np.eye(3)), ("projection", np.zeros((3, 4))), ("rectification", np.eye(3)))
+    )
+    return CalibrationMessage(0, "", *size, text_of(tree.get("distortion_model")), lens, k, p, r)
+
+
+def _intrinsics(tree: dict) -> CalibrationMessage:
+    """github.com/ethz-asl/kalibr/wiki/yaml-formats."""
+    kind = tree.get("camera_model", "pinhole")
+    if kind != "pinhole":
+        raise BadCalibrationError(f"camera_model {reprlib.repr(kind)[:40]} is not supported; pinhole is")
+    numbers = numbers_of(tree["intrinsics"], 4)
+    lens = tree.get("distortion_coeffs", tree.get("distortion_coefficients", []))
+    width, height = numbers_of(tree.get("resolution", [0, 0]), 2)
+    model = _model(tree.get("distortion_model", "none"))
+    return pinhole(numbers[:2], numbers[2:], (size_of(width), size_of(height)), model, numbers_of(lens, None))
+
+
+def _model(name: Any) -> str:
+    if not isinstance(name, str) or name not in _MODELS:
+        raise BadCalibrationError(f"distortion_model {reprlib.repr(name)[:40]} is none of {', '.join(_MODELS)}")
+    return _MODELS[name]
+
+
+def _listed(part: dict) -> CalibratedCamera:
+    """A camera of VSLAM-LAB's calibration.yaml."""
+    if part.get("cam_model", "pinhole") != "pinhole":
+        raise BadCalibrationError(f"cam_model {reprlib.repr(part['cam_model'])[:40]} is not supported; pinhole is")
+    focal, centre = (numbers_of(part.get(name), 2) for name in ("focal_length", "principal_point"))
+    width, height = numbers_of(part.get("image_dimension", [0, 0]), 2)
+    lens = numbers_of(part.get("distortion_coefficients", []), None)
+    model = _model(part.get("distortion_type", "none"))
+    calibration = pinhole(focal, centre, (size_of(width), size_of(height)), model, lens)
+    placed = rigid_of(part["T_BS"]) if "T_BS" in part else None
+    per_m = float(numbers_of([part["depth_factor"]], 1)[0]) if "depth_factor" in part else None
+    return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, None, placed, per_m)
+
+
+def _settings(tree: dict, sections: list[str]) -> list[CalibratedCamera]:
+    """The settings of ORB-SLAM 2 and 3, and of VSLAM-LAB before its list of cameras."""
+    factor = tree.get("RGBD.DepthMapFactor", tree.get("DepthMapFactor"))
+    per_m = None if factor is None else float(numbers_of([factor], 1)[0])
+    return [CalibratedCamera(name, "", _section(tree, name), depth_per_m=per_m) for name in sections]
+
+
+def _section(tree: dict, name: str) -> CalibrationMessage:
+    def numbers(names: str) -> Floats:
+        return numbers_of([tree.get(f"{name}.{one}", tree.get(f"Camera.{one}", 0.0)) for one in names.split()], None)
+
+    kind = text_of(tree.get("Camera.type", tree.get(f"{name}.model"))).lower()
+    model, lens = ("equidistant", "k1 k2 k3 k4") if kind in _FISHEYE else ("plumb_bob", "k1 k2 p1 p2 k3")
+    width, height = np.maximum(numbers("width height"), numbers("w h"))
+    size = size_of(float(width)), size_of(float(height))
+    return pinhole(numbers("fx fy"), numbers("cx cy"), size, model, numbers(lens))

@@ -1,0 +1,156 @@
+"""A COLMAP model (Schoenberger and Frahm, 2016): cameras and images, text or binary, and the folder of its images."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter, defaultdict
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vplog.data import Trajectory
+from vplog.errors import LogError
+from vplog.geometry import se3
+from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.datasets import ros1
+from vplog.logs.datasets.streams import DataSet, Stream, camera_streams
+from vplog.logs.datasets.tables import lines_of
+from vplog.logs.formats.container import Channel
+from vplog.logs.image_folder import named_stamps, natural_order
+from vplog.logs.tf_odometry import are_usable
+
+if TYPE_CHECKING:
+    from vplog.data import Floats, Ints
+    from vplog.logs.calibrations.camera import CalibratedCamera
+
+_MODELS = (".", "sparse", "sparse/0", "colmap/sparse/0", "dslr_calibration_undistorted")
+"""Where a model lies below the folder of a reconstruction: COLMAP's own, its automatic one, NeRF's, ETH3D's."""
+_LARGEST = 2**31
+"""Bytes of images.bin; 100,000 images of 1000 points take a third of it."""
+_UNITS = (
+    "The poses of a COLMAP model have a scale and a frame of their own, unless it was aligned with metres; "
+    "`vplog evaluate --truth auto --align sim3` leaves the scale free."
+)
+
+
+class _Image(NamedTuple):
+    """An image of the model."""
+
+    name: str
+    camera: str
+    pose: tuple[float, ...]
+    """Quaternion w x y z and translation of camera_from_world."""
+
+
+def _model_of(path: Path) -> Path | None:
+    for folder in (path / name for name in _MODELS):
+        for ending in (".bin", ".txt"):
+            if all((folder / f"{name}{ending}").is_file() for name in ("cameras", "images")):
+                return folder / f"images{ending}"
+    return None
+
+
+def roots(path: Path) -> list[Path]:
+    return [path] if _model_of(path) is not None else []
+
+
+def read(path: Path) -> DataSet:
+    """The body is the camera of most images, whose poses are the truth. Raises LogError."""
+    table = _model_of(path)
+    if table is None:
+        raise LogError(f"{path} holds no COLMAP model. Give the folder with cameras and images.")
+    images = _binary(table) if table.suffix == ".bin" else _text(table)
+    folder = _folder_of(images, [path, *table.resolve().parents[:3]], table)
+    cameras = {one.name: one for one in read_calibrations(table.with_name(f"cameras{table.suffix}"))}
+    groups: defaultdict[str, list[_Image]] = defaultdict(list)
+    for one in sorted(images, key=lambda image: natural_order(Path(image.name).name)):
+        groups[str(PurePosixPath(one.name).parent)].append(one)
+    streams, main = [], max(sorted(groups), key=lambda name: len(groups[name]))
+    for name, group in groups.items():
+        files = [folder / one.name for one in group]
+        topic = folder.name if name == "." else name
+        stamp_ns, _ = named_stamps(files)
+        streams += [*camera_streams(topic, stamp_ns, files, None), _calibrations(topic, stamp_ns, group, cameras)]
+    stamp_ns, _ = named_stamps([folder / one.name for one in groups[main]])
+    return DataSet("colmap", streams, _truth(stamp_ns, groups[main]), [_UNITS])
+
+
+def _folder_of(images: list[_Image], near: list[Path], table: Path) -> Path:
+    """The folder that most of the first images lie in. Raises LogError."""
+    places = [place / name for place in near for name in ("images", "rgb", ".")]
+    found: Counter[Path] = Counter()
+    for one in images[:20]:
+        found.update({place for place in places if (place / one.name).is_file()})
+    if not found:
+        raise LogError(f"The images that {table} names, as {images[0].name[:60]}, are not near it, in images/ or rgb/.")
+    return max(places, key=lambda place: found[place])
+
+
+def _calibrations(topic: str, stamp_ns: Ints, images: list[_Image], cameras: dict[str, CalibratedCamera]) -> Stream:
+    """The calibration of each image: COLMAP may have a camera for every one."""
+    if missing := next((one for one in images if one.camera not in cameras), None):
+        raise LogError(f"The COLMAP model has no camera {missing.camera} of {missing.name[:60]}. Copy it again.")
+    channel = Channel(f"{topic}/camera_info", "sensor_msgs/CameraInfo", "ros1")
+
+    def message(row: int) -> bytes:
+        return ros1.camera_info(int(stamp_ns[row]), topic, cameras[images[row].camera].calibration)
+
+    return Stream(channel, stamp_ns, message)
+
+
+def _truth(stamp_ns: Ints, images: list[_Image]) -> Trajectory:
+    values = np.array([one.pose for one in images], np.float64)
+    stamp_ns, rows = np.unique(stamp_ns, return_index=True)
+    camera_from_world: Floats = se3.pose(se3.rotation(values[rows][:, [1, 2, 3, 0]]), values[rows][:, 4:])
+    return Trajectory(stamp_ns, se3.inverse(camera_from_world))
+
+
+def _text(path: Path) -> list[_Image]:
+    """`ID QW QX QY QZ TX TY TZ CAMERA NAME`, and a line of points behind each, which may be empty. Raises LogError."""
+    found = []
+    for number, line in lines_of(path):
+        fields = line.split(maxsplit=9)
+        if len(fields) < 10 or not fields[0].isdecimal() or not _is_name(fields[9]):
+            continue  # points: x, y and the number of a landmark, over and over
+        try:
+            found.append(_Image(_inside(fields[9], path), fields[8], tuple(map(float, fields[1:8]))))
+        except ValueError:
+            raise LogError(f"{path}:{number} is no image of a COLMAP model. Copy it again.") from None
+    return _checked(found, path)
+
+
+def _is_name(text: str) -> bool:
+    return any(letter.isalpha() for letter in text)
+
+
+def _binary(path: Path) -> list[_Image]:
+    """images.bin. Raises LogError."""
+    if path.stat().st_size > _LARGEST:
+        raise LogError(f"{path} is larger than 2 GB. Give a smaller model.")
+    data, found = path.read_bytes(), []
+    try:
+        (count,), at = struct.unpack_from("<Q", data), 8
+        for _ in range(min(count, len(data) // 64)):
+            _, *pose, camera = struct.unpack_from("<i7di", data, at)
+            end = data.index(b"\0", at + 64)
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            found.append(_Image(_inside(data[at + 64 : end].decode(), path), str(camera), tuple(pose)))
+            at = min(end + 9 + 24 * points, len(data))
+    except (struct.error, ValueError):
+        raise LogError(f"{path} ends within an image, or is no COLMAP model. Copy it again.") from None
+    return _checked(found, path)
+
+
+def _inside(name: str, path: Path) -> str:
+    """A name below the folder of the images. Raises LogError."""
+    if name.startswith("/") or ".." in name.split("/"):
+        raise LogError(f"{path} names {name[:60]}, which is outside its folder.")
+    return name
+
+
+def _checked(images: list[_Image], path: Path) -> list[_Image]:
+    poses = np.array([one.pose for one in images], np.float64).reshape(-1, 7)
+    if not len(poses) or not are_usable(poses[:, [4, 5, 6, 1, 2, 3, 0]]).all():
+        raise LogError(f"{path} holds no image with a pose, or one whose pose is none. Copy it again.")
+    return images

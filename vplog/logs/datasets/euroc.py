@@ -1,0 +1,53 @@
+"""EuRoC's ASL layout (Burri et al., 2016), and TUM VI's: mav0 with camN, imuN and a ground truth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.datasets.folders import below, image_files
+from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
+from vplog.logs.datasets.tables import listed_images, numbers_of, poses_of, rows_of, stamps_ns
+from vplog.logs.image_folder import named_stamps
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+_POSES = ("state_groundtruth_estimate0", "gt0", "mocap0", "vicon0")
+"""Folders with poses, the best first: of the body, of the IMU in TUM VI, of a marker."""
+
+
+def roots(path: Path) -> list[Path]:
+    """The folder that holds the sensors, with `mav0` or `path` itself."""
+    return [folder for folder in (path, path / "mav0") if (folder / "cam0" / "data").is_dir()][:1]
+
+
+def read(path: Path) -> DataSet:
+    """The body is that of T_BS, EuRoC's IMU. Raises LogError."""
+    streams: list[Stream] = []
+    for folder in below(path):
+        if folder.name.startswith("cam"):
+            streams += _camera(folder)
+        elif folder.name.startswith("imu") and (folder / "data.csv").is_file():
+            streams.append(_imu(folder / "data.csv", folder.name))
+    truths = [path / name / "data.csv" for name in _POSES]
+    found = next((file for file in truths if file.is_file()), None)
+    return DataSet("euroc", streams, None if found is None else poses_of(found, 1, scalar_first=True))
+
+
+def _camera(folder: Path) -> list[Stream]:
+    table, sensor = folder / "data.csv", folder / "sensor.yaml"
+    if table.is_file():
+        stamp_ns, files = listed_images(table, folder / "data", 1)
+    else:
+        files = image_files(folder / "data")
+        stamp_ns, _ = named_stamps(files)
+    camera = read_calibrations(sensor)[0] if sensor.is_file() else None
+    return camera_streams(folder.name, stamp_ns, files, camera)
+
+
+def _imu(table: Path, name: str) -> Stream:
+    rows = rows_of(table, 7)
+    values = numbers_of(table, rows, 1, 6)
+    return imu_stream(name, stamps_ns(table, [row[0] for row in rows], 1), values[:, :3], values[:, 3:])

@@ -1,0 +1,65 @@
+"""KITTI odometry (Geiger et al., 2012): sequences/NN with image_0 to image_3, calib.txt and times.txt; poses/NN.txt."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Trajectory
+from vplog.errors import LogError
+from vplog.geometry import se3
+from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.datasets.folders import below, image_files
+from vplog.logs.datasets.streams import DataSet, camera_streams
+from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.data import Ints
+
+_CAMERAS = ("image_0", "image_1", "image_2", "image_3")
+"""Grey left and right, colour left and right."""
+
+
+_FARTHEST_M, _ROTATED = 1e9, 0.1
+"""m beyond which a number is damage, and the least that some entry of a rotation has: three make a unit row."""
+
+
+def is_root(path: Path) -> bool:
+    return (path / "times.txt").is_file() and any((path / name).is_dir() for name in _CAMERAS)
+
+
+def roots(path: Path) -> list[Path]:
+    """The sequences of a folder of KITTI's, or the folder itself."""
+    return [path] if is_root(path) else [folder for folder in below(path / "sequences") if is_root(folder)]
+
+
+def read(path: Path) -> DataSet:
+    """The body is the grey left camera, whose poses are the truth. Raises LogError."""
+    times = path / "times.txt"
+    stamp_ns = stamps_ns(times, [row[0] for row in rows_of(times, 1)], 10**9)
+    calibration = path / "calib.txt"
+    cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
+    streams = []
+    for name in _CAMERAS:
+        files = image_files(path / name)
+        if rows := [int(file.stem) for file in files if file.stem.isdecimal()]:
+            if max(rows) >= len(stamp_ns):
+                raise LogError(f"{path / name} has an image {max(rows)}, and times.txt {len(stamp_ns)} rows only.")
+            streams += camera_streams(name, stamp_ns[rows], files, cameras.get(name))
+    return DataSet("kitti", streams, _truth(path, stamp_ns))
+
+
+def _truth(path: Path, stamp_ns: Ints) -> Trajectory | None:
+    """poses/NN.txt beside the sequences: rows of world_from_camera (3, 4), one for each image."""
+    file = path.parent.parent / "poses" / f"{path.resolve().name}.txt"
+    if not file.is_file():
+        return None
+    rows = rows_of(file, 12)[: len(stamp_ns)]
+    values = numbers_of(file, rows, 0, 12).reshape(-1, 3, 4)
+    if not (np.abs(values) < _FARTHEST_M).all() or (np.abs(values[:, :, :3]).max((1, 2)) < _ROTATED).any():
+        raise LogError(f"{file} holds a row that is no pose. Copy the data set again.")
+    u, _, v = np.linalg.svd(values[:, :, :3])  # the nearest rotations: they have seven digits
+    return Trajectory(stamp_ns[: len(values)], se3.pose(u @ v, values[:, :, 3]))

@@ -1,0 +1,104 @@
+"""Text tables of data sets: a row a line, columns by commas or blanks, comments behind `#`."""
+
+from __future__ import annotations
+
+import re
+from decimal import Decimal, InvalidOperation
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Trajectory
+from vplog.errors import LogError
+from vplog.geometry import se3
+from vplog.logs.tf_odometry import are_usable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from vplog.data import Floats, Ints
+
+_LINE_LIMIT = 65536
+"""Characters; a line of COLMAP's images.txt has some thousand, and a file without line ends is not read whole."""
+
+
+def lines_of(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines with their numbers, those that are blank or comments left out. Raises LogError."""
+    try:
+        with path.open(encoding="utf-8-sig") as stream:
+            number = 0
+            while line := stream.readline(_LINE_LIMIT):
+                number += 1
+                if "\0" in line:
+                    raise LogError(f"{path}:{number} is not text. Copy the data set again.")
+                if line.strip() and not line.startswith("#"):
+                    yield number, line.strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise LogError(f"Cannot read {path}: {error}. Copy the data set again.") from None
+
+
+def rows_of(path: Path, least: int) -> list[list[str]]:
+    """Rows of at least so many columns; a line of names at the top is left out, and a last line that is cut off. Raises
+    LogError at the first other line that has fewer."""
+    found: list[list[str]] = []
+    short = 0
+    for number, line in lines_of(path):
+        if short:
+            raise LogError(f"{path}:{short} has too few columns; {least} are expected. Copy the data set again.")
+        fields = [field.strip() for field in line.split(",")] if "," in line else line.split()
+        if not found and fields and re.match(r"[A-Za-z]", fields[0]):
+            continue
+        short = 0 if len(fields) >= least else number
+        if not short:
+            found.append(fields)
+    if not found:
+        raise LogError(f"{path} holds no row. Copy the data set again.")
+    return found
+
+
+def stamps_ns(path: Path, texts: list[str], unit_ns: int) -> Ints:
+    """Stamps in units of so many ns, kept to the ns. Raises LogError at the first that is no time."""
+    return np.array([_stamp_ns(path, text, unit_ns) for text in texts], np.int64)
+
+
+def _stamp_ns(path: Path, text: str, unit_ns: int) -> int:
+    try:
+        value = Decimal(text)
+        if value.is_finite() and value.adjusted() < 20 and 0 <= (stamp_ns := int(value * unit_ns)) < 2**63:
+            return stamp_ns
+    except InvalidOperation:
+        pass
+    raise LogError(f"{path}: {text[:40]!r} is no stamp. Copy the data set again.")
+
+
+def numbers_of(path: Path, rows: list[list[str]], first: int, count: int) -> Floats:
+    """(K, count) numbers of columns from `first` on. Raises LogError where one is none."""
+    try:
+        return np.array([row[first : first + count] for row in rows], np.float64).reshape(-1, count)
+    except ValueError as error:
+        raise LogError(f"{path}: {error}. Copy the data set again.") from None
+
+
+def poses_of(path: Path, unit_ns: int, scalar_first: bool = False) -> Trajectory:
+    """`stamp x y z` and a quaternion a line, x y z w or, scalar first, w x y z; rows without a pose are left out.
+    Raises LogError."""
+    rows = rows_of(path, 8)
+    values = numbers_of(path, rows, 1, 7)
+    quaternion = values[:, [4, 5, 6, 3]] if scalar_first else values[:, 3:]
+    usable = are_usable(np.concatenate([values[:, :3], quaternion], axis=1))
+    if not usable.any():
+        raise LogError(f"{path} holds no pose. Copy the data set again.")
+    stamp_ns, first = np.unique(stamps_ns(path, [row[0] for row in rows], unit_ns)[usable], return_index=True)
+    values, quaternion = values[usable][first], quaternion[usable][first]
+    return Trajectory(stamp_ns, se3.pose(se3.rotation(quaternion), values[:, :3]))
+
+
+def listed_images(path: Path, folder: Path, unit_ns: int, columns: tuple[int, int] = (0, 1)) -> tuple[Ints, list[Path]]:
+    """Stamps and files by the columns of a list of images. Raises LogError, also where a path leads elsewhere."""
+    rows = rows_of(path, max(columns) + 1)
+    names = [row[columns[1]] for row in rows]
+    for name in names:
+        if name.startswith("/") or ".." in name.split("/"):
+            raise LogError(f"{path} names {name[:60]}, which is outside {folder}.")
+    return stamps_ns(path, [row[columns[0]] for row in rows], unit_ns), [folder / name for name in names]

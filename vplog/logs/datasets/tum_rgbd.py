@@ -1,0 +1,50 @@
+"""TUM RGB-D (Sturm et al., 2012): rgb.txt and depth.txt with a stamp and a file a line, groundtruth.txt."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.logs.calibrations.camera import CalibratedCamera, pinhole
+from vplog.logs.datasets.streams import DataSet, camera_streams, depth_stream
+from vplog.logs.datasets.tables import listed_images, poses_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_PER_M = 5000.0
+"""Counts of a metre in the depth images (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats)."""
+_CALIBRATIONS = {
+    "1": ((517.3, 516.5), (318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0), (325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2), (320.1, 247.6), ()),
+}
+"""Focal lengths, principal point and lens of the colour cameras freiburg1 to 3 as they are published beside the data
+(file_formats, Intrinsic Camera Calibration of the Kinect); no file of a sequence holds them."""
+_SIZE = (640, 480)
+
+
+def roots(path: Path) -> list[Path]:
+    found = (path / "rgb.txt").is_file() and not (path / "calibration.yaml").is_file()
+    return [path] if found else []
+
+
+def read(path: Path) -> DataSet:
+    """The body is the colour camera, whose poses are the truth. Raises LogError."""
+    streams = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), _calibration(path))
+    if (path / "depth.txt").is_file():
+        streams.append(depth_stream("depth", *listed_images(path / "depth.txt", path, 10**9), _PER_M, "rgb"))
+    truth = path / "groundtruth.txt"
+    return DataSet("tum-rgbd", streams, poses_of(truth, 10**9) if truth.is_file() else None)
+
+
+def _calibration(path: Path) -> CalibratedCamera | None:
+    """That of the camera which the folder or the comments of its lists name."""
+    with (path / "rgb.txt").open("rb") as stream:
+        named = re.search(r"freiburg([123])", f"{path.resolve().name} {stream.read(1000)!r}")
+    if named is None:
+        return None
+    focal, centre, lens = (np.array(values, np.float64) for values in _CALIBRATIONS[named[1]])
+    return CalibratedCamera("rgb", "", pinhole(focal, centre, _SIZE, "plumb_bob", lens), body_from_camera=np.eye(4))

@@ -1,0 +1,57 @@
+"""A folder of images named by their place in UTM, `vplog.geometry.utm_name`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.data import Gps, Trajectory
+from vplog.errors import LogError
+from vplog.geometry import se3
+from vplog.geometry.utm_name import utm_name
+from vplog.logs.datasets.folders import image_files
+from vplog.logs.datasets.streams import DataSet, camera_streams, fix_stream
+from vplog.logs.image_folder import named_stamps, natural_order
+
+if TYPE_CHECKING:
+    from vplog.geometry.utm_name import UtmName
+
+_UNORDERED = (
+    "The names hold no time: the images are taken in the order of their panoramas and tiles, 0.1 s apart, which need "
+    "not be that of a drive."
+)
+
+
+def roots(path: Path) -> list[Path]:
+    first = next((file.name for file in path.iterdir() if file.suffix), "") if path.is_dir() else ""
+    return [path] if first.startswith("@") and utm_name(first) else []
+
+
+def read(path: Path) -> DataSet:
+    """The truth is positions in UTM, without orientations. Raises LogError where a name has no place."""
+    found = {file: utm_name(file.name) for file in image_files(path)}
+    named = {file: place for file, place in found.items() if place is not None}
+    if bad := sorted(found.keys() - named):
+        raise LogError(f"{bad[0]} is not named @utm_east@utm_north@... as the others are. Move it elsewhere.")
+    files = sorted(named, key=lambda file: _order(file, named[file]))
+    places = [named[file] for file in files]
+    stamp_ns, timed = named_stamps([Path(place.time or "-") for place in places])
+    if timed and len(np.unique(stamp_ns)) < len(stamp_ns):
+        stamp_ns, timed = named_stamps([Path("-")] * len(files))
+    streams = camera_streams("images", stamp_ns, files, None)
+    position = np.array([[place.east, place.north, place.height_m] for place in places])
+    position[~np.isfinite(position)] = 0.0
+    latitude_deg, longitude_deg = np.array([[place.latitude_deg, place.longitude_deg] for place in places]).T
+    if np.isfinite(latitude_deg + longitude_deg).all():
+        unknown = np.full((len(files), 3, 3), np.nan)
+        streams.append(fix_stream("position", Gps(stamp_ns, latitude_deg, longitude_deg, position[:, 2], unknown)))
+    truth = Trajectory(stamp_ns, se3.pose(np.eye(3), position))
+    names = {time_ns: file.name for time_ns, file in zip(stamp_ns.tolist(), files, strict=True)}
+    return DataSet("utm-images", streams, truth, [] if timed else [_UNORDERED], names)
+
+
+def _order(file: Path, place: UtmName) -> tuple:
+    columns = (place.time, place.panorama, place.tile)
+    return tuple(natural_order(column or "0") for column in columns), natural_order(file.name)

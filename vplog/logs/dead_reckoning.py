@@ -1,0 +1,188 @@
+"""Odometry of sensors that measure no pose: velocities added up, turned by a gyroscope, and positions of fixes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import solveh_banded
+from scipy.sparse import diags_array
+
+from vplog.data import RECEIVER_SIGMA_M, Odometry
+from vplog.geometry import se3
+from vplog.geometry.geodesy import local_enu
+
+if TYPE_CHECKING:
+    from vplog.data import Bools, Floats, Gps, Ints
+
+_LONGEST_S = 1.0
+"""s; over a longer gap the last velocity is not held, as of a recorder that was paused."""
+_STANDING_M_S, _STANDING_RAD_S = 0.01, 0.02
+"""m/s and rad/s; below both a vehicle stands: wheels resolve some mm/s, and a gyroscope's bias is below a degree/s."""
+_LEAST_STANDING_S = 1.0
+"""s of standing in all, from which the mean of a gyroscope is its bias rather than its noise."""
+_LEAST_FIXES = 5
+"""Fixes that a smoothing spline is found for."""
+_LEAST_WAY = 6.0
+"""Sigmas that the fixes extend over at least: noise at rest does not."""
+_PERIOD_NS = 100_000_000
+"""ns; between fixes the odometry has samples as often, so that bends are not cut."""
+_GAP_PERIODS = 3.0
+"""Times the median period between fixes, beyond which what happened there is not known."""
+_SLOW = 0.1
+"""Share of the drive's own speed (its 90 % quantile) below which a direction of motion is noise."""
+_WINDOWS = (0.5, 300.0, 24)
+"""Smoothing windows that are tried, in periods between fixes, and how many: hardly any, and as far as numbers reach."""
+_PROBES = 16
+"""Random signs by which the trace of the smoother is estimated (Hutchinson 1990): to a few percent of it."""
+_LEVEL_RAD = 0.1
+"""rad; sigma of roll and pitch, which positions leave unknown: roads are steep to 10 %."""
+
+
+def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats) -> Odometry:
+    """Velocities (T, 6), linear (m/s) then angular (rad/s) in the body's axes, added up by trapezoids.
+
+    `variances` (T, 6) of these, NaN or zero where unknown, become those of the increments.
+    """
+    seconds = np.diff(stamp_ns) / 1e9
+    held = np.where(seconds <= _LONGEST_S, seconds, 0.0)[:, None]
+    moved = (twists[1:] + twists[:-1]) / 2 * held
+    step = se3.exp(moved[:, [3, 4, 5, 0, 1, 2]])
+    poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
+    for row, one in enumerate(step, 1):
+        np.matmul(poses[row - 1], one, out=poses[row])
+    poses[:, :3, :3] = se3.rotation(se3.quaternion(poses[:, :3, :3]))  # rounding adds up over a long drive
+    known = np.isfinite(variances).all(1) & (variances >= 0).all(1) & (variances > 0).any(1)
+    if not known.all():
+        return Odometry(stamp_ns, poses, None)
+    covariance = np.zeros((len(stamp_ns), 6, 6))
+    covariance[1:, range(6), range(6)] = variances[1:, [3, 4, 5, 0, 1, 2]] * held**2
+    covariance[0] = covariance[1] if len(covariance) > 1 else 0.0
+    return Odometry(stamp_ns, poses, covariance)
+
+
+class Turned(NamedTuple):
+    """Velocities at the samples of a gyroscope."""
+
+    stamp_ns: Ints
+    """(K,)"""
+    twists: Floats
+    """(K, 6) linear, then angular."""
+    bias: float | None
+    """rad/s that the gyroscope is off at rest; None where the body never stands for long, and it is left in."""
+
+
+def turned_by_gyro(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats, body_from_imu: Floats) -> Turned:
+    """Velocities (T, 6) at the samples of a gyroscope, whose rates (K, 3) rad/s replace the angular ones: a wheel's
+    scale and slip no longer turn the drive."""
+    inside = (gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1])
+    at_ns, rates = gyro_ns[inside], gyro[inside] @ body_from_imu[:3, :3].T
+    since = stamp_ns[0]
+    linear = np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in twists[:, :3].T], axis=1)
+    turning = np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in twists[:, 3:].T], axis=1)
+    standing = _standing(linear, turning)
+    seconds = float(np.diff(at_ns)[standing[1:]].sum()) / 1e9 if len(at_ns) > 1 else 0.0
+    bias = np.median(rates[standing], axis=0) if seconds >= _LEAST_STANDING_S else np.zeros(3)
+    size = float(np.linalg.norm(bias)) if seconds >= _LEAST_STANDING_S else None
+    return Turned(at_ns, np.concatenate([linear, rates - bias], axis=1), size)
+
+
+def _standing(linear: Floats, turning: Floats) -> Bools:
+    """(K,) whether the wheels stand."""
+    slow = (np.linalg.norm(linear, axis=1) < _STANDING_M_S) & (np.linalg.norm(turning, axis=1) < _STANDING_RAD_S)
+    return np.asarray(slow)
+
+
+def odometry_of_fixes(gps: Gps) -> Odometry | None:
+    """The fixes as poses, x ahead and z up; None where they do not go far enough for a heading.
+
+    Positions are smoothed, headings the directions of their motion, level. The covariance is that of an increment.
+    """
+    local = local_enu(gps)
+    variance = local.covariance[:, range(3), range(3)]
+    known = np.isfinite(variance) & (variance > 0)
+    variance = np.where(known, variance, np.array([1.0, 1.0, 4.0]) * RECEIVER_SIGMA_M**2)
+    if len(local) < _LEAST_FIXES or np.hypot(*np.ptp(local.enu_m[:, :2], axis=0)) < _LEAST_WAY * _sigma(variance):
+        return None
+    fixed_s, at_ns = (local.stamp_ns - local.stamp_ns[0]) / 1e9, _between(local.stamp_ns)
+    at_s = (at_ns - local.stamp_ns[0]) / 1e9
+    level, height = (_smoothed(fixed_s, local.enu_m[:, axes], variance[:, axes]) for axes in ([0, 1], [2]))
+    curve = CubicSpline(fixed_s, np.concatenate([level.places, height.places], axis=1))
+    places, velocity = curve(at_s), curve(at_s, 1)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    slow = _SLOW * float(np.quantile(speed, 0.9))
+    moving = speed > slow
+    yaw = np.interp(at_s, at_s[moving], np.unwrap(np.arctan2(velocity[moving, 1], velocity[moving, 0])))
+    poses = se3.pose(se3.so3_exp(yaw[:, None] * np.array([0.0, 0.0, 1.0])), places)
+    rates = _rates([level, height], float(fixed_s[-1]), np.maximum(speed, slow))
+    each = rates * np.gradient(at_s)[:, None]
+    return Odometry(at_ns, poses, each[:, :, None] * np.eye(6), drifts=False)
+
+
+def _sigma(variance: Floats) -> float:
+    """m, horizontal, of the usual fix."""
+    return float(np.sqrt(np.median(variance[:, :2])))
+
+
+def _between(stamp_ns: Ints) -> Ints:
+    """The stamps of fixes, and others between those that are no gap apart."""
+    steps = np.diff(stamp_ns)
+    parts = np.where(steps <= _GAP_PERIODS * np.median(steps), np.ceil(steps / _PERIOD_NS), 1).astype(np.int64)
+    each = np.repeat(np.arange(len(steps)), parts)
+    number = np.arange(len(each)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(stamp_ns[each] + number * steps[each] // parts[each], stamp_ns[-1])
+
+
+class _Smooth(NamedTuple):
+    """Smoothed fixes."""
+
+    places: Floats
+    """(T, A) m."""
+    variance: float
+    """m^2 of a fix, by what the fixes are off these."""
+    parameters: float
+    """Effective degrees of freedom, the trace of the smoother."""
+
+
+def _smoothed(at_s: Floats, places: Floats, variance: Floats) -> _Smooth:
+    """The (T, A) places that balance distance to the fixes and acceleration (Whittaker 1923; Eilers 2003), by the
+    window of least generalised cross-validation (Craven and Wahba 1979)."""
+    count, steps = len(at_s), np.diff(at_s)
+    weight, period = 1.0 / variance.mean(1), float(np.median(steps))
+    middle = (steps[1:] + steps[:-1]) / 2
+    bend = diags_array(
+        [1 / (steps[:-1] * middle), -(1 / steps[:-1] + 1 / steps[1:]) / middle, 1 / (steps[1:] * middle)],
+        offsets=[0, 1, 2], shape=(count - 2, count),  # pyright: ignore[reportArgumentType]
+    )  # fmt: skip
+    energy = (bend.T @ diags_array(middle) @ bend).tocsr()
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, _PROBES))
+    found: list[tuple[float, _Smooth]] = []
+    for window_s in period * np.geomspace(*_WINDOWS):
+        bands = float(np.median(weight)) * window_s**4 / period * np.stack(
+            [np.append(energy.diagonal(k), np.zeros(k)) for k in range(3)]
+        )  # fmt: skip
+        bands[0] += weight
+        solved = solveh_banded(bands, weight[:, None] * np.concatenate([places, signs], axis=1), lower=True)
+        trace = float((signs * solved[:, places.shape[1] :]).sum()) / _PROBES
+        free = max(count - trace, 1e-9)
+        smooth = solved[:, : places.shape[1]]
+        chi2 = float((weight[:, None] * (smooth - places) ** 2).mean(1).sum())
+        own = chi2 / free * float(np.median(variance.mean(1)))
+        found.append((count * chi2 / free**2, _Smooth(smooth, own, max(trace, 2.0))))
+    return min(found, key=lambda one: one[0])[1]
+
+
+def _rates(axes: list[_Smooth], seconds: float, speed: Floats) -> Floats:
+    """(K, 6) variances that a second of motion adds, rotation first, where the body has (K,) this speed in m/s.
+
+    A smoother of p parameters leaves p/T of the variance of T fixes, in errors that last for a p-th of the drive: in
+    less time they grow at most as a random walk that reaches twice that variance by then, and so do the direction's.
+    """
+    noise = [one.variance * one.parameters / len(one.places) for one in axes]
+    lasting_s = [seconds / one.parameters for one in axes]
+    yaw = 2 * noise[0] / (speed * lasting_s[0]) ** 2 / lasting_s[0]
+    moved = [2 * noise[i] / lasting_s[i] for i in (0, 0, 1)]
+    still = np.tile([2 * _LEVEL_RAD**2 / lasting_s[0], 2 * _LEVEL_RAD**2 / lasting_s[0], 0.0, *moved], (len(speed), 1))
+    still[:, 2] = yaw
+    return still

@@ -1,0 +1,245 @@
+"""The pose of a picture in a map: verified against the places most like it one by one, then fitted to all landmarks
+that agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vplog.data import Verdict
+from vplog.features.matching import match_features
+from vplog.geometry import se3
+from vplog.loops import pose_refinement, undistort, verify_metric
+from vplog.loops.calibration import motion_covariance
+from vplog.loops.landmarks import Landmarks, inverse_depth
+from vplog.loops.verify_metric import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vplog.data import Camera, Features, Floats, Ints
+    from vplog.loops.verify import VerifySettings
+
+_CHI2_2 = 9.210
+"""Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
+_RIVAL_SIGMA = 3.0
+"""Standard deviations, of a count of matches, by which a pose must have more inliers than another one elsewhere."""
+_PROGRESS = (
+    Verdict.NO_CALIBRATION, Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.DEGENERATE_MOTION,
+    Verdict.TOO_FEW_INLIERS, Verdict.POOR_SPREAD, Verdict.IMPLAUSIBLE_POSE, Verdict.TOO_FAR, Verdict.INCONSISTENT,
+    Verdict.ACCEPTED,
+)  # fmt: skip
+"""Verdicts by how far a picture came."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeLandmarks:
+    """The landmarks of one keyframe of a map."""
+
+    world_from_camera: Floats
+    """(4, 4)."""
+    features: Features
+    """(L,) their descriptors, and where they are in the keyframe's image."""
+    landmarks: Landmarks
+    """(L,) in the keyframe's camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """The verdict on a picture, and its pose in the map where that is `accepted`."""
+
+    verdict: Verdict
+    place: int
+    """Row of the place that explains it best; -1 where it was compared with none."""
+    matches: int
+    """Feature matches with that place."""
+    inliers: int
+    """Features that agree with the pose."""
+    places: int = 0
+    """Places that they are of."""
+    world_from_camera: Floats | None = None
+    """(4, 4)."""
+    covariance: Floats | None = None
+    """(6, 6) rotation first, in the picture's camera; relative to the map, whose own error is not in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A picture verified against one place."""
+
+    place: int
+    mine: Ints
+    """(K,) features of the picture that match a landmark."""
+    rows: Ints
+    """(K,) those landmarks."""
+    pose: Pose
+    world_from_camera: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Query:
+    """A picture's features with their rays."""
+
+    features: Features
+    rays: Floats
+    camera: Camera
+    settings: VerifySettings
+
+    def solve(self, landmarks: Landmarks, rows: Ints, mine: Ints, start: Floats | None = None) -> Pose:
+        """The pose by landmarks `rows` (K,) that features `mine` (K,) match. A place's width limits closures, whose
+        errors grow with the distance; a picture has what is nearest, and its covariance."""
+        own, settings = self.features.rows(mine), self.settings
+        rho = inverse_depth(own.depth_m.astype(np.float64), settings.landmarks)
+        metric = settings.metric.model_copy(update={"max_distance_m": np.inf})
+        share = own.points / [own.width, own.height]
+        return verify_metric.solve(
+            landmarks, rows, self.rays[mine], rho, share, self.camera, settings.landmarks, metric, start
+        )
+
+
+def landmarks_from(features: Features, sigma: Floats, camera: Camera, pixel_sigma: float, measured: bool) -> Landmarks:
+    """The landmarks of a keyframe's features (L,), all with depths, whose inverses have standard deviations `sigma`
+    (L,) in 1/m; `measured` by a sensor, or by odometry's metres."""
+    rays, rho = undistort.rays(camera, features.points), 1.0 / features.depth_m.astype(np.float64)
+    covariance = np.zeros((len(rays), 3, 3))
+    covariance[:, :2, :2] = undistort.noise_of_rays(camera, rays, pixel_sigma)
+    covariance[:, 2, 2] = sigma**2
+    known = np.isfinite(rays).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (rho > 0) & (sigma > 0)
+    return Landmarks(rho, rays, covariance, known, len(rho), measured)
+
+
+def localize(
+    features: Features, camera: Camera, places: Sequence[KeyframeLandmarks], settings: VerifySettings
+) -> Localization:
+    """The pose of a picture by its features (M,) and the places that it may be of, likeliest first.
+
+    Each place is verified by itself; the pose with most inliers starts a fit to the landmarks of all places that agree
+    with it. Where another pose elsewhere has as many, the picture is at neither.
+    """
+    if camera.matrix is None:
+        return Localization(Verdict.NO_CALIBRATION, -1, 0, 0)
+    if not places:
+        return Localization(Verdict.TOO_FEW_MATCHES, -1, 0, 0)
+    query = _Query(features, undistort.rays(camera, features.points), camera, settings)
+    fits = _verified(query, places)
+    best = max(fits, key=lambda fit: (_PROGRESS.index(fit.pose.verdict), fit.pose.inliers, len(fit.mine)))
+    found = Localization(best.pose.verdict, best.place, len(best.mine), best.pose.inliers)
+    if best.world_from_camera is None:
+        return found
+    if any(_is_rival(fit, best, places, settings) for fit in fits):
+        return replace(found, verdict=Verdict.INCONSISTENT)
+    return _refined(query, fits, best, places)
+
+
+def _verified(query: _Query, places: Sequence[KeyframeLandmarks]) -> list[_Fit]:
+    """The picture against each place, most matches first. A pose that one gives is tried on the next before any is
+    sampled: places around a picture agree, and one elsewhere does not."""
+    matched = [_matched(query, place) for place in places]
+    fits, world_from_camera = list[_Fit](), None
+    for number in sorted(range(len(places)), key=lambda number: -len(matched[number][0])):
+        fits.append(_fitted(query, number, places[number], matched[number], world_from_camera))
+        if world_from_camera is None:
+            world_from_camera = fits[-1].world_from_camera
+    return sorted(fits, key=lambda fit: fit.place)
+
+
+def _matched(query: _Query, place: KeyframeLandmarks) -> tuple[Ints, Ints]:
+    """Features of the picture (K,) and landmarks of the place (K,) that match."""
+    mine, rows = match_features(query.features, place.features, query.settings.matching)
+    usable = np.isfinite(query.rays[mine]).all(axis=1) & place.landmarks.known[rows]
+    return mine[usable], rows[usable]
+
+
+def _fitted(
+    query: _Query, number: int, place: KeyframeLandmarks, matched: tuple[Ints, Ints], start: Floats | None
+) -> _Fit:
+    """The picture's pose by its matches with one place; `start` is world_from_camera (4, 4) to try first."""
+    mine, rows = matched
+    if len(mine) < query.settings.metric.min_inliers:
+        few = Verdict.TOO_FEW_MATCHES if place.landmarks.known.any() else Verdict.TOO_FEW_LANDMARKS
+        return _Fit(number, mine, rows, Pose(few, 0, 0.0))
+    start = None if start is None else se3.between(place.world_from_camera, start)
+    pose = query.solve(place.landmarks, rows, mine, start)
+    found = pose.match_from_query
+    return _Fit(number, mine, rows, pose, None if found is None else place.world_from_camera @ found)
+
+
+def _is_rival(fit: _Fit, best: _Fit, places: Sequence[KeyframeLandmarks], settings: VerifySettings) -> bool:
+    """Whether a pose elsewhere has as many inliers as the best, but for the noise of their count.
+
+    Elsewhere is further off than views of one place can be: in a map that still errs, places around a picture give
+    poses that differ by as much as the map does.
+    """
+    if fit.world_from_camera is None or best.world_from_camera is None:
+        return False
+    apart = np.linalg.norm(fit.world_from_camera[:3, 3] - best.world_from_camera[:3, 3])
+    if apart < settings.metric.max_distance_m:
+        return False
+    return fit.pose.inliers > best.pose.inliers - _RIVAL_SIGMA * np.sqrt(best.pose.inliers)
+
+
+def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[KeyframeLandmarks]) -> Localization:
+    """The best fit, improved by the landmarks of all places that agree with it."""
+    start, anchor = best.pose.match_from_query, places[best.place].world_from_camera
+    if start is None or best.pose.covariance is None:
+        raise ValueError("only a pose is refined")
+    agreeing = [_agreeing(query, fit, places[fit.place], anchor, start) for fit in fits if len(fit.mine)]
+    points, covariance, mine = (np.concatenate([getattr(one, name) for one in agreeing]) for name in _Agreeing._fields)
+    # a feature counts once, by the landmark whose depth is surest: its pixel has one error, however many match it
+    order = np.lexsort((covariance[:, 2, 2] / points[:, 2] ** 2, mine))
+    chosen = order[np.unique(mine[order], return_index=True)[1]]
+    merged = Landmarks(
+        points[chosen, 2], points[chosen, :2], covariance[chosen], np.ones(len(chosen), bool), len(chosen),
+        places[best.place].landmarks.from_depth,
+    )  # fmt: skip
+    pose, used = query.solve(merged, np.arange(len(chosen)), mine[chosen], start), sum(map(_counts, agreeing))
+    if pose.match_from_query is None or pose.covariance is None or pose.inliers < best.pose.inliers:
+        pose, used = best.pose, 1  # other places drew it away
+    found, own = pose.match_from_query, pose.covariance
+    if found is None or own is None:
+        raise ValueError("only a pose is refined")
+    own = own + motion_covariance(found, query.settings.calibration.least_share)
+    return Localization(Verdict.ACCEPTED, best.place, len(best.mine), pose.inliers, used, anchor @ found, own)
+
+
+class _Agreeing(NamedTuple):
+    """Landmarks of one place that agree with a pose."""
+
+    points: Floats
+    """(A, 3) in the camera of the best place."""
+    covariance: Floats
+    mine: Ints
+    """(A,) the picture's features that match them."""
+
+
+def _counts(agreeing: _Agreeing) -> bool:
+    return len(agreeing.mine) > 0
+
+
+def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats, pose: Floats) -> _Agreeing:
+    """The landmarks of a place that agree with a pose in the camera `anchor` (4, 4)."""
+    rays = query.rays[fit.mine]
+    points, covariance = _moved(se3.between(anchor, place.world_from_camera), place.landmarks, fit.rows)
+    by_pixel = undistort.noise_of_rays(query.camera, rays, query.settings.landmarks.pixel_sigma)
+    squared, _ = pose_refinement.agreement(pose, points, covariance, rays, by_pixel)
+    agrees = squared < _CHI2_2
+    return _Agreeing(points[agrees], covariance[agrees], fit.mine[agrees])
+
+
+def _moved(b_from_a: Floats, landmarks: Landmarks, rows: Ints) -> tuple[Floats, Floats]:
+    """Landmarks `rows` (K,) of camera a as triples (K, 3) of camera b, and their covariance (K, 3, 3)."""
+    rays, rho = landmarks.rays[rows], landmarks.rho[rows]
+    bearing = np.column_stack([rays, np.ones(len(rays))])
+    rotation, shift = b_from_a[:3, :3], b_from_a[:3, 3]
+    moved = bearing @ rotation.T + rho[:, None] * shift
+    depth = np.where(moved[:, 2] > 0, moved[:, 2], np.nan)[:, None]  # behind it: no triple, and it agrees with no pose
+    points = np.column_stack([moved[:, :2], rho]) / depth
+    by_moved = np.zeros((len(rays), 3, 3))
+    by_moved[:, 0, 0] = by_moved[:, 1, 1] = 1.0 / depth[:, 0]
+    by_moved[:, :, 2] = -points / depth
+    by_triple = np.column_stack([rotation[:, 0], rotation[:, 1], shift])
+    J = by_moved @ by_triple
+    J[:, 2, 2] += 1.0 / depth[:, 0]
+    return points, J @ landmarks.covariance[rows] @ np.swapaxes(J, 1, 2)

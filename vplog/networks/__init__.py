@@ -1,0 +1,1 @@
+"""Neural networks that users bring: their files, and the pixels that go into them."""

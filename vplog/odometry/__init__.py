@@ -1,0 +1,1 @@
+"""Odometry by images: corners tracked from frame to frame, poses and landmarks adjusted together."""

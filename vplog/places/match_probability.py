@@ -1,0 +1,84 @@
+"""How probable it is that a query's best row is its place, learned on the queries' own scores without a truth.
+
+Two groups (Efron, Large-Scale Inference, 2010, chapter 5): queries that are somewhere in the map, and queries that are
+nowhere, whose best row is the best of rows that only look alike. What such rows reach each query shows by its second
+and third best place. Scores with an exponential tail have independent spacings, that of rank i is 1/i of the first in
+the mean (Renyi, On the theory of order statistics, 1953): twice the second spacing above the second place is a draw of
+what the best of look-alike rows would be. Of queries that have a place the second best is itself the best of these, so
+the more queries have one, the more cautious the probabilities are.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import isotonic_regression
+
+if TYPE_CHECKING:
+    from vplog.data import Float32s, Floats, Ints
+
+_LEAST = 20
+"""Queries, at least, from which rates can be learned: one more or less then changes them by 5 %."""
+_SAMPLED = 200
+"""Queries from which the extent of a place is measured."""
+
+
+def match_probabilities(scores: Float32s, stops: Ints) -> Floats | None:
+    """(Q,) probability that the best row shows the query's place, by (Q, M) scores of the rows below each stop (Q,).
+
+    NaN without two more places to compare with; None where too few queries have these.
+    """
+    extent = place_extent(scores)
+    best = np.array([best_places(scores[q, : stops[q]], extent) for q in range(len(scores))]).reshape(-1, 3)
+    known = np.flatnonzero(np.isfinite(best).all(axis=1))
+    if len(known) < _LEAST:
+        return None
+    first, second, third = best[known].T
+    found = np.full(len(scores), np.nan)
+    found[known] = 1.0 - null_probabilities(first, second + 2.0 * (second - third))
+    return found
+
+
+def place_extent(scores: Float32s) -> int:
+    """Rows from the best one within which others may show its place: twice the distance at which the correlation of
+    scores along the map falls below 1/e, since two views share something as far as the reach of both."""
+    some = np.unique(np.linspace(0, len(scores) - 1, min(_SAMPLED, len(scores))).astype(int))
+    rows = np.asarray(scores[some], np.float64)
+    finite = np.isfinite(rows)
+    total = np.where(finite, rows, 0.0)
+    centred = np.where(finite, rows - total.sum(1, keepdims=True) / np.maximum(finite.sum(1, keepdims=True), 1), 0.0)
+    power = np.square(centred).sum()
+    most = max(scores.shape[1] // 8, 1)
+    return 2 * next((d for d in range(1, most) if (centred[:, d:] * centred[:, :-d]).sum() < power / np.e), most)
+
+
+def best_places(row: Float32s, extent: int) -> Floats:
+    """(3,) best scores that are more than `extent` rows from each other; NaN where there are no more."""
+    score, found = np.where(np.isfinite(row), row, -np.inf), np.full(3, np.nan, np.float64)
+    for place in range(3 if len(score) else 0):
+        at = int(score.argmax())
+        if score[at] == -np.inf:
+            break
+        found[place] = score[at]
+        score[max(at - extent, 0) : at + extent + 1] = -np.inf
+    return found
+
+
+def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
+    """(N,) share of the null sample (K,) that does as well, itself counted (Vovk et al. 2005, section 2.2)."""
+    higher = len(null) - np.searchsorted(np.sort(null), found, "left")
+    return np.asarray((1.0 + higher) / (1.0 + len(null)), np.float64)
+
+
+def null_probabilities(found: Floats, null: Floats) -> Floats:
+    """(N,) local false discovery rate by a null sample (K,), falling with the score: the ratio of densities by isotonic
+    regression on both samples, the share of nulls by Storey 2002, eq. 6, at one half."""
+    share = min(1.0, (1.0 + (conformal_p(found, null) > 0.5).sum()) / (0.5 * len(found)))
+    null = np.append(null, np.inf)  # one more above all: no score is certain for free
+    pool, of_null = np.concatenate([found, null]), np.repeat([0.0, 1.0], [len(found), len(null)])
+    order = np.lexsort((of_null, pool))
+    fitted = np.empty(len(pool))
+    fitted[order] = isotonic_regression(of_null[order], increasing=False).x
+    odds = fitted[: len(found)] / np.maximum(1.0 - fitted[: len(found)], 1e-9)
+    return np.minimum(1.0, share * odds * len(found) / len(null))

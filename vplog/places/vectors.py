@@ -1,0 +1,228 @@
+"""Places as vectors that were computed elsewhere: one a frame, in .npy or Parquet files.
+
+A pair of .npy files, `queries_descriptors.npy` and `database_descriptors.npy`, is what VPR-methods-evaluation writes
+(github.com/gmberton/VPR-methods-evaluation): its rows are in the order of the images' paths as text.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from pydantic import model_validator
+
+from vplog.errors import LibraryError
+from vplog.places.dense import VectorIndex, VectorState, nearness, products
+from vplog.places.library_files import RelearnedSettings, keep_references, references_hash
+from vplog.places.network_vector import MAX_DIMENSIONS
+from vplog.storage.parquet_limits import open_table, read_table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from vplog.data import Features, Float32s, Ints, Reference
+    from vplog.execution.execution import Execution
+    from vplog.stages import Log
+
+_QUERIES, _DATABASE = "queries_descriptors.npy", "database_descriptors.npy"
+_COLUMNS = "stamp_ns (int64), vector (a list of floats), and drive (text) where it is of several drives"
+
+
+class VectorsSettings(RelearnedSettings):
+    """Vectors from files. It learns nothing: the references only go into the library."""
+
+    LOCATIONS: ClassVar = frozenset({"file"})
+
+    kind: Literal["vectors"] = "vectors"
+    """Name of the recogniser."""
+    file: str = ""
+    """A .npy file of (F, D) vectors; one of a pair `queries_descriptors.npy`, `database_descriptors.npy`, or their
+    folder; or a .parquet file with stamp_ns, vector and, of several drives, drive."""
+    model: str = ""
+    """Name of what made the vectors: drives whose vectors lie in files of their own compare where it is the same.
+    Empty: those of one file alone compare."""
+    metric: Literal["cosine", "l2"] = "cosine"
+    """Vectors are brought to unit length and compared by their product, or as they are by their distance."""
+    order: Literal["names", "frames"] = "names"
+    """Rows of a .npy file: by the paths of the images as text, 10.jpg before 2.jpg, where the log is a folder of
+    images; or the frames as vplog counts them."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _absolute(cls, tree: Any) -> Any:
+        named = isinstance(tree, dict) and isinstance(tree.get("file"), str) and tree["file"]
+        return {**tree, "file": str(Path(tree["file"]).absolute())} if named else tree
+
+    def learn(self, references: Iterable[Reference], execution: Execution) -> VectorsState:
+        """Nothing to learn. Raises LibraryError where there is no reference, or no file of vectors."""
+        files = VectorFiles(_files(self.file))
+        value = pa.float16() if self.metric == "cosine" else pa.float32()
+        return VectorsState(self, keep_references(references), files, pa.list_(value, files.dimensions))
+
+
+@dataclass(frozen=True, eq=False)
+class VectorsState(VectorState):
+    """The files. Shared freely between threads."""
+
+    settings: VectorsSettings
+    references: list[Reference]
+    files: VectorFiles
+    arrow_type: pa.FixedSizeListType
+
+    @cached_property
+    def _hash(self) -> str:
+        content = self.settings.model or self.files.sha256
+        about = f"{references_hash(self.references, self.settings)} {content} {self.files.dimensions}"
+        return hashlib.sha256(about.encode()).hexdigest()
+
+    @property
+    def token(self) -> str:
+        """Stands for all that descriptors depend on, the files of a named model among it."""
+        return f"{self.hash} {self.files.sha256}"
+
+    def stored(self, log: Log, stamp_ns: Ints, query: bool | None) -> list[NDArray[Any]]:
+        """(D,) of each frame. Raises LibraryError where they are not those of this log."""
+        vectors = self.files.of(log, stamp_ns, query, self.settings.order)
+        if not np.isfinite(vectors).all():
+            raise LibraryError(f"{self.settings.file} has values that are not finite for frames of {log.name}.")
+        if self.settings.metric == "cosine":
+            vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.float32(1e-9))
+        return list(vectors.astype(self.arrow_type.value_type.to_pandas_dtype()))
+
+    def describe(self, features: Features) -> NDArray[Any]:
+        """Raises LibraryError: features have no vector."""
+        raise LibraryError("Vectors from a file belong to frames of a log, and only features are here. Give the log.")
+
+    def index(self, descriptors: Sequence[NDArray[Any]]) -> VectorIndex:
+        similarity = products if self.settings.metric == "cosine" else nearness
+        return VectorIndex(self.matrix(descriptors, np.float32), similarity)
+
+
+class VectorFiles:
+    """One file of vectors, or a pair: that of queries, then that of the map."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        """Raises LibraryError where they hold no vectors, or of several lengths."""
+        self._paths = paths
+        self._tables = [_Rows(path) if path.suffix == ".npy" else _Stamped(path) for path in paths]
+        lengths = {table.dimensions for table in self._tables}
+        if len(lengths) > 1:
+            raise LibraryError(f"{paths[0]} and {paths[1].name} have vectors of {sorted(lengths)} values: no pair.")
+        self.dimensions: int = lengths.pop()
+
+    @cached_property
+    def sha256(self) -> str:
+        """Over the content of the files."""
+        digest = hashlib.sha256()
+        for path in self._paths:
+            with path.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "sha256").digest())
+        return digest.hexdigest()
+
+    def of(self, log: Log, stamp_ns: Ints, query: bool | None, order: str) -> Float32s:
+        """(N, D) vectors of frames of a log. Raises LibraryError where they may be another drive's."""
+        names_drives = isinstance(self._tables[0], _Stamped) and self._tables[0].names_drives
+        if query is not False and not names_drives and (query is None or len(self._tables) == 1):
+            raise LibraryError(
+                f"{self._paths[0]} does not say which of several drives its vectors are of. Give a pair {_QUERIES}, "
+                f"{_DATABASE}, or a Parquet file with {_COLUMNS}."
+            )
+        return self._tables[0 if query else -1].of(log, stamp_ns, order)
+
+
+class _Rows:
+    """The vectors of a .npy file, by the number of the frame."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._vectors = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            why = str(error).splitlines()[0][:200]
+            raise LibraryError(f"{path} is not a .npy file of numbers: {why}. Write it with numpy.save.") from None
+        shape, kind = self._vectors.shape, self._vectors.dtype.kind
+        if len(shape) != 2 or not 1 <= shape[1] <= MAX_DIMENSIONS or kind != "f":
+            raise LibraryError(
+                f"{path} has an array of {' x '.join(map(str, shape))} {self._vectors.dtype}; vectors are one row a "
+                f"frame, of at most {MAX_DIMENSIONS} floats."
+            )
+        self.dimensions: int = shape[1]
+
+    def of(self, log: Log, stamp_ns: Ints, order: str) -> Float32s:
+        stamps = log.stamps()
+        if len(stamps) != len(self._vectors):
+            raise LibraryError(
+                f"{self._path} has {len(self._vectors)} vectors, and {log.name} has {len(stamps)} frames. Give a row "
+                "for each, or a Parquet file with the stamps of those there are."
+            )
+        frames = np.searchsorted(stamps, stamp_ns)
+        names = log.file_names()
+        if order == "names" and names is not None:
+            place = np.empty(len(stamps), np.int64)
+            place[sorted(range(len(stamps)), key=names.__getitem__)] = np.arange(len(stamps))
+            frames = place[frames]
+        return np.asarray(self._vectors[frames], np.float32)
+
+
+class _Stamped:
+    """The vectors of a Parquet file, by stamp."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with open_table(path) as file:
+                names = [name for name in ("stamp_ns", "vector", "drive") if name in file.schema_arrow.names]
+                table = read_table(path, file, names)
+            self._stamp_ns = table["stamp_ns"].cast(pa.int64()).to_numpy()
+            vectors = table["vector"].combine_chunks()
+            lengths = np.unique(pc.call_function("list_value_length", [vectors]).to_numpy(zero_copy_only=False))
+            self._drives = np.array(table["drive"].to_pylist()) if "drive" in names else None
+            values = vectors.flatten().cast(pa.float32())
+        except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+            why = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+            raise LibraryError(f"{path} is not a table of vectors: {why}. Its columns are {_COLUMNS}.") from None
+        if len(lengths) != 1 or not 1 <= lengths[0] <= MAX_DIMENSIONS or vectors.null_count + values.null_count:
+            raise LibraryError(f"{path} has vectors of different or no lengths. Its columns are {_COLUMNS}.")
+        self.dimensions, self.names_drives = int(lengths[0]), self._drives is not None
+        self._vectors = values.to_numpy(zero_copy_only=False).reshape(-1, self.dimensions)
+
+    def of(self, log: Log, stamp_ns: Ints, order: str) -> Float32s:
+        rows = np.arange(len(self._stamp_ns)) if self._drives is None else np.flatnonzero(self._drives == log.name)
+        rows = rows[np.argsort(self._stamp_ns[rows], kind="stable")]
+        known = self._stamp_ns[rows]
+        if (np.diff(known) == 0).any():
+            raise LibraryError(f"{self._path} has two vectors of one stamp for {log.name}. Its columns are {_COLUMNS}.")
+        at = np.minimum(np.searchsorted(known, stamp_ns), max(len(known) - 1, 0))
+        found = known[at] == stamp_ns if len(known) else np.zeros(len(stamp_ns), bool)
+        if not found.all():
+            missing = np.flatnonzero(~found)
+            raise LibraryError(
+                f"{self._path} lacks {len(missing)} of {len(stamp_ns)} frames of {log.name}, the first at stamp_ns "
+                f"{int(stamp_ns[missing[0]])}. Give a vector for each."
+            )
+        return self._vectors[rows[at]]
+
+
+def _files(name: str) -> list[Path]:
+    """The file, or the pair that it is one of. Raises LibraryError where there is none."""
+    path = Path(name)
+    if not name or not path.exists():
+        what = f"{path} does not exist" if name else "No file of vectors is named"
+        raise LibraryError(f"{what}. Name it: vectors:FILE.npy, vectors:FILE.parquet, or places.file in a pipeline.")
+    folder = path if path.is_dir() else path.parent
+    pair = [folder / _QUERIES, folder / _DATABASE]
+    if path.is_dir() or path in pair:
+        for missing in (one for one in pair if not one.is_file()):
+            raise LibraryError(f"{missing} is missing: a pair of vectors is {_QUERIES} and {_DATABASE} in one folder.")
+        return pair
+    if path.suffix not in (".npy", ".parquet"):
+        raise LibraryError(f"{path} is neither .npy nor .parquet. Write the vectors with numpy.save.")
+    return [path]

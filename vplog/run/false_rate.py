@@ -1,0 +1,116 @@
+"""The share of false closures that is expected of a drive's ledger, and kept below what was asked for."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vplog.cache.codecs import closures_codec
+from vplog.cache.steps import step
+from vplog.data import Verdict
+from vplog.evaluate.body_truth import TruthAt
+from vplog.evaluate.closure_pose import pose_bounds, pose_errors
+from vplog.geometry import se3
+from vplog.graph.build import build_graph
+from vplog.graph.consistency import OdometryChain
+from vplog.graph.noise import broken_edges, edge_covariance
+from vplog.loops.false_rate import MOST_APART, at_rate, certain_pairs, evidence, mirrored_evidence, with_p_false
+from vplog.loops.propose import candidate_stops
+from vplog.loops.verify import drive_of, verify_between
+
+if TYPE_CHECKING:
+    from vplog.cache.feature_shards import Extracted
+    from vplog.data import Bools, Camera, Closures, Ints, Keyframes, Odometry
+    from vplog.execution.execution import Execution
+    from vplog.graph.noise import NoiseSettings
+    from vplog.loops.false_rate import FalseRateSettings
+    from vplog.loops.propose import ProposeSettings
+    from vplog.loops.verify import VerifySettings
+
+_log = logging.getLogger(__name__)
+_FAR_M = 1e6
+"""m between two pieces of a drive, of which nothing is known."""
+
+
+@step("p_false", lambda *_: closures_codec(), items=lambda closures, *_: len(closures))
+def rate_closures(
+    closures: Closures,
+    odometry: Odometry,
+    keyframes: Keyframes,
+    camera: Camera,
+    features: Extracted,
+    settings: FalseRateSettings,
+    propose: ProposeSettings,
+    verify: VerifySettings,
+    noise: NoiseSettings,
+    *,
+    execution: Execution,
+) -> Closures:
+    """The ledger with `p_false`, and with `rate` without what is likelier to be false."""
+    if not len(closures):
+        return closures
+    ruled_out = beyond_drift(closures, keyframes, odometry, noise, verify.metric.max_distance_m, settings.sigmas)
+    left = np.flatnonzero(~ruled_out)
+    count = min(max(settings.null_pairs - int(ruled_out.sum()), 0), len(left))
+    drive = drive_of(keyframes, camera, features.__getitem__, verify)
+    rows = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]
+    mirror = mirrored_evidence(closures, rows, drive, execution)
+    piece = np.zeros(len(keyframes.stamp_ns))
+    piece[broken_edges(odometry, keyframes.stamp_ns) + 1] = _FAR_M  # what lies behind a break is near nothing before
+    positions = np.column_stack([keyframes.odom_from_body[:, :3, 3], np.cumsum(piece)])
+    stops = candidate_stops(keyframes, propose)
+    # a moving camera's landmarks come from these very neighbours, so that they tell little of other closures
+    most = settings.certain_pairs if {"depth", "stereo"} & set(closures.scale) else 0
+    pairs = certain_pairs(positions, stops, verify.metric.max_distance_m, most)
+    certain = verify_between(pairs, drive, drive, execution, share=0.0)
+    closures = with_p_false(closures, ruled_out, mirror, *_by_odometry(certain, keyframes, camera, noise, settings))
+    return closures if settings.rate is None else _asked(closures, settings.rate, int(ruled_out.sum()), count)
+
+
+def _by_odometry(
+    certain: Closures, keyframes: Keyframes, camera: Camera, noise: NoiseSettings, settings: FalseRateSettings
+) -> tuple[Ints, Bools]:
+    """Evidence (K,) of the verified ones of certain pairs with a pose, and whether `vplog evaluate` would call it
+    wrong with the odometry as the truth, which may drift meanwhile."""
+    poses = keyframes.odom_from_body
+    step = np.zeros((len(poses), 2))  # rad and m
+    between = se3.between(poses[:-1], poses[1:])
+    step[1:] = np.column_stack([se3.angle(between), np.linalg.norm(between[:, :3, 3], axis=1)])
+    path = np.cumsum(step, axis=0)
+    turned, moved = (path - path[np.maximum(np.arange(len(poses)) - MOST_APART, 0)]).T
+    drift = [noise.turn_per_radian * turned + noise.turn_per_metre * moved, noise.drift_per_metre * moved]
+    none = np.zeros_like(step)
+    known = np.ones(len(poses), bool)
+    query, match = TruthAt(poses, known, settings.sigmas * np.stack(drift, 1)), TruthAt(poses, known, none)
+    cameras = camera.body_from_camera, camera.body_from_camera
+    posed, _, wrong, _ = pose_errors(certain, query, match, pose_bounds(poses[:, :3, 3]), cameras)
+    rows = posed & certain.of(Verdict.ACCEPTED)
+    return evidence(certain)[rows], wrong[rows]
+
+
+def beyond_drift(
+    closures: Closures, keyframes: Keyframes, odometry: Odometry, noise: NoiseSettings, reach_m: float, sigmas: float
+) -> Bools:
+    """(C,) candidates whose ends odometry has further apart than `reach_m` by so many sigmas of its drift."""
+    model = noise.model_copy(update={"source": "model"})
+    covariance = edge_covariance(odometry, keyframes.stamp_ns, model)[0]  # a log may claim anything
+    chain = OdometryChain.of(build_graph(keyframes, covariance, None)[0])
+    drift = chain.covariance(closures.match, closures.query)[:, 3:, 3:]
+    apart = np.diff(keyframes.odom_from_body[:, :3, 3][np.stack([closures.match, closures.query])], axis=0)[0]
+    sigma_m = np.sqrt(np.maximum(np.linalg.eigvalsh(drift)[:, -1], 0.0))
+    return np.linalg.norm(apart, axis=1) - sigmas * sigma_m > reach_m
+
+
+def _asked(closures: Closures, rate: float, ruled_out: int, mirrored: int) -> Closures:
+    verified = closures.of(Verdict.ACCEPTED)
+    least = closures.p_false[verified].min(initial=1.0)
+    if verified.any() and least > rate:
+        _log.warning(
+            "--false-rate %g: no closure is that sure. Of the %d verified the surest are false with %.2g, by %d pairs "
+            "that odometry rules out and %d mirrored ones; ask for more than that, or for more --set "
+            "false_rate.null_pairs.",
+            rate, verified.sum(), least, ruled_out, mirrored,
+        )  # fmt: skip
+    return at_rate(closures, rate)

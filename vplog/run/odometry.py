@@ -1,0 +1,144 @@
+"""The odometry of a run: the log's, or where it has none, or visual odometry was requested, that of its images."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.cache.codecs import json_codec
+from vplog.cache.steps import step
+from vplog.data import Odometry
+from vplog.errors import LogError
+from vplog.odometry.visual import visual_odometry
+from vplog.run.feature_extraction import image_topics
+from vplog.run.keyframes import select_keyframes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from vplog.cache.stage_cache import Inputs
+    from vplog.cache.steps import Steps
+    from vplog.data import Camera, Frame, Keyframes
+    from vplog.execution.execution import Execution
+    from vplog.logs import TopicChoice
+    from vplog.run.keyframes import KeyframeSettings
+    from vplog.stages import EncodedFrame, Log
+
+_log = logging.getLogger(__name__)
+_UNCALIBRATED = (
+    "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
+    "Record its camera_info, or name it with --camera-info-topic."
+)
+_NAMED = 4
+"""Breaks that are named."""
+
+
+@step("read")
+def read(
+    log: Log, topics: TopicChoice, settings: KeyframeSettings, *, steps: Steps
+) -> tuple[Odometry, Camera, Keyframes]:
+    """Odometry, camera and selected keyframes of a drive. Raises LogError where there is no odometry."""
+    odometry = odometry_of(log, topics, steps)
+    selected, warnings = select_keyframes(log.name, log.stamps(), odometry, settings)
+    for warning in warnings:
+        _log.warning(warning)
+    if (camera := log.camera()).matrix is None:
+        _log.warning(_UNCALIBRATED, camera.name)
+    return odometry, camera, selected
+
+
+def gives_visual(log: Log) -> bool:
+    """Whether there is a calibrated camera with depth or a stereo pair."""
+    with suppress(LogError):  # no images
+        return log.camera().matrix is not None and log.has_depth()
+    return False
+
+
+def is_visual(log: Log, topics: TopicChoice) -> bool:
+    """Whether the odometry is that of the images. Raises LogError where there is none at all."""
+    odometry = log.odometry()
+    if odometry is not None and len(odometry.stamp_ns) > 1:
+        return False
+    if topics.odometry in (None, "visual") and gives_visual(log):
+        return True
+    what = "has no odometry, and a trajectory is built on it"
+    if topics.odometry == "visual":
+        what = "gives no visual odometry, which needs a calibrated camera with depth images or a stereo pair"
+    raise LogError(f"{log.name} {what}. {log.without_odometry()}")
+
+
+def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
+    """The odometry of a drive. Raises LogError where there is none."""
+    odometry, visual = log.odometry(), is_visual(log, topics)
+    if visual or odometry is None:
+        return steps(by_images, log, topics.odometry is None, steps.cache.inputs, image_topics(topics))
+    return odometry
+
+
+@step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))
+def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
+    """Visual odometry, its breaks noted. Raises LogError where tracking fails from the first frame to the last."""
+    if unasked:
+        _log.warning(
+            "The log has no odometry, so that of its images is taken (visual odometry, as by --odometry visual)."
+        )
+    stamp_ns = log.stamps()
+    odometry = visual_odometry(_decoded(log, stamp_ns, execution), log.camera())
+    if odometry is None:
+        raise LogError(
+            f"{log.name}: no two of {len(stamp_ns)} frames could be tracked: too few corners with depth, or too little "
+            "in common from one frame to the next. --odometry-file takes poses from a file."
+        )
+    _log_breaks(odometry, stamp_ns)
+    return odometry
+
+
+def _decoded(log: Log, stamp_ns: np.ndarray, execution: Execution) -> Iterator[Frame]:
+    """All frames that decode, in order."""
+
+    def work(encoded: EncodedFrame) -> Frame | None:
+        try:
+            return encoded.decode()
+        except LogError:
+            return None  # counted by the log
+
+    frames = execution.map(work, log.frames(stamp_ns))
+    return (frame for frame in execution.counted("odometry", frames, len(stamp_ns)) if frame is not None)
+
+
+def _log_breaks(odometry: Odometry, stamp_ns: np.ndarray) -> None:
+    if lost := len(stamp_ns) - len(odometry.stamp_ns):
+        _log.warning("Visual odometry lost its track in %d of %d frames.", lost, len(stamp_ns))
+    breaks = odometry.breaks
+    if breaks is None or not len(breaks):
+        return
+    seconds = (odometry.stamp_ns[breaks] - stamp_ns[0]) / 1e9
+    named = ", ".join(f"{second:.1f} s" for second in seconds[:_NAMED].tolist())
+    more = f" and {len(breaks) - _NAMED} more" if len(breaks) > _NAMED else ""
+    _log.warning(
+        "Visual odometry starts again at %s%s after the first image: the drive has %d pieces, and only closures tell "
+        "how they lie to each other.",
+        named, more, len(breaks) + 1,
+    )  # fmt: skip
+
+
+def _plain(odometry: Odometry) -> dict[str, Any]:
+    breaks, covariance = odometry.breaks, odometry.covariance
+    return {
+        "stamp_ns": odometry.stamp_ns.tolist(),
+        "poses": odometry.odom_from_body[:, :3].tolist(),
+        "covariance": None if covariance is None else covariance.tolist(),
+        "breaks": None if breaks is None else breaks.tolist(),
+    }
+
+
+def _from_plain(tree: dict[str, Any]) -> Odometry:
+    stamp_ns, top = np.array(tree["stamp_ns"], np.int64), np.array(tree["poses"], np.float64)
+    poses = np.concatenate([top, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(top), 1, 1))], axis=1)
+    covariance = np.array(tree["covariance"], np.float64)
+    if poses.shape != (len(stamp_ns), 4, 4) or covariance.shape != (len(stamp_ns), 6, 6):
+        raise ValueError("poses and covariances do not fit the stamps")
+    return Odometry(stamp_ns, poses, covariance, breaks=np.array(tree["breaks"], np.int64))
