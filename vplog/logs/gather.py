@@ -117,6 +117,7 @@ class TopicCollector:
 
     def __init__(self, chosen: Selection) -> None:
         self.images, self.depths, self.rights = Images(chosen.image), Images(chosen.depth), Images(chosen.right)
+        self.masks = Images(chosen.mask)
         self.calibrations = Calibrations(chosen.camera_info)
         self.right_calibrations = Calibrations(chosen.right_info)
         self.poses = {
@@ -144,7 +145,7 @@ class TopicCollector:
     @cached_property
     def by_channel(self) -> dict[Channel, Images]:
         """The image topics in use."""
-        return {one.channel: one for one in (self.rights, self.depths, self.images) if one.channel}
+        return {one.channel: one for one in (self.masks, self.rights, self.depths, self.images) if one.channel}
 
     def add_block(self, block: Block) -> None:
         """Add the messages of a block, odometry in batches."""
@@ -218,7 +219,11 @@ class TopicCollector:
 
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
-        images = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
+        images = [
+            (one.channel.topic, one.stamps)
+            for one in (self.images, self.depths, self.rights, self.masks)
+            if one.channel
+        ]
         gyro = [(self.gyro.topic, self.gyro.stamps)] if self.gyro.topic else []
         return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one] + gyro
 

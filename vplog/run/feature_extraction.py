@@ -11,7 +11,6 @@ keyframes become references.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from dataclasses import dataclass
 from itertools import islice
@@ -22,7 +21,7 @@ import numpy as np
 from vplog import logs
 from vplog.cache.code_hash import code_of
 from vplog.cache.feature_shards import Extracted, packed
-from vplog.cache.input_hashes import files_of
+from vplog.cache.input_hashes import files_of, hash_inputs
 from vplog.cache.stage_cache import (
     AbsentError,
     DamagedError,
@@ -191,11 +190,10 @@ def split_keyframes(
 
 def image_topics(topics: logs.TopicChoice) -> dict[str, Any]:
     """The choice of topics as far as images depend on it; files beside the log by their content."""
-    named = topics.model_dump(mode="json", exclude={"gps"})
-    for name, file in (("odometry_file", topics.odometry_file), ("calibration_file", topics.calibration_file)):
-        if file is not None:
-            with file.open("rb") as stream:
-                named[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    named = topics.model_dump(mode="json", exclude={"gps", "masks"})
+    for name, path in topics.files.items():
+        hashes = hash_inputs(path)
+        named[name] = hashes if path.is_dir() else list(hashes.values())  # a file may be called otherwise
     return named
 
 
