@@ -15,6 +15,7 @@ from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
+    FixesMessage,
     FixMessage,
     ImageMessage,
     ImuMessage,
@@ -178,11 +179,13 @@ class TopicCollector:
             self._add_message(block, row, first + row)
 
     def finish_poses(self) -> None:
-        """Add the messages of odometry that wait."""
+        """Add the messages of odometry, and fixes of NMEA, that wait."""
         for channel in list(self._waiting):
             self._add_poses(channel)
         for channel, (data, log_ns) in self._paths.items():
             self._add_message(Block(data, [channel], [log_ns], [0], [len(data)], [()]), 0, self._messages)
+        if self.fixes:
+            self.fixes.add_sentences()
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
@@ -258,6 +261,9 @@ class TopicCollector:
                 self.gyro.add(imu, message.log_ns, position)
             case FixMessage() as fix if self.fixes:
                 self.fixes.add(fix, message.log_ns, position)
+            case FixesMessage(_, fixes) if self.fixes:
+                for fix in fixes:
+                    self.fixes.add(fix, message.log_ns, position)
             case list() as transforms if channel in self._tf:
                 self.dynamic.add(transforms, message.log_ns, position)
             case list() as transforms:

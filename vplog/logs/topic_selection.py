@@ -13,7 +13,7 @@ other parts the first by these rules does, unless TopicChoice names another:
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
 - odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
   chain from its root to the body is taken;
-- gps: most messages, then name.
+- gps: sentences of NMEA last, then most messages, then name.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from vplog.errors import LogError, nearest
-from vplog.logs.messages.records import GEOMETRY, TWISTS, WHEELS, short_type
+from vplog.logs.messages.records import GEOMETRY, NMEA, TWISTS, WHEELS, short_type
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     sources = _sources(candidates, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
     imu = pick("imu", _by_size) if sources and turned else None
-    gps = pick("gps", _by_size)
+    gps = pick("gps", lambda c: (short_type(c.channel.type) == NMEA, *_by_size(c)))
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     parts = {
         "image": image, "depth": depth, "camera_info": calibration, "odometry": requested, "gps": gps,
