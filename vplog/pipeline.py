@@ -160,7 +160,7 @@ def run(
     ):
         odometry, camera, selected = do(read, log, topics, pipeline.keyframes)
         features = do(extract, log, topics, selected, pipeline)
-        keyframes = decoded(selected, features)
+        keyframes = decoded(selected, features, pipeline.features)
         if library is None:
             images = do(own_images, log, selected, keyframes, features, pipeline.library)
             references = own_references(keyframes, features, images)

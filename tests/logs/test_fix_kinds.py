@@ -244,3 +244,13 @@ def test_sentences_without_a_fix_or_a_checksum(text: str, valid: bool) -> None:
     if valid:
         assert (found.latitude_deg, found.longitude_deg) == pytest.approx((48.1173, 11.5166667))
         assert np.isnan(found.covariance).all()
+
+
+@pytest.mark.parametrize("write", [lambda: nmea("GN", "GSV RMC GGA"), KINDS["ROS 2"], KINDS["json"]])
+def test_fixes_of_any_kind_alone_are_odometry(write: Callable[[], Messages], tmp_path: Path) -> None:
+    log = logs.open(write_raw(tmp_path / "drive.mcap", write()))
+    odometry = log.odometry()
+    assert odometry is not None
+    assert [source.kind for source in log.info().odometry_sources if source.used] == ["gps"]
+    way_m = np.linalg.norm(odometry.odom_from_body[-1, :3, 3] - odometry.odom_from_body[0, :3, 3])
+    assert way_m == pytest.approx(94.0, abs=3.0)  # 39 steps of 2.2 m north, .9 m east and .1 m up
