@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from pathlib import Path
+from typing import Any, ClassVar, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vplog.errors import SettingsError, nearest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
 
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 """Errors of the parser: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""

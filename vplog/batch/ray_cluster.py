@@ -10,16 +10,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.errors import SettingsError
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _CONNECT_TIMEOUT_S = 5.0
 """Time after which a machine that does not take a connection counts as unreachable: TCP has then tried three times."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import platform
 import secrets
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -15,20 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import vplog
-from vplog.batch.ray_cluster import connected, watched_head
+from vplog.batch.ray_cluster import Head, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
 from vplog.results import run_record
-from vplog.run.feature_extraction import compute_part, missing_parts, parts_of, put_part
+from vplog.run.feature_extraction import Part, compute_part, missing_parts, parts_of, put_part
 from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from vplog.batch.ray_cluster import Head
-    from vplog.run.feature_extraction import Part
     from vplog.storage.scratch import Bytes
 
     Files = tuple[tuple[str, tuple[Any, ...]], ...]

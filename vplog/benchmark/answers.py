@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +14,6 @@ from pyarrow import csv
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from vplog.benchmark.traversals import Traversal
     from vplog.data import Int32s
     from vplog.evaluate.retrieval import Ranks

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.cache.code_hash import code_of
@@ -19,9 +21,6 @@ from vplog.run.feature_extraction import PART_KEYFRAMES, image_topics
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
     from vplog.data import Bytes, Features, Float32s, Frame, Ints
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice

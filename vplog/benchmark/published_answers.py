@@ -11,6 +11,7 @@ come best first.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -22,8 +23,6 @@ from vplog.evaluate.truth_tables import read_lines
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from vplog.benchmark.traversals import Traversal
     from vplog.data import Float32s
 

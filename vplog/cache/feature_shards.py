@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
@@ -11,9 +13,6 @@ from vplog.errors import ResultError
 from vplog.features.store import SIFT_BYTES, features_from, features_to, size_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
     from vplog.data import Features
 
 _LENGTH = struct.Struct("<I")

@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -39,8 +40,6 @@ from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
 

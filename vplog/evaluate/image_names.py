@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,6 @@ from vplog.errors import TruthError
 from vplog.geometry.utm_name import FORM, utm_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from vplog.data import Floats, Ints
 
 _MOST_DEG = 1e4

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import rankdata
 
-from vplog.evaluate.retrieval import reliability
+from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats
-    from vplog.evaluate.retrieval import Ranks, Reliability
 
 FALSE_ALARMS = 0.01
 """Share of the queries without a match that may be answered."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,6 @@ import numpy as np
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 
 _MAX_GAP_S = 2.0

@@ -7,19 +7,15 @@ wanted, the image is halved before.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from vplog.data import THUMBNAIL_SIDE, Features
+from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Float32s
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Float32s
 
 
 class SiftSettings(Settings):

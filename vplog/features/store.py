@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.errors import ResultError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SIFT_BYTES = 128
 """Of a descriptor."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,17 +16,13 @@ from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
 from vplog.localize.localize import TOP, LocalizedPicture, localize_log
-from vplog.localize.places import opened
+from vplog.localize.places import Places, opened
 from vplog.localize.trajectory import JoinedLog, join_by_odometry
 from vplog.results.localized_table import write_localized
 from vplog.results.tables import TableMetadata
 from vplog.run.keyframes import select_keyframes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.localize.places import Places
     from vplog.stages import Log
 
 _AT_ODDS = "At odds with the other pictures by the log's odometry, so it has no pose."

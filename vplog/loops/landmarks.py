@@ -7,6 +7,7 @@ that measure disparity have one constant error in it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,8 +20,6 @@ from vplog.loops import undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vplog.data import Camera, Features, Floats, Keyframes
 
     FeaturesOf = Callable[[int], Features]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,6 @@ from pydantic import Field
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from vplog.data import Bools, Float32s, Int32s, Ints, Keyframes, Ranking
 
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vplog.figures.run_figures import earth_of
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.geo import Earth, on_earth
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
     from vplog.data import Floats
 
     Box = tuple[float, float, float, float]

@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from vplog.errors import LibraryError, SettingsError
 from vplog.settings import Settings, load_yaml
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vplog.data import Bytes, Float32s, Frame
 
 _MAX_BYTES = 2**31

@@ -6,12 +6,14 @@ An image is its visual words and how often each occurs. Two images compare by th
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numba
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pydantic import Field
 
 from vplog.errors import LibraryError
@@ -21,10 +23,6 @@ from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, postings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
     from vplog.data import Bytes, Features, Float32s, Ranking, Reference
     from vplog.execution.execution import Execution
 

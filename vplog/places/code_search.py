@@ -16,15 +16,12 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
-from vplog.data import Ranking
+from vplog.data import Bools, Bytes, Float32s, Ints, Ranking, Uint16s
 from vplog.errors import ResultError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Bools, Bytes, Float32s, Ints, Uint16s
-
     Pairing = Literal["best", "same", "both"]
 
 BLOCK = 8192

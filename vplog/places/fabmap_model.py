@@ -7,19 +7,17 @@ the true distribution; it is a maximum spanning tree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from vplog.places.vocabulary import postings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
     from vplog.data import Bools, Floats, Int32s, Ints, Reference
 
     Words = NDArray[np.uint16]

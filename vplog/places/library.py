@@ -6,6 +6,7 @@ that are its near neighbours and close enough: several words per feature (sectio
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,8 +19,6 @@ from vplog.places.library_files import keep_references
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
     from vplog.execution.execution import Execution
 

@@ -7,6 +7,7 @@ one absolute distance, a match here weighs by how much nearer it is than the fea
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -22,8 +23,6 @@ from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from vplog.data import Features, Float32s, Int32s, Reference
 
     Described = tuple[Float32s, Float32s]

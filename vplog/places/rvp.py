@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vplog.data import Floats, Int32s
 
 

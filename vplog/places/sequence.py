@@ -8,6 +8,7 @@ a return begins or ends.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
@@ -20,8 +21,6 @@ from vplog.places.dense import best_rows
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
     from vplog.data import Float32s, Int32s, Ints, Ranking
     from vplog.execution.execution import Execution
     from vplog.stages import PlaceIndex

@@ -7,7 +7,9 @@ top-left pixel.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,9 +18,6 @@ from vplog.errors import ResultError
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
     from vplog.data import Bytes, Camera, Floats, Structure
 
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

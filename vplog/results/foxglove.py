@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,8 +24,6 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from vplog.data import Camera, Floats, Gps
 
 Part = tuple[list[float], list[float]]

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
 from vplog.results.tables import MATRIX, TableMetadata, column, pose_columns
 from vplog.storage.parquet_limits import write_table
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 LOCALIZED = pa.schema(
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,8 +12,6 @@ from vplog.geometry.tum import seconds
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Trajectory
 
 

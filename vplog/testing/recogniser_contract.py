@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,14 +21,11 @@ import pytest
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places.views import views_of
-from vplog.stages import index_of_part
+from vplog.stages import PlaceState, index_of_part
 from vplog.testing.pictures import Drive, reference
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Reference
-    from vplog.stages import PlaceState
 
 COUNT = 12
 """Pictures of a library and of a map."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -18,8 +19,6 @@ from vplog.storage.scratch import scratch
 from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Bytes, Features, Ints, Structure
     from vplog.execution.execution import Execution
     from vplog.pipeline import Pipeline

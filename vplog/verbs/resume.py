@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from vplog import logs
 from vplog.cache.stage_cache import inputs_of, key_of
@@ -16,10 +18,6 @@ from vplog.results.staging import recover
 from vplog.run.provenance import OWN_LIBRARY, stat_of, stored_log
 from vplog.storage.folders import check_regular
 from vplog.storage.remote_path import located
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 
 @dataclass(frozen=True)

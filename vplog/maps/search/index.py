@@ -10,9 +10,11 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,9 +30,6 @@ from vplog.results import tables
 from vplog.storage.parquet_limits import check_file
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     from vplog.data import Int32s
     from vplog.maps.storage.map_store import Store
     from vplog.stages import CodedState, PlaceState
