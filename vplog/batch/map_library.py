@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog import logs
+from vplog.data import Ints
 from vplog.errors import LibraryError, LogError, ResultError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
@@ -16,7 +17,6 @@ from vplog.places.reference_choice import PAPER_SIZE, evenly
 from vplog.run.reference_library import build_library, check_library
 
 if TYPE_CHECKING:
-    from vplog.data import Ints
     from vplog.logs import TopicChoice
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline

@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
+from vplog.data import Int32s
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Int32s
     from vplog.evaluate.retrieval import Ranks
 
 COLUMNS = pa.schema({

@@ -24,6 +24,7 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal
+from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, no_truth, open_truth
 from vplog.execution.execution import Execution, logged_warnings
@@ -38,7 +39,6 @@ from vplog.storage.scratch import replacing
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from vplog.data import Float32s, Ints, Reference
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.retrieval import Ranks
     from vplog.pipeline import Pipeline

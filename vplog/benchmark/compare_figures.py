@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.benchmark.answers import file_stem
+from vplog.data import Bytes, Float32s, Floats, Ints
 from vplog.evaluate.open_set import reliability_of_matches
 from vplog.evaluate.retrieval import Ranks, Reliability, average_precision, precision_recall, recall_at
 from vplog.figures.canvas import as_text, saved_figure
@@ -17,7 +18,6 @@ from vplog.storage.image_file import decode_image
 if TYPE_CHECKING:
     from vplog.benchmark.method_scores import MethodResult
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Bytes, Float32s, Floats, Ints
     from vplog.evaluate.pairs import Pairs
 
 FIGURES = (

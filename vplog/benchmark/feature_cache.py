@@ -15,13 +15,13 @@ from vplog.cache.feature_shards import Extracted, packed
 from vplog.cache.input_hashes import stat_signature
 from vplog.cache.stage_cache import AbsentError, DamagedError, check_file, file_name, key_of, sealed
 from vplog.cache.user_cache import cache_folder, max_bytes, trim
+from vplog.data import Bytes, Features, Float32s, Frame, Ints
 from vplog.features.extraction import extract_frames
 from vplog.results.previews import PictureSettings, preview
 from vplog.run.feature_extraction import PART_KEYFRAMES, image_topics
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Features, Float32s, Frame, Ints
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
     from vplog.stages import Extractor, Log

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.benchmark.published_answers import AnswersSettings, fill_scores
+from vplog.data import Float32s, Floats, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.evaluate.open_set import score_open_set
@@ -28,7 +29,6 @@ from vplog.stages import FrameState, PlaceIndex, PlaceState, ProbableIndex, Stor
 
 if TYPE_CHECKING:
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Float32s, Floats, Ints, Reference
     from vplog.evaluate.pairs import Pairs
     from vplog.places import PlaceSettings
 

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
+from vplog.data import Bytes, Closures
 from vplog.results import tables
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Closures
     from vplog.stages import PlaceState
 
 T = TypeVar("T")

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import cv2
 import numpy as np
 
+from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
 from vplog.demo.route import axis_point, lap_length
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
     from vplog.demo.settings import DemoSettings
 
 PX_PER_M = 48

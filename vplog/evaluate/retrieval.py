@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vplog.data import Bools, Float32s, Floats, Int32s, Ints
 from vplog.errors import TruthError
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Float32s, Floats, Int32s, Ints
     from vplog.evaluate.pairs import Pairs
 
 

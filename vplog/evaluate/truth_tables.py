@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from vplog.data import Ints
 from vplog.errors import TruthError, VplogError
 from vplog.evaluate.image_names import row_finder
 
 if TYPE_CHECKING:
-    from vplog.data import Ints
     from vplog.stages import Log
 
 _LINE_LIMIT = 4096

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from vplog.data import Features, Frame
 from vplog.errors import LogError
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
 
 if TYPE_CHECKING:
-    from vplog.data import Features, Frame
     from vplog.execution.execution import Execution
     from vplog.stages import EncodedFrame, Extractor
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints, Trajectory
 from vplog.geometry import se3
 from vplog.storage.remote_path import reason
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, Trajectory
     from vplog.errors import VplogError
 
 _LINE_LIMIT = 4096

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -39,7 +40,6 @@ from vplog.storage.scratch import scratch
 from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
     from vplog.loops.candidate import Drive
     from vplog.loops.verify import VerifySettings
     from vplog.maps.storage.map_store import Store

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import earth_of_run, earth_record, in_box
@@ -22,7 +23,6 @@ from vplog.results.run_record import read_single_run
 from vplog.storage.remote_path import local_copy
 
 if TYPE_CHECKING:
-    from vplog.data import Floats
     from vplog.maps.geo_bounds import Box
     from vplog.maps.storage.map_store import Store
 

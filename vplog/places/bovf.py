@@ -16,6 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
+from vplog.data import Bytes, Features, Float32s, Ranking, Reference
 from vplog.errors import LibraryError
 from vplog.places.columns import check_type, check_values, list_slices, to_lists
 from vplog.places.dense import best_rows
@@ -23,7 +24,6 @@ from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, postings
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Features, Float32s, Ranking, Reference
     from vplog.execution.execution import Execution
 
 _WORD_BYTES, _PLACE_BYTES = 3, 4

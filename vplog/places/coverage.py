@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
+from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Keyframes
 from vplog.places.library import Library, Words, WordSettings, hnsw, l1_distance
 from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Keyframes
     from vplog.execution.execution import Execution
 
 STRONGEST = 200

@@ -17,6 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
+from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.code_search import CodeIndex, Place
 from vplog.places.columns import from_column, to_column
@@ -26,7 +27,6 @@ from vplog.places.matches import keypoints_of, patches_of
 from vplog.places.vocabulary import ROOT_STEPS, spread_rows
 
 if TYPE_CHECKING:
-    from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
     from vplog.execution.execution import Execution
     from vplog.places.matches import Described
 

@@ -14,12 +14,12 @@ import faiss
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.library_files import keep_references
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
     from vplog.execution.execution import Execution
 
 

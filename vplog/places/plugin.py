@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from vplog.data import Reference
 from vplog.errors import SettingsError, nearest
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.data import Reference
     from vplog.execution.execution import Execution
     from vplog.stages import PlaceState
 

@@ -17,11 +17,11 @@ import numba
 import numpy as np
 from pydantic import Field, model_validator
 
+from vplog.data import Float32s, Int32s, Ints, Ranking
 from vplog.places.dense import best_rows
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.data import Float32s, Int32s, Ints, Ranking
     from vplog.execution.execution import Execution
     from vplog.stages import PlaceIndex
 

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pydantic import model_validator
 
+from vplog.data import Features, Float32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.dense import VectorIndex, VectorState, nearness, products
 from vplog.places.library_files import RelearnedSettings, keep_references, references_hash
@@ -26,7 +27,6 @@ from vplog.places.network_vector import MAX_DIMENSIONS
 from vplog.storage.parquet_limits import open_table, read_table
 
 if TYPE_CHECKING:
-    from vplog.data import Features, Float32s, Ints, Reference
     from vplog.execution.execution import Execution
     from vplog.stages import Log
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from vplog.data import Features, Ints
 from vplog.stages import FrameState, Log, PlaceState, StoredState
 
 if TYPE_CHECKING:
-    from vplog.data import Features, Ints
     from vplog.execution.execution import Execution
 
 

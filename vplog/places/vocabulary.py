@@ -13,11 +13,11 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from vplog.data import Bytes, Float32s, Int32s, Ints
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Int32s, Ints
     from vplog.execution.execution import Execution
 
 ROOT_STEPS = np.float32(512)

@@ -10,15 +10,12 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bytes, Camera, Floats, Structure
 from vplog.errors import ResultError
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Camera, Floats, Structure
 
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of coefficients, of `plumb_bob` and `rational_polynomial`."""

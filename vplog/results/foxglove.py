@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -21,10 +21,8 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from vplog.data import Camera, Floats, Gps
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Gps
 
 Part = tuple[list[float], list[float]]
 """Position in m and quaternion x y z w of one pose, as plain numbers."""

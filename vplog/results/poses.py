@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Trajectory
 from vplog.geometry import se3
 from vplog.geometry.tum import seconds
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from vplog.data import Trajectory
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> Path:

@@ -13,6 +13,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.cache.code_hash import code_of
+from vplog.data import Features, Floats
 from vplog.errors import ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.landmarks import landmarks_of
@@ -27,7 +28,6 @@ from vplog.run.reextraction import ReextractedFeatures
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from vplog.data import Features, Floats
     from vplog.execution.execution import Execution
     from vplog.loops.candidate import Drive
 

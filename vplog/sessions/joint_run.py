@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
+from vplog.data import Closures
 from vplog.errors import SettingsError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
@@ -28,7 +29,6 @@ from vplog.sessions.inter_session import candidates_among, closures_between, lik
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 
 if TYPE_CHECKING:
-    from vplog.data import Closures
     from vplog.graph.joint import Joined
     from vplog.sessions.joint_graph import Ledgers
     from vplog.stages import PlaceState

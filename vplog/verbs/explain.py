@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
+from vplog.data import Closures, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.figures.closure_view import SharedBoxes, find_agreement, find_boxes
@@ -20,7 +21,6 @@ from vplog.verbs.explain_figure import View, draw
 from vplog.verbs.report import frames_at, recorded_pipeline, recorded_places
 
 if TYPE_CHECKING:
-    from vplog.data import Closures, Keyframes
     from vplog.pipeline import Pipeline
 
 

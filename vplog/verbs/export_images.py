@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from vplog import logs
+from vplog.data import Bytes, Features, Ints, Structure
 from vplog.errors import SettingsError
 from vplog.features.store import FeatureStore
 from vplog.loops.structure import pairs_to_match, triangulate
@@ -19,7 +20,6 @@ from vplog.storage.scratch import scratch
 from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Features, Ints, Structure
     from vplog.execution.execution import Execution
     from vplog.pipeline import Pipeline
     from vplog.stages import EncodedFrame, Log

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from vplog import logs
+from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
 from vplog.errors import LogError
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
@@ -25,7 +26,6 @@ from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
     from vplog.logs import TopicChoice
     from vplog.stages import Log
 

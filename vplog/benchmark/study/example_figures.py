@@ -11,13 +11,13 @@ import numpy as np
 
 from vplog.benchmark.study.charts import explain
 from vplog.benchmark.study.experiments import StudyOptions, box_methods
+from vplog.data import Boxes, Bytes, Floats
 from vplog.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from vplog.benchmark.study.evaluation_store import Bench
-    from vplog.data import Boxes, Bytes, Floats
     from vplog.stages import BoxState
 
 _SHOWN = 4

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.cache.code_hash import code_of
+from vplog.data import Closures, Odometry
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
 from vplog.graph.refine import Refined, about_odometry
@@ -32,7 +33,6 @@ from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solv
 from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
-    from vplog.data import Closures, Odometry
     from vplog.execution.execution import Execution
     from vplog.maps.joining.drive_pairs import JoinState
     from vplog.maps.joining.members import Member

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.cache.code_hash import code_of
+from vplog.data import SharedReferences
 from vplog.errors import ResultError
 from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_features, opened_drive
 from vplog.maps.storage.layout import folder_name, key_of, quoted
@@ -23,7 +24,6 @@ from vplog.sessions.inter_session import closures_between, with_shared
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from vplog.data import SharedReferences
     from vplog.execution.execution import Execution
     from vplog.loops.propose import Proposals
     from vplog.maps.storage.map_store import Store

@@ -13,6 +13,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.cache.input_hashes import hash_inputs
+from vplog.data import Int32s, Ints
 from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
@@ -29,7 +30,6 @@ from vplog.storage.remote_path import located
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from vplog.data import Int32s, Ints
     from vplog.execution.execution import Execution
     from vplog.loops.candidate import Drive
     from vplog.maps.storage.map_store import Store

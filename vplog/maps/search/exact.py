@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import Segment, open_segment
 from vplog.places.code_search import CodeIndex
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
     from vplog.maps.search.index import SegmentView
     from vplog.places.bobb import Place
     from vplog.places.code_search import Pairing

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
+from vplog.data import Int32s
 from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
@@ -30,7 +31,6 @@ from vplog.results import tables
 from vplog.storage.parquet_limits import check_file
 
 if TYPE_CHECKING:
-    from vplog.data import Int32s
     from vplog.maps.storage.map_store import Store
     from vplog.stages import CodedState, PlaceState
 

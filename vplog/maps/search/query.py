@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
+from vplog.data import Ints
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
@@ -33,7 +34,6 @@ from vplog.storage.remote_path import RemotePath
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from vplog.data import Ints
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.map_store import Store
 

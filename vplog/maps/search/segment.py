@@ -18,19 +18,17 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from vplog.data import Bytes, Ints
 from vplog.errors import ResultError
 from vplog.places.code_search import MOST_ROWS, CodeLists, check_lists
 from vplog.results.run_record import canonical_json
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Ints
 
 SUFFIX = ".lists"
 _MAGIC = b"vplists\n"

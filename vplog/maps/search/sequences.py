@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Floats, Int32s, Ints
 from vplog.execution.execution import Execution
 from vplog.maps.search.exact import NO_SCORE, Answers, answers_in_drive, merge, no_answers
 from vplog.maps.search.index import read_column
@@ -22,7 +23,6 @@ from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.stages import PlaceState, index_of_part
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Int32s, Ints
     from vplog.maps.storage.map_store import Store
 
 EXACT_PLACES = 200_000
