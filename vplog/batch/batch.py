@@ -111,9 +111,8 @@ def run_batch(
             for ended in as_completed(workers, tasks, options):
                 found = done[ended[0].drive] = _publish(store, *ended)
                 if found.state == "computed" and not (keep and shutil.disk_usage(store.root).free > _FREE_BYTES):
-                    shutil.rmtree(
-                        _cache(store, found.drive), ignore_errors=True
-                    )  # else for another attempt or the join
+                    # else it stays for another attempt or the join
+                    shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
                 options.on_drive(found)
                 execution.progress("drives", len(done), len(paths))
         finally:  # of a batch that was interrupted, too

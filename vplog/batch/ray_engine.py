@@ -281,7 +281,9 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
             ended = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
             if outcome.error:
                 return RemoteOutcome(**ended)
-            _set_library_path(made, task.library)
+            account = run_record.read_run_json(made / "run.json")
+            account["library"]["from"] = library_of(task.library)  # not this machine's copy
+            run_record.write_run_json(made / "run.json", account)
             stages = _put_files(cache) if task.keep_cache and task.cache is None else ()
             return RemoteOutcome(**ended, files=_put_files(made), cache=stages)
     except VplogError as error:
@@ -289,13 +291,6 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
     except OSError as error:
         why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
         return RemoteOutcome(why, retryable=True, worker=where)
-
-
-def _set_library_path(made: Path, library: Path) -> None:
-    """Let run.json of a finished run name the map's library, not this machine's copy."""
-    account = run_record.read_run_json(made / "run.json")
-    account["library"]["from"] = library_of(library)
-    run_record.write_run_json(made / "run.json", account)
 
 
 def _put_files(folder: Path) -> Files:

@@ -10,6 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vplog.cache.code_hash import code_of
 from vplog.cache.feature_shards import Extracted, packed
 from vplog.cache.input_hashes import stat_signature
@@ -79,7 +81,7 @@ class FeatureFolder:
             spent.append(round(1e3 * (time.thread_time() - began), 3))
             return features
 
-        frames = extract_frames(log.frames(stamp_ns[:0] if not wanted else _among(stamp_ns, wanted)), timed, execution)
+        frames = extract_frames(log.frames(stamp_ns[np.isin(stamp_ns, wanted)]), timed, execution)
         counted = execution.part(done, len(stamp_ns)).counted(f"extract {log.name}", frames, len(stamp_ns))
         for part, key in missing:
             content = _content(islice(counted, len(part)), spent)
@@ -102,12 +104,6 @@ class FeatureFolder:
         except (AbsentError, DamagedError):
             return False
         return True
-
-
-def _among(stamp_ns: Ints, wanted: list[int]) -> Ints:
-    """The stamps that are wanted."""
-    chosen = set(wanted)
-    return stamp_ns[[stamp in chosen for stamp in stamp_ns.tolist()]]
 
 
 def _content(frames: Iterable[tuple[int, Frame | None, Features | None, str]], spent: list[float]) -> bytes:

@@ -79,12 +79,8 @@ def evaluate_method(
     """
     if isinstance(settings, AnswersSettings):
         return evaluate_answers(settings, inputs)
-    map_traversal, query_traversal, truth, stops = (
-        inputs.map_traversal,
-        inputs.query_traversal,
-        inputs.truth,
-        inputs.stops,
-    )
+    map_traversal, query_traversal = inputs.map_traversal, inputs.query_traversal
+    truth, stops = inputs.truth, inputs.stops
     began = time.process_time()
     state: Any = settings.learn(inputs.references, execution)
     learn_s = time.process_time() - began  # of all threads

@@ -233,10 +233,8 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
         name = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{name}")
     request = resume_request(arguments.output, arguments.logs)
-    arguments.one_drive, arguments.force = (
-        not request.several,
-        True,
-    )  # whether it may replace results was settled when it began
+    arguments.one_drive = not request.several
+    arguments.force = True  # whether it may replace results was settled when it began
     return request.logs, request.pipeline, request.library, request.topics
 
 

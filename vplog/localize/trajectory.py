@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 class JoinedSettings(Protocol):
     """The settings that this takes, as the pipeline has them."""
 
-    @property
-    def noise(self) -> NoiseSettings: ...
-    @property
-    def solve(self) -> OptimiserSettings: ...
+    noise: NoiseSettings
+    solve: OptimiserSettings
 
 
 class JoinedLog(NamedTuple):

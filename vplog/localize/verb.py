@@ -37,7 +37,8 @@ def localize_paths(
     `out` is a table (.parquet) or a trajectory (.tum): of the cameras of pictures, or of the body of a log.
     """
     _check_out(out)
-    log = open_pictures_or_log(paths, topics)
+    is_log = len(paths) == 1 and not logs.is_image_file(paths[0])
+    log = logs.open(paths[0], topics) if is_log else logs.open_images(paths, topics)
     with opened(root, execution) as places:
         stamps, keyframes, warnings = _frames(log, places)
         found = list(localize_log(places, log, stamps, execution, top))
@@ -59,13 +60,6 @@ def localize_paths(
             "warnings": log.warnings + warnings + places.warnings,
             "answers": records,
         }
-
-
-def open_pictures_or_log(paths: Sequence[Path], topics: logs.TopicChoice | None) -> Log:
-    """One log, or files of pictures as one. Raises LogError."""
-    if len(paths) == 1 and not logs.is_image_file(paths[0]):
-        return logs.open(paths[0], topics)
-    return logs.open_images(paths, topics)
 
 
 def _check_out(out: Path | None) -> None:

@@ -34,11 +34,6 @@ PLACES_ONLY = "places_of"
 """Field in drive.json of such a drive: the file that it is from."""
 
 
-def library_of_file(path: Path) -> str:
-    """The hash of the library that an exported file's places are described with. Raises ResultError."""
-    return read_places_header(path).library
-
-
 def drives_of_file(path: Path) -> dict[str, dict[str, Any]]:
     """drive.json of each drive in an exported file, but for its key, in order. Raises ResultError."""
     about = read_places_header(path)

@@ -44,14 +44,10 @@ _log = logging.getLogger(__name__)
 class BackEnd(Protocol):
     """The settings that these steps take."""
 
-    @property
-    def noise(self) -> NoiseSettings: ...
-    @property
-    def solve(self) -> OptimiserSettings: ...
-    @property
-    def refine(self) -> RefineSettings: ...
-    @property
-    def gps(self) -> GpsSettings: ...
+    noise: NoiseSettings
+    solve: OptimiserSettings
+    refine: RefineSettings
+    gps: GpsSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,14 +66,10 @@ opens the log for it, which reads it through once."""
 class Extraction(Protocol):
     """The settings that extraction takes, as the pipeline has them."""
 
-    @property
-    def keyframes(self) -> KeyframeSettings: ...
-    @property
-    def features(self) -> FeatureSettings: ...
-    @property
-    def stereo(self) -> StereoSettings: ...
-    @property
-    def pictures(self) -> PictureSettings: ...
+    keyframes: KeyframeSettings
+    features: FeatureSettings
+    stereo: StereoSettings
+    pictures: PictureSettings
 
 
 @dataclass(frozen=True)

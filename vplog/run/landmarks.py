@@ -43,8 +43,7 @@ _LOOKED_AT = 16
 class DriveSettings(Extraction, Protocol):
     """The settings that landmarks take, as the pipeline has them."""
 
-    @property
-    def verify(self) -> VerifySettings: ...
+    verify: VerifySettings
 
 
 @contextmanager

@@ -80,9 +80,7 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
     if not isinstance(about, dict) or not all(path.exists() for path in paths) or stat_of(paths) == about:
         return  # of an older version; or the run reports what is missing
     now = inputs_of(paths, out / CACHE)
-    if now.token == key_of(
-        now.signature
-    ):  # the cache does not know the content either, so nothing of it would be found
+    if now.token == key_of(now.signature):  # the cache does not know it either: nothing of it would be found
         given = shlex.join(map(str, paths))
         raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
 
