@@ -17,11 +17,10 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 TYPE_CHECKING = False  # for type checkers it is true, and typing takes most of the time of this import
 if TYPE_CHECKING:
-    from typing import Any
-
     from vplog.api import (
         Answers,
         Map,

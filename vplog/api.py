@@ -5,19 +5,18 @@ from __future__ import annotations
 import logging
 import os
 import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.cores import available, limited
-from vplog.execution.execution import Execution, silent
+from vplog.execution.execution import Execution, Progress, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
     import numpy as np
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from vplog.batch.worker import Drive
     from vplog.benchmark.compare import Comparison
     from vplog.data import Camera
-    from vplog.execution.execution import Progress
     from vplog.execution.process_pool import OwnProcesses
     from vplog.localize.localize import LocalizedPicture
     from vplog.localize.localizer import Localizer

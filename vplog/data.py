@@ -10,20 +10,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
-    Float32s = NDArray[np.float32]
-    Ints = NDArray[np.int64]
-    Int32s = NDArray[np.int32]
-    Bytes = NDArray[np.uint8]
-    Uint16s = NDArray[np.uint16]
-    Bools = NDArray[np.bool_]
-
+Floats = NDArray[np.float64]
+Float32s = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Int32s = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
+Uint16s = NDArray[np.uint16]
+Bools = NDArray[np.bool_]
 
 THUMBNAIL_SIDE = 128
 """px; GIST is commonly computed on 128 x 128, and SeqSLAM's thumbnails are smaller."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import model_validator
 
@@ -43,9 +44,6 @@ from vplog.run.reference_library import check_library, cover, given_references, 
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.run.verification import verify
 from vplog.settings import Settings, load_yaml, override
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 
 class Pipeline(Settings):

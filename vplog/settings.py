@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from operator import eq
+from pathlib import Path
+from typing import Any, ClassVar, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vplog.errors import SettingsError, nearest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
 
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 """Errors of the parser: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
@@ -46,7 +44,7 @@ class Settings(BaseModel):
         except ValidationError as error:
             name, text = _explain(error.errors()[0], _schema(cls))
             parts = name.split(".")
-            set_by = [one for one in assignments if _same_branch(one.partition("=")[0].split("."), parts)]
+            set_by = [one for one in assignments if all(map(eq, one.partition("=")[0].split("."), parts))]
             place = f"--set {set_by[-1]}" if set_by else where
             remedy = "" if _A_SETTING in text else f" {_A_SETTING}"  # of a file that these settings name
             raise SettingsError(f"{place}: {text}{remedy}") from None
@@ -55,10 +53,6 @@ class Settings(BaseModel):
 @cache
 def _schema(settings: type[Settings]) -> dict[str, Any]:
     return settings.model_json_schema()
-
-
-def _same_branch(one: list[str], other: list[str]) -> bool:
-    return all(a == b for a, b in zip(one, other, strict=False))
 
 
 def _explain(error: Any, schema: dict[str, Any]) -> tuple[str, str]:

@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -16,7 +17,7 @@ from vplog import logs
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
-from vplog.batch.worker import Drive, Task, made_by
+from vplog.batch.worker import Drive, Outcome, Task, made_by
 from vplog.cache.input_hashes import bytes_of
 from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.execution.execution import Execution
@@ -26,18 +27,14 @@ from vplog.maps.joining.join import load_places
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import drive_record, folder_name
-from vplog.pipeline import load_pipeline, pipeline_from
+from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.storage.remote_path import RemotePath, located
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from vplog.batch.engine import Engine
-    from vplog.batch.worker import Outcome
     from vplog.logs import TopicChoice
     from vplog.maps.storage.map_store import Store
-    from vplog.pipeline import Pipeline
 
 _FREE_BYTES = 10**10
 """Free space of the map's disk below which stage caches are removed: what a drive of several hours needs while it is
@@ -114,9 +111,8 @@ def run_batch(
             for ended in as_completed(workers, tasks, options):
                 found = done[ended[0].drive] = _publish(store, *ended)
                 if found.state == "computed" and not (keep and shutil.disk_usage(store.root).free > _FREE_BYTES):
-                    shutil.rmtree(
-                        _cache(store, found.drive), ignore_errors=True
-                    )  # else for another attempt or the join
+                    # else it stays for another attempt or the join
+                    shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
                 options.on_drive(found)
                 execution.progress("drives", len(done), len(paths))
         finally:  # of a batch that was interrupted, too

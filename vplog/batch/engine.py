@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from vplog.batch.worker import Drive, Outcome, Task, compute_drive
@@ -13,10 +15,6 @@ from vplog.errors import SettingsError, VplogError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from concurrent.futures import Executor
-    from pathlib import Path
-
     from vplog.batch.ray_engine import RayEngine
 
     Engine: TypeAlias = "LocalEngine | RayEngine"

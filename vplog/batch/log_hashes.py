@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
+from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +18,6 @@ from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog import logs
+from vplog.data import Ints
 from vplog.errors import LibraryError, LogError, ResultError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
@@ -14,10 +17,6 @@ from vplog.places.reference_choice import PAPER_SIZE, evenly
 from vplog.run.reference_library import build_library, check_library
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.data import Ints
     from vplog.logs import TopicChoice
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline

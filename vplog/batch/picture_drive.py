@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +15,6 @@ from vplog.results import tables
 from vplog.run.odometry import gives_visual
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.execution.execution import Execution
     from vplog.pipeline import Pipeline
     from vplog.stages import Log

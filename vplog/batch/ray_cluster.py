@@ -10,16 +10,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.errors import SettingsError
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _CONNECT_TIMEOUT_S = 5.0
 """Time after which a machine that does not take a connection counts as unreachable: TCP has then tried three times."""
@@ -133,7 +131,8 @@ def _start(ray: Any, folder: Path, threads: int) -> None:
     """A cluster of this machine alone. Its files and those of its workers go with the folder."""
     before = dict(os.environ)
     os.environ.update({"TMPDIR": str(folder), **_ENVIRONMENT})
-    if not _has_token():
+    tokens = "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
+    if not (any(map(os.environ.get, tokens)) or Path("~/.ray/auth_token").expanduser().is_file()):  # Ray makes none
         os.environ["RAY_AUTH_TOKEN"] = _TOKEN
     place = str(folder) if len(str(folder)) <= _LONGEST_PLACE else _OTHER_PLACE
     try:
@@ -141,12 +140,6 @@ def _start(ray: Any, folder: Path, threads: int) -> None:
     finally:
         os.environ.clear()
         os.environ.update(before)
-
-
-def _has_token() -> bool:
-    """Whether Ray finds one without making it."""
-    given = any(os.environ.get(name) for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
-    return given or Path("~/.ray/auth_token").expanduser().is_file()
 
 
 def _check_answers(address: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import platform
 import secrets
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -15,20 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import vplog
-from vplog.batch.ray_cluster import connected, watched_head
+from vplog.batch.ray_cluster import Head, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
 from vplog.results import run_record
-from vplog.run.feature_extraction import compute_part, missing_parts, parts_of, put_part
+from vplog.run.feature_extraction import Part, compute_part, missing_parts, parts_of, put_part
 from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from vplog.batch.ray_cluster import Head
-    from vplog.run.feature_extraction import Part
     from vplog.storage.scratch import Bytes
 
     Files = tuple[tuple[str, tuple[Any, ...]], ...]
@@ -284,7 +281,9 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
             ended = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
             if outcome.error:
                 return RemoteOutcome(**ended)
-            _set_library_path(made, task.library)
+            account = run_record.read_run_json(made / "run.json")
+            account["library"]["from"] = library_of(task.library)  # not this machine's copy
+            run_record.write_run_json(made / "run.json", account)
             stages = _put_files(cache) if task.keep_cache and task.cache is None else ()
             return RemoteOutcome(**ended, files=_put_files(made), cache=stages)
     except VplogError as error:
@@ -292,13 +291,6 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
     except OSError as error:
         why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
         return RemoteOutcome(why, retryable=True, worker=where)
-
-
-def _set_library_path(made: Path, library: Path) -> None:
-    """Let run.json of a finished run name the map's library, not this machine's copy."""
-    account = run_record.read_run_json(made / "run.json")
-    account["library"]["from"] = library_of(library)
-    run_record.write_run_json(made / "run.json", account)
 
 
 def _put_files(folder: Path) -> Files:

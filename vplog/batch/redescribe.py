@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
@@ -28,9 +30,6 @@ from vplog.storage.remote_path import local_copy, located
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
     from vplog.maps.storage.map_store import Store
 
 

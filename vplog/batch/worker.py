@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +25,6 @@ from vplog.run.run_folder import CacheOptions
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from vplog.logs import TopicChoice
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,13 +11,11 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
+from vplog.data import Int32s
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Int32s
     from vplog.evaluate.retrieval import Ranks
 
 COLUMNS = pa.schema({

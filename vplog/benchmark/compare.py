@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +24,9 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal
+from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
-from vplog.evaluate.place_truth import TruthChoice, no_truth, open_truth
+from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, no_truth, open_truth
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.logs import EVERY_IMAGE
 from vplog.places.library_files import check_descriptors, load_references, references_hash
@@ -35,13 +37,9 @@ from vplog.results.staging import staged
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     import pyarrow as pa
 
-    from vplog.data import Float32s, Ints, Reference
     from vplog.evaluate.pairs import Pairs
-    from vplog.evaluate.place_truth import PlaceTruth
     from vplog.evaluate.retrieval import Ranks
     from vplog.pipeline import Pipeline
     from vplog.stages import Log

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.benchmark.answers import file_stem
+from vplog.data import Bytes, Float32s, Floats, Ints
 from vplog.evaluate.open_set import reliability_of_matches
-from vplog.evaluate.retrieval import average_precision, precision_recall, recall_at
+from vplog.evaluate.retrieval import Ranks, Reliability, average_precision, precision_recall, recall_at
 from vplog.figures.canvas import as_text, saved_figure
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.benchmark.method_scores import MethodResult
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Bytes, Float32s, Floats, Ints
     from vplog.evaluate.pairs import Pairs
-    from vplog.evaluate.retrieval import Ranks, Reliability
 
 FIGURES = (
     *(f"{name}.[ps][nv]g" for name in ("curves", "reliability")), "similarity.png", "misses-[0-9][0-9]-*.png",

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from vplog.cache.code_hash import code_of
 from vplog.cache.feature_shards import Extracted, packed
 from vplog.cache.input_hashes import stat_signature
 from vplog.cache.stage_cache import AbsentError, DamagedError, check_file, file_name, key_of, sealed
 from vplog.cache.user_cache import cache_folder, max_bytes, trim
+from vplog.data import Bytes, Features, Float32s, Frame, Ints
 from vplog.features.extraction import extract_frames
 from vplog.results.previews import PictureSettings, preview
 from vplog.run.feature_extraction import PART_KEYFRAMES, image_topics
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from vplog.data import Bytes, Features, Float32s, Frame, Ints
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
     from vplog.stages import Extractor, Log
@@ -80,7 +81,7 @@ class FeatureFolder:
             spent.append(round(1e3 * (time.thread_time() - began), 3))
             return features
 
-        frames = extract_frames(log.frames(stamp_ns[:0] if not wanted else _among(stamp_ns, wanted)), timed, execution)
+        frames = extract_frames(log.frames(stamp_ns[np.isin(stamp_ns, wanted)]), timed, execution)
         counted = execution.part(done, len(stamp_ns)).counted(f"extract {log.name}", frames, len(stamp_ns))
         for part, key in missing:
             content = _content(islice(counted, len(part)), spent)
@@ -103,12 +104,6 @@ class FeatureFolder:
         except (AbsentError, DamagedError):
             return False
         return True
-
-
-def _among(stamp_ns: Ints, wanted: list[int]) -> Ints:
-    """The stamps that are wanted."""
-    chosen = set(wanted)
-    return stamp_ns[[stamp in chosen for stamp in stamp_ns.tolist()]]
 
 
 def _content(frames: Iterable[tuple[int, Frame | None, Features | None, str]], spent: list[float]) -> bytes:

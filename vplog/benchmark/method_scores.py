@@ -6,7 +6,9 @@ Times are CPU time of the thread that does the work, so they are those of one th
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from shutil import disk_usage
 from typing import TYPE_CHECKING, Any
 
@@ -14,27 +16,21 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.benchmark.published_answers import AnswersSettings, fill_scores
+from vplog.data import Float32s, Floats, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.evaluate.open_set import score_open_set
-from vplog.evaluate.retrieval import reliability
+from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 from vplog.execution.execution import Execution
 from vplog.places.match_probability import match_probabilities
-from vplog.places.sequence import sequence_rows
+from vplog.places.sequence import SequenceSettings, sequence_rows
 from vplog.places.views import views_of
-from vplog.stages import FrameState, ProbableIndex, StoredState
+from vplog.stages import FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Float32s, Floats, Ints, Reference
     from vplog.evaluate.pairs import Pairs
-    from vplog.evaluate.retrieval import Ranks, Reliability
     from vplog.places import PlaceSettings
-    from vplog.places.sequence import SequenceSettings
-    from vplog.stages import PlaceIndex, PlaceState
 
 RELIABILITY_BINS = 10
 """Bins of the probability: with the 200 answers of a short traversal a bin holds 20."""
@@ -83,12 +79,8 @@ def evaluate_method(
     """
     if isinstance(settings, AnswersSettings):
         return evaluate_answers(settings, inputs)
-    map_traversal, query_traversal, truth, stops = (
-        inputs.map_traversal,
-        inputs.query_traversal,
-        inputs.truth,
-        inputs.stops,
-    )
+    map_traversal, query_traversal = inputs.map_traversal, inputs.query_traversal
+    truth, stops = inputs.truth, inputs.stops
     began = time.process_time()
     state: Any = settings.learn(inputs.references, execution)
     learn_s = time.process_time() - began  # of all threads

@@ -11,21 +11,20 @@ come best first.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
+from vplog.data import Float32s
 from vplog.errors import SettingsError
 from vplog.evaluate.image_names import row_finder
 from vplog.evaluate.truth_tables import read_lines
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from vplog.benchmark.traversals import Traversal
-    from vplog.data import Float32s
 
 _FORMAT = "The header is `query,match` or `query,match,score`; a frame is its number from 0, or the name of its image."
 

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.benchmark.published_answers import AnswersSettings
 from vplog.errors import SettingsError, nearest
-from vplog.pipeline import load_pipeline
+from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places import KINDS
 from vplog.places.plugin import PluginSettings, plugin_names
 from vplog.settings import override
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.pipeline import Pipeline
 
 
 def split_methods(text: str) -> list[str]:

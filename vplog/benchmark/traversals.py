@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Reference
+from vplog.data import Bytes, Floats, Ints, Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.masking import masked
@@ -15,7 +15,6 @@ from vplog.masking import masked
 if TYPE_CHECKING:
     from vplog.benchmark.feature_cache import FeatureFolder
     from vplog.cache.feature_shards import Extracted
-    from vplog.data import Bytes, Floats, Ints
     from vplog.stages import Extractor, Log
 
 

@@ -7,6 +7,7 @@ given is made.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -14,13 +15,11 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
+from vplog.data import Bytes, Closures
 from vplog.results import tables
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from vplog.data import Bytes, Closures
     from vplog.stages import PlaceState
 
 T = TypeVar("T")

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 import struct
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
+from vplog.data import Features
 from vplog.errors import ResultError
 from vplog.features.store import SIFT_BYTES, features_from, features_to, size_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from vplog.data import Features
 
 _LENGTH = struct.Struct("<I")
 """Bytes of the JSON head of a part, which comes before its features and pictures."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, cast
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import cast
 
 from vplog.storage.remote_path import RemotePath
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
 
 _BLOCK_BYTES = 2**20
 """Read at once: hashing one takes a millisecond."""

@@ -12,8 +12,10 @@ import io
 import json
 import struct
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 
 import numpy as np
@@ -25,9 +27,6 @@ from vplog.settings import Settings
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
     from vplog.cache.codecs import Codec
 
 T = TypeVar("T")

@@ -12,24 +12,22 @@ to functions that take them, and do not change a result.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import accumulate
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
 from vplog.cache.code_hash import code_of
 from vplog.cache.stage_cache import AbsentError, StageCache, digest_of, key_of
 from vplog.execution.cores import limited
-from vplog.execution.execution import logged_warnings
+from vplog.execution.execution import Execution, logged_warnings
 from vplog.execution.timing import StageTimer
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
     from vplog.cache.codecs import Codec
-    from vplog.execution.execution import Execution
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -5,14 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vplog.errors import SettingsError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 VARIABLE = "VPLOG_CACHE"
 """Environment variable that names the cache, unless a verb does."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 from vplog import api
 from vplog.cli.parser import (
@@ -20,9 +20,6 @@ from vplog.cli.parser import (
 )
 from vplog.cli.printing import Progress, print_comparison, print_result, print_study
 from vplog.execution.execution import Execution
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def compare(arguments: argparse.Namespace) -> None:

@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -39,8 +40,6 @@ from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
 
@@ -234,10 +233,8 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
         name = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
         arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{name}")
     request = resume_request(arguments.output, arguments.logs)
-    arguments.one_drive, arguments.force = (
-        not request.several,
-        True,
-    )  # whether it may replace results was settled when it began
+    arguments.one_drive = not request.several
+    arguments.force = True  # whether it may replace results was settled when it began
     return request.logs, request.pipeline, request.library, request.topics
 
 

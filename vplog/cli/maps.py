@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vplog import api
 from vplog.cli import printing
@@ -23,9 +24,6 @@ from vplog.cli.printing import Progress, print_result
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
-
     Verb = Callable[[argparse.Namespace], None]
 
 

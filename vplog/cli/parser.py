@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from itertools import takewhile
@@ -16,8 +17,6 @@ from vplog.errors import VplogError, nearest
 from vplog.storage.urls import without_secrets
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.cli.parser import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
@@ -20,9 +22,6 @@ from vplog.cli.printing import (
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
     from vplog.verbs.evaluate_run import TruthOptions
 
 _TRUTH = "TUM file, the log's own GPS, or the truth that comes with it"

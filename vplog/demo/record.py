@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from vplog.data import Trajectory
+from vplog.data import Bytes, Camera, Float32s, Floats, Trajectory
 from vplog.demo import route
 from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
 from vplog.demo.settings import DemoSettings
@@ -21,12 +23,6 @@ from vplog.execution.cores import allowed
 from vplog.execution.execution import Execution
 from vplog.geometry.se3 import quaternion
 from vplog.geometry.tum import write_tum
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.data import Bytes, Camera, Float32s, Floats
 
 IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"

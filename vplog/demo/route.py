@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints
 from vplog.geometry.geodesy import geodetic
 from vplog.geometry.se3 import between, exp, log, pose, so3_exp
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
     from vplog.demo.settings import DemoSettings
 
 START_NS = 1_700_000_000_000_000_000

@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from vplog.data import Camera
+from vplog.data import Bytes, Camera, Float32s, Floats, Int32s, Ints
 from vplog.demo import route
-from vplog.demo.world import World, build_world, traffic
+from vplog.demo.world import Quads, World, build_world, traffic
 from vplog.geometry.se3 import inverse, pose, so3_exp, transform
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
     from vplog.demo.settings import DemoSettings
-    from vplog.demo.world import Quads
 
 CAMERA_FRAME = "camera_optical"
 BODY_FRAME = "base_link"

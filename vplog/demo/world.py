@@ -7,18 +7,17 @@ fixed number of px per metre: every place looks like no other.
 from __future__ import annotations
 
 import string
+from collections.abc import Iterator
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
 from vplog.demo.route import axis_point, lap_length
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
     from vplog.demo.settings import DemoSettings
 
 PX_PER_M = 48

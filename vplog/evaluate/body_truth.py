@@ -7,16 +7,12 @@ odometry, whose drift is small over the few metres between two samples.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Bools, Floats, Ints, Trajectory
 from vplog.evaluate.pairs import bracketing, poses_at
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints
 
 _BETTER = 0.5
 """Another frame must halve the disagreement with the odometry to be taken: chance does not."""

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bools, Closures, Floats
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Closures, Floats
     from vplog.evaluate.body_truth import TruthAt
 
 _DRIFT_M = 0.04

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints
 from vplog.errors import TruthError
 from vplog.geometry.utm_name import FORM, utm_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from vplog.data import Floats, Ints
 
 _MOST_DEG = 1e4
 """Degrees; a heading beyond is something else."""

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.stats import rankdata
 
-from vplog.evaluate.retrieval import reliability
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats
-    from vplog.evaluate.retrieval import Ranks, Reliability
+from vplog.data import Bools, Floats
+from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 
 FALSE_ALARMS = 0.01
 """Share of the queries without a match that may be answered."""

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 
 _MAX_GAP_S = 2.0
 """s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""

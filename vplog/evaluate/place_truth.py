@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Gps, Trajectory
+from vplog.data import Bools, Floats, Gps, Ints, Trajectory
 from vplog.errors import TruthError, nearest
 from vplog.evaluate import pairs
 from vplog.evaluate.image_names import folders_of, numbers_of, utm_of
@@ -18,9 +19,6 @@ from vplog.geometry import se3
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from vplog.data import Bools, Floats, Ints
     from vplog.evaluate.pairs import Pairs
     from vplog.stages import Log
 

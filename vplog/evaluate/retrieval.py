@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from vplog.data import Bools, Float32s, Floats, Int32s, Ints
 from vplog.errors import TruthError
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from vplog.data import Bools, Float32s, Floats, Int32s, Ints
     from vplog.evaluate.pairs import Pairs
 
 

@@ -7,16 +7,12 @@ Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Floats, Ints, Trajectory
 from vplog.errors import TruthError
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
 
 MAX_DIFFERENCE_S = 0.01
 """s; how far the stamps of two poses that are compared may be apart, evo's default."""

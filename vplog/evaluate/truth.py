@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Floats, Gps, Ints, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate.trajectory import Ate, aligned_error
 from vplog.geometry import geodesy, se3
 from vplog.geometry.tum import read_tum
 from vplog.storage.remote_path import located
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Floats, Gps, Ints
 
 
 def read_truth(place: str | Path) -> Trajectory:

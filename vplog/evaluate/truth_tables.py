@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import csv
 import pickletools
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from vplog.errors import TruthError
+from vplog.data import Ints
+from vplog.errors import TruthError, VplogError
 from vplog.evaluate.image_names import row_finder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.data import Ints
-    from vplog.errors import VplogError
     from vplog.stages import Log
 
 _LINE_LIMIT = 4096

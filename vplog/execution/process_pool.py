@@ -16,6 +16,8 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from types import ModuleType
@@ -26,9 +28,6 @@ from pebble import ProcessExpired, ProcessPool
 from vplog.errors import SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from concurrent.futures import Future
-
     T = TypeVar("T")
 
 __all__ = ["OwnProcesses", "ProcessExpired"]

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from concurrent.futures import BrokenExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
 from typing import TYPE_CHECKING, TypeVar
 
 from vplog.errors import VplogError, was_interrupted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-    from concurrent.futures import Executor, Future
-
     Task = TypeVar("Task")
     Result = TypeVar("Result")
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Features, Frame
 from vplog.errors import LogError
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
 from vplog.masking import masked
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from vplog.data import Features, Frame
     from vplog.execution.execution import Execution
     from vplog.stages import EncodedFrame, Extractor
 

@@ -7,20 +7,16 @@ L1 distances mean what they mean for SIFT.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from vplog.data import Features
+from vplog.data import Bytes, Features, Float32s
 from vplog.errors import LibraryError
 from vplog.features.sift import depth_at, thumbnail_of_image
 from vplog.networks.onnx_model import NetworkInput, NetworkSettings
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Float32s
 
 _LENGTH = np.float32(512)
 """Length of a descriptor, as of SIFT's by OpenCV, for which thresholds are meant."""

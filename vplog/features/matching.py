@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bytes, Features, Ints
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Features, Ints
 
 _EXACT = 1 << 24
 """Integers up to 2^24 are exact in float32, so no order of summation changes a distance (IEEE 754)."""

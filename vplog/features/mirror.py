@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Features
+from vplog.data import Features
 
 _CELLS, _BINS = 4, 8
 """Cells on a side of a SIFT descriptor, and directions of the gradient in each (Lowe 2004, section 6.1)."""

@@ -7,22 +7,16 @@ wanted, the image is halved before.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Iterator
+from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from vplog.data import THUMBNAIL_SIDE, Features
+from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Float32s
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Float32s
-
 
 _TAILS = (1, 99)
 """Percentiles of an image that become black and white."""

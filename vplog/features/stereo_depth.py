@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Features, Float32s
 from vplog.features.matching import squared_distances
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Features, Float32s
 
 
 class StereoSettings(Settings):

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from typing import TYPE_CHECKING, Self
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.errors import ResultError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SIFT_BYTES = 128
 """Of a descriptor."""
@@ -66,9 +64,7 @@ class FeatureStore:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(
-            OSError
-        ):  # a full disk fails again here; append has raised it, and the file is removed
+        with suppress(OSError):  # a full disk fails again, as in append, and the file is removed
             self._file.close()
         self._path.unlink(missing_ok=True)
 

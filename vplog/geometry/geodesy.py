@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Floats, Gps, Ints
+from vplog.data import Floats, Gps, Ints
 
 _SEMI_MAJOR_M = 6_378_137.0
 """m, WGS84 (NIMA TR8350.2, table 3.1)."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Floats
+from vplog.data import Floats
 
 _SMALL_ANGLE = 1e-7
 """rad; below it the Taylor series is exact to double precision."""

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import io
 from decimal import Decimal, InvalidOperation
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints, Trajectory
 from vplog.geometry import se3
 from vplog.storage.remote_path import reason
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Floats, Ints, Trajectory
     from vplog.errors import VplogError
 
 _LINE_LIMIT = 4096

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Camera, Features, Frame, Ints, Verdict
 from vplog.errors import LibraryError, LogError
 from vplog.features.extraction import describe
 from vplog.geometry import se3
 from vplog.loops.localize import Localization, localize
 from vplog.masking import masked
 from vplog.results.geo import on_earth
-from vplog.stages import FrameState, StoredState
+from vplog.stages import EncodedFrame, FrameState, Log, StoredState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from vplog.data import Camera, Features, Frame, Ints
     from vplog.execution.execution import Execution
     from vplog.localize.places import Places
-    from vplog.stages import EncodedFrame, Log
 
 TOP = 10
 """Places that a picture is verified against."""

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from typing import Any, Self
 
 import cv2
 import numpy as np
 
 from vplog import logs
-from vplog.data import Camera, Frame
+from vplog.data import Bytes, Camera, Frame
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.localize.localize import LocalizedPicture, localize_frame
 from vplog.localize.places import Places, opened
 from vplog.storage.remote_path import located
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.data import Bytes
 
 
 class Localizer:

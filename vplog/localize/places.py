@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import threading
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -20,7 +23,7 @@ from vplog.maps.joining.drive_pairs import known_camera
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, opened_log
 from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import update_index
+from vplog.maps.search.index import SegmentView, update_index
 from vplog.maps.search.query import open_map
 from vplog.maps.search.sequences import best_lines
 from vplog.maps.storage import map_store
@@ -31,24 +34,17 @@ from vplog.results import run_record, tables
 from vplog.results.landmark_table import LandmarkTable
 from vplog.run.landmarks import LANDMARKS, landmark_key, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
-from vplog.stages import CodedState
+from vplog.stages import CodedState, PlaceState
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
 from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from contextlib import AbstractContextManager
-    from pathlib import Path
-
-    from vplog.data import Floats
     from vplog.loops.candidate import Drive
     from vplog.loops.verify import VerifySettings
-    from vplog.maps.search.index import SegmentView
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
     from vplog.results.geo import Earth
-    from vplog.stages import PlaceState
 
     Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
     """Drive and keyframe of the likeliest places of each of some descriptors, best first."""

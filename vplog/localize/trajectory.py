@@ -7,26 +7,22 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from vplog.data import EdgeKind, PoseGraph
+from vplog.data import Bools, EdgeKind, Floats, Ints, Keyframes, Odometry, PoseGraph, Trajectory
 from vplog.geometry import se3
 from vplog.graph.build import build_graph, checked
 from vplog.graph.consistency import is_loop
 from vplog.graph.correct_trajectory import correct_trajectory
-from vplog.graph.noise import edge_covariance
+from vplog.graph.noise import NoiseSettings, edge_covariance
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints, Keyframes, Odometry, Trajectory
-    from vplog.graph.noise import NoiseSettings
     from vplog.graph.solve import OptimiserSettings
 
 
 class JoinedSettings(Protocol):
     """The settings that this takes, as the pipeline has them."""
 
-    @property
-    def noise(self) -> NoiseSettings: ...
-    @property
-    def solve(self) -> OptimiserSettings: ...
+    noise: NoiseSettings
+    solve: OptimiserSettings
 
 
 class JoinedLog(NamedTuple):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,17 +16,13 @@ from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
 from vplog.localize.localize import TOP, LocalizedPicture, localize_log
-from vplog.localize.places import opened
+from vplog.localize.places import Places, opened
 from vplog.localize.trajectory import JoinedLog, join_by_odometry
 from vplog.results.localized_table import write_localized
 from vplog.results.tables import TableMetadata
 from vplog.run.keyframes import select_keyframes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.localize.places import Places
     from vplog.stages import Log
 
 _AT_ODDS = "At odds with the other pictures by the log's odometry, so it has no pose."
@@ -39,7 +37,8 @@ def localize_paths(
     `out` is a table (.parquet) or a trajectory (.tum): of the cameras of pictures, or of the body of a log.
     """
     _check_out(out)
-    log = open_pictures_or_log(paths, topics)
+    is_log = len(paths) == 1 and not logs.is_image_file(paths[0])
+    log = logs.open(paths[0], topics) if is_log else logs.open_images(paths, topics)
     with opened(root, execution) as places:
         stamps, keyframes, warnings = _frames(log, places)
         found = list(localize_log(places, log, stamps, execution, top))
@@ -61,13 +60,6 @@ def localize_paths(
             "warnings": log.warnings + warnings + places.warnings,
             "answers": records,
         }
-
-
-def open_pictures_or_log(paths: Sequence[Path], topics: logs.TopicChoice | None) -> Log:
-    """One log, or files of pictures as one. Raises LogError."""
-    if len(paths) == 1 and not logs.is_image_file(paths[0]):
-        return logs.open(paths[0], topics)
-    return logs.open_images(paths, topics)
 
 
 def _check_out(out: Path | None) -> None:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Floats, Ints, Keyframes
 from vplog.geometry import se3
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, Keyframes
 
 
 class CalibrationSettings(Settings):

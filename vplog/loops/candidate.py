@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Verdict
+from vplog.data import Camera, Features, Floats, Keyframes, Verdict
 from vplog.features.matching import MatchSettings, first_matches, match_features
 from vplog.geometry import se3
 from vplog.loops import undistort, verify_epipolar, verify_metric
@@ -19,9 +20,6 @@ from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Camera, Features, Floats, Keyframes
     from vplog.loops.landmarks import FeaturesOf
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 from scipy.optimize import isotonic_regression
 
-from vplog.data import Verdict
+from vplog.data import Bools, Closures, Floats, Ints, Verdict
 from vplog.features.mirror import mirrored
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
@@ -23,7 +23,6 @@ from vplog.places.match_probability import conformal_p
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Closures, Floats, Ints
     from vplog.execution.execution import Execution
     from vplog.loops.candidate import Drive
 

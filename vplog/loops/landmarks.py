@@ -7,23 +7,19 @@ that measure disparity have one constant error in it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Camera, Features, Floats, Keyframes
 from vplog.features import matching
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.settings import Settings
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.data import Camera, Features, Floats, Keyframes
-
-    FeaturesOf = Callable[[int], Features]
+FeaturesOf = Callable[[int], Features]
 
 
 class LandmarkSettings(Settings):

@@ -3,12 +3,13 @@ that agree."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Camera, Features, Floats, Ints, Verdict
 from vplog.features.matching import match_features
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort, verify_metric
@@ -17,9 +18,6 @@ from vplog.loops.landmarks import Landmarks, inverse_depth
 from vplog.loops.verify_metric import Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Camera, Features, Floats, Ints
     from vplog.loops.verify import VerifySettings
 
 _CHI2_2 = 9.210

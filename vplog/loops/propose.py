@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bools, Float32s, Int32s, Ints, Keyframes, Ranking
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Bools, Float32s, Int32s, Ints, Keyframes, Ranking
 
 
 class ProposeSettings(Settings):

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from vplog.data import Structure
-from vplog.features.matching import match_features
+from vplog.data import Bools, Camera, Closures, Float32s, Floats, Ints, Structure
+from vplog.features.matching import MatchSettings, match_features
 from vplog.geometry import se3
 from vplog.loops import undistort
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Bools, Camera, Closures, Float32s, Floats, Ints
     from vplog.execution.execution import Execution
-    from vplog.features.matching import MatchSettings
     from vplog.loops.landmarks import FeaturesOf
 
 _NEIGHBOURS = 3

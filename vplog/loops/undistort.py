@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 
+from vplog.data import Camera, Floats
 from vplog.errors import LogError
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats
 
 MODELS = ("none", "plumb_bob", "rational_polynomial", "equidistant")
 _STEPS = 10

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Closures, Verdict
+from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes, Verdict
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
@@ -15,7 +15,6 @@ from vplog.loops.candidate import Drive, Row, VerifySettings, check_queries, che
 from vplog.loops.landmarks import for_stereo
 
 if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Int32s, Ints, Keyframes
     from vplog.execution.execution import Execution
     from vplog.loops.landmarks import FeaturesOf
     from vplog.loops.propose import Proposals

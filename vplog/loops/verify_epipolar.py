@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Verdict
+from vplog.data import Bools, Float32s, Verdict
 from vplog.loops.verify_metric import Pose, log10_false_alarms
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Float32s
 
 _SAMPLE = 7
 """Matches that fix a fundamental matrix."""

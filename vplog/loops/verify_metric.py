@@ -6,6 +6,7 @@ has no wheel for Linux on ARM.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import lgamma, log, log10
 from typing import TYPE_CHECKING
@@ -14,15 +15,12 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Verdict
+from vplog.data import Camera, Floats, Verdict
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Camera, Floats
     from vplog.loops.landmarks import Landmarks, LandmarkSettings
 
 _SAMPLE = 3

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vplog.data import Floats
 from vplog.figures.run_figures import earth_of
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.geo import Earth, on_earth
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats
-
-    Box = tuple[float, float, float, float]
-    """South, west, north, east in degrees; west of more than east crosses the antimeridian."""
+Box = tuple[float, float, float, float]
+"""South, west, north, east in degrees; west of more than east crosses the antimeridian."""
 
 
 _DECIMALS = 7

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,25 +22,16 @@ from vplog.maps.geo_bounds import earth_from_record, earth_record
 from vplog.maps.storage import layout, map_store
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
-from vplog.results.places_map import read_drives, read_places_header
+from vplog.results.places_map import DrivePlaces, PlacesHeader, read_drives, read_places_header
 from vplog.storage.remote_path import original
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
     import pyarrow as pa
 
     from vplog.maps.storage.map_store import Store
-    from vplog.results.places_map import DrivePlaces, PlacesHeader
 
 PLACES_ONLY = "places_of"
 """Field in drive.json of such a drive: the file that it is from."""
-
-
-def library_of_file(path: Path) -> str:
-    """The hash of the library that an exported file's places are described with. Raises ResultError."""
-    return read_places_header(path).library
 
 
 def drives_of_file(path: Path) -> dict[str, dict[str, Any]]:

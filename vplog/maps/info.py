@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
@@ -20,9 +22,6 @@ from vplog.storage.folders import regular_files
 from vplog.storage.parquet_limits import open_table
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from vplog.maps.storage.map_store import Store
 
 _READ_AT_ONCE = 16

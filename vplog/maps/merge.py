@@ -5,25 +5,24 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of, library_of_file
+from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of
 from vplog.maps.joining.drive_pairs import DRIVE_FILES
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.damage import DamagedDriveError, damaged_files
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
-from vplog.results.places_map import places_by_drive
+from vplog.results.places_map import places_by_drive, read_places_header
 from vplog.storage.remote_path import local_copy, original
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
     from vplog.maps.storage.map_store import Store
 
 
@@ -82,7 +81,7 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
         if not source.exists():
             raise ResultError(f"There is neither a map nor an exported file at {source}.")
         if source.is_file():
-            found, name = library_of_file(source), original(source)
+            found, name = read_places_header(source).library, original(source)
             again = "Describe its map again (vplog map redescribe), and export that."
         else:
             with map_store.reading(source) as other:

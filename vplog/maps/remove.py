@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 
 def remove_drives(root: Path, drives: Sequence[str]) -> dict[str, Any]:

@@ -14,19 +14,16 @@ import hashlib
 import os
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from vplog.data import Bytes, Float32s, Frame
 from vplog.errors import LibraryError, SettingsError
 from vplog.settings import Settings, load_yaml
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Float32s, Frame
 
 _MAX_BYTES = 2**31
 """A protobuf message, and so an ONNX file with its weights inside, is smaller (onnx.ai/onnx/repo-docs/IR.html)."""

@@ -7,6 +7,8 @@ to the letter; here votes have the closed form of `expected_votes.py`, and the o
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numba
@@ -14,23 +16,18 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
 
-from vplog.data import Boxes
+from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences, Uint16s
 from vplog.errors import LibraryError
 from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
 from vplog.places.columns import from_column, to_column
 from vplog.places.library_files import ReferencesState, relearn
-from vplog.places.matches import Matches, Once, WeighedMatchSettings, index_references
+from vplog.places.matches import Matcher, Matches, Once, WeighedMatchSettings, index_references
 from vplog.places.overlap import list_shared
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences, Uint16s
     from vplog.execution.execution import Execution
     from vplog.places.code_search import Pairing
-    from vplog.places.matches import Matcher
 
 NOBODY = 65_535
 """The number of no reference, where fewer than J share anything."""

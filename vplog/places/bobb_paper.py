@@ -7,6 +7,7 @@ I boxes: each where the features of one window of the image are found again (sec
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Literal, Self
 
 import numba
@@ -14,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field, PositiveFloat, model_validator
 
-from vplog.data import Boxes
+from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp
@@ -23,9 +24,6 @@ from vplog.places.library_files import ReferencesState, RelearnedSettings
 from vplog.places.overlap import BoxIndex, BoxPlace, list_shared
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
     from vplog.execution.execution import Execution
 
 

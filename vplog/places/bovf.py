@@ -6,14 +6,17 @@ An image is its visual words and how often each occurs. Two images compare by th
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numba
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pydantic import Field
 
+from vplog.data import Bytes, Features, Float32s, Ranking, Reference
 from vplog.errors import LibraryError
 from vplog.places.columns import check_type, check_values, list_slices, to_lists
 from vplog.places.dense import best_rows
@@ -21,11 +24,6 @@ from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, postings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Features, Float32s, Ranking, Reference
     from vplog.execution.execution import Execution
 
 _WORD_BYTES, _PLACE_BYTES = 3, 4

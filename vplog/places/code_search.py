@@ -9,23 +9,20 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
-from vplog.data import Ranking
+from vplog.data import Bools, Bytes, Float32s, Ints, Ranking, Uint16s
 from vplog.errors import ResultError
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+Pairing = Literal["best", "same", "both"]
 
-    from vplog.data import Bools, Bytes, Float32s, Ints, Uint16s
-
-    Pairing = Literal["best", "same", "both"]
 
 BLOCK = 8192
 """Rows of a block: their bounds take 32 kB, a core's first cache; 4096 to 32768 cost the same to 20 %."""

@@ -7,6 +7,7 @@ record of a run only matches that keep their arrangement count, less the most th
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -14,15 +15,12 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from vplog.places.library import WordSettings, hnsw, l1_distance
+from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Keyframes
+from vplog.places.library import Library, Words, WordSettings, hnsw, l1_distance
 from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Keyframes
     from vplog.execution.execution import Execution
-    from vplog.places.library import Library, Words
 
 STRONGEST = 200
 """Features of a frame that the choice is made by: a quarter of what describes a place is enough."""

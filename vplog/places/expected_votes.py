@@ -7,13 +7,10 @@ are summed over a coarse grid, by one matrix of kernel and box for each side.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Floats
+from vplog.data import Bytes, Floats
 
 
 def box_sums(cells: int, patches: int, box: int) -> Floats:

@@ -10,13 +10,16 @@ through a Chow-Liu tree, z_p being the parent of z_q.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from vplog.data import Bools, Features, Float32s, Floats, Ranking, Reference
 from vplog.errors import LibraryError
 from vplog.places.columns import check_type, check_values, list_slices, to_lists
 from vplog.places.dense import ranked
@@ -33,11 +36,6 @@ from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Bools, Features, Float32s, Floats, Ranking, Reference
     from vplog.execution.execution import Execution
 
     Words = NDArray[np.uint16]

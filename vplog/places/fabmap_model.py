@@ -7,22 +7,18 @@ the true distribution; it is a maximum spanning tree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from vplog.data import Bools, Floats, Int32s, Ints, Reference
 from vplog.places.vocabulary import postings
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+Words = NDArray[np.uint16]
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Bools, Floats, Int32s, Ints, Reference
-
-    Words = NDArray[np.uint16]
 
 _FIXED_POINT = 2**32
 """Steps of 1 / 2^32 nats: sums of whole numbers are exact, so equal information ties in any order of the sum."""

@@ -5,22 +5,19 @@ The energy of a bank of Gabor filters over the prefiltered image, averaged over 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pydantic import Field
 
-from vplog.data import THUMBNAIL_SIDE
+from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Float32s, Reference
 from vplog.places.dense import VectorIndex, VectorState, nearness, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Features, Float32s, Reference
     from vplog.execution.execution import Execution
 
 _PREFILTER_PAD, _PREFILTER_CYCLES, _LEAST_CONTRAST = 5, 4, 0.2

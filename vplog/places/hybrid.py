@@ -7,16 +7,19 @@ representation, ACM MM 2013) of keypoints and patches, with the position in the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numba
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pydantic import Field
 
-from vplog.places.bobb import BobbSettings
-from vplog.places.code_search import Place
+from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
+from vplog.places.bobb import BobbSettings, BobbState
+from vplog.places.code_search import CodeIndex, Place
 from vplog.places.columns import from_column, to_column
 from vplog.places.dense import best_rows
 from vplog.places.library_files import ReferencesState, RelearnedSettings
@@ -24,14 +27,7 @@ from vplog.places.matches import keypoints_of, patches_of
 from vplog.places.vocabulary import ROOT_STEPS, spread_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
     from vplog.execution.execution import Execution
-    from vplog.places.bobb import BobbState
-    from vplog.places.code_search import CodeIndex
     from vplog.places.matches import Described
 
 _STEPS = 4096

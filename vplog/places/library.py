@@ -6,6 +6,7 @@ that are its near neighbours and close enough: several words per feature (sectio
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,14 +14,12 @@ import faiss
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.library_files import keep_references
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
     from vplog.execution.execution import Execution
 
 

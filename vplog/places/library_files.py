@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,10 +24,6 @@ from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
 
 _FORMAT = 1
 """Version of library.json. A reader refuses a newer one."""

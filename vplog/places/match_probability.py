@@ -10,13 +10,10 @@ the more queries have one, the more cautious the probabilities are.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-if TYPE_CHECKING:
-    from vplog.data import Float32s, Floats, Ints
+from vplog.data import Float32s, Floats, Ints
 
 _LEAST = 20
 """Queries, at least, from which rates can be learned: one more or less then changes them by 5 %."""

@@ -7,13 +7,15 @@ one absolute distance, a match here weighs by how much nearer it is than the fea
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numba
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Features, Float32s, Int32s, Reference
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 from vplog.places.library_files import keep_references
@@ -21,13 +23,9 @@ from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+Described = tuple[Float32s, Float32s]
+"""Descriptors (M, 128), whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
 
-    from vplog.data import Features, Float32s, Int32s, Reference
-
-    Described = tuple[Float32s, Float32s]
-    """Descriptors (M, 128), whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
 
 Value = TypeVar("Value")
 

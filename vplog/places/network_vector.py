@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
+from vplog.data import Bytes, Features, Frame, Reference
 from vplog.errors import LibraryError
 from vplog.networks.onnx_model import NetworkSettings
 from vplog.places.dense import VectorIndex, VectorState, products, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Features, Frame, Reference
     from vplog.execution.execution import Execution
 
 MAX_DIMENSIONS = 2**16

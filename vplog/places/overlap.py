@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
-from vplog.data import SharedReferences
+from vplog.data import Bytes, Float32s, Floats, Int32s, Ints, Ranking, SharedReferences, Uint16s
 from vplog.places.dense import best_rows
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+Compare = Callable[[Ints, Ints, Ints, Ints], tuple[Floats, Floats]]
 
-    from vplog.data import Bytes, Float32s, Floats, Int32s, Ints, Ranking, Uint16s
-
-    Compare = Callable[[Ints, Ints, Ints, Ints], tuple[Floats, Floats]]
 
 _PAIRS = 4096
 """Pairs of places that are compared at once: their references and boxes take some ten MB."""

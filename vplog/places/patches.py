@@ -7,15 +7,11 @@ have one direction (Dalal & Triggs, CVPR 2005).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
+from vplog.data import Bytes, Float32s
 from vplog.places.vocabulary import ROOT_STEPS
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s
 
 CELL = 8
 """px of the thumbnail along a cell; a patch is then a quarter of the image along each side."""

@@ -6,19 +6,18 @@ mine = "my_package.recogniser:MineSettings"
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from vplog.data import Reference
 from vplog.errors import SettingsError, nearest
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from vplog.data import Reference
     from vplog.execution.execution import Execution
     from vplog.stages import PlaceState
 

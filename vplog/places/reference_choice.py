@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Ints
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Ints
 
 PAPER_SIZE = 100
 """L of the paper's experiments (section IV)."""

@@ -7,15 +7,13 @@ similarity times the pixels it shares with the cell, which is the per-pixel algo
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Int32s
+from vplog.data import Floats, Int32s
 
 
 class Pattern(NamedTuple):

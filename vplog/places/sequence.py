@@ -8,6 +8,7 @@ a return begins or ends.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
@@ -16,13 +17,11 @@ import numba
 import numpy as np
 from pydantic import Field, model_validator
 
+from vplog.data import Float32s, Int32s, Ints, Ranking
 from vplog.places.dense import best_rows
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from vplog.data import Float32s, Int32s, Ints, Ranking
     from vplog.execution.execution import Execution
     from vplog.stages import PlaceIndex
 

@@ -5,6 +5,7 @@ Milford & Wyeth, SeqSLAM: Visual route-based navigation for sunny summer days an
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -12,14 +13,11 @@ import numba
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import THUMBNAIL_SIDE
+from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Reference
 from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from vplog.data import Bytes, Features, Reference
     from vplog.execution.execution import Execution
 
 _WIDTH, _HEIGHT, _PATCH = 64, 32, 8

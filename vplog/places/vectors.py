@@ -7,6 +7,7 @@ A pair of .npy files, `queries_descriptors.npy` and `database_descriptors.npy`, 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,8 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 from pydantic import model_validator
 
+from vplog.data import Features, Float32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.dense import VectorIndex, VectorState, nearness, products
 from vplog.places.library_files import RelearnedSettings, keep_references, references_hash
@@ -24,11 +27,6 @@ from vplog.places.network_vector import MAX_DIMENSIONS
 from vplog.storage.parquet_limits import open_table, read_table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Features, Float32s, Ints, Reference
     from vplog.execution.execution import Execution
     from vplog.stages import Log
 

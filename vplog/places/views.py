@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from vplog.data import Features, Ints
 from vplog.masking import masked
-from vplog.stages import FrameState, StoredState
+from vplog.stages import FrameState, Log, PlaceState, StoredState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from vplog.data import Features, Ints
     from vplog.execution.execution import Execution
-    from vplog.stages import Log, PlaceState
 
 
 @dataclass(frozen=True)

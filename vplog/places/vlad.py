@@ -6,24 +6,22 @@ Chum, Negative evidences and co-occurrences in image retrieval, ECCV 2012).
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pydantic import Field
 
+from vplog.data import Features, Float32s, Reference
 from vplog.errors import LibraryError
 from vplog.places.dense import VectorIndex, VectorState, products, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift, spread_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Features, Float32s, Reference
     from vplog.execution.execution import Execution
 
 _MAX_PCA_REFERENCES = 2000

@@ -6,20 +6,18 @@ centre is the same whatever the order of the sum, the number of threads or the m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import faiss
 import numpy as np
+from numpy.typing import NDArray
 
+from vplog.data import Bytes, Float32s, Int32s, Ints
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from vplog.data import Bytes, Float32s, Int32s, Ints
     from vplog.execution.execution import Execution
 
 ROOT_STEPS = np.float32(512)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from vplog.data import Camera
 from vplog.errors import ResultError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _CAMERA: dict[str, Callable[[Any], Any]] = {
     "name": str, "distortion_model": str, "width": int, "height": int, "disparity_zero_px": float, "baseline_m": float,

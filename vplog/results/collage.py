@@ -4,15 +4,12 @@ above, the references that both share below, with boxes and voting maps."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from vplog.data import Bools, Bytes, Floats
 from vplog.results.report.charts import subsampled
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Bytes, Floats
 
 _AGREES, _OTHER = (111, 224, 53), (61, 77, 255)
 """Blue, green, red: the green and red of `vplog explain`."""

@@ -7,19 +7,15 @@ top-left pixel.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from vplog.data import Bytes, Camera, Floats, Structure
 from vplog.errors import ResultError
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.data import Bytes, Camera, Floats, Structure
 
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of coefficients, of `plumb_bob` and `rational_polynomial`."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -11,9 +12,6 @@ from vplog.results import feature_table, landmark_table, localized_table, messag
 from vplog.results.mcap import TOPICS
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _HEADER = {
     "vplog.table": "Name of the table.",

@@ -6,8 +6,9 @@ One row group for each keyframe, so that any of them is read alone.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -17,10 +18,6 @@ from vplog.errors import ResultError
 from vplog.results.tables import FLOAT32_LIST, column
 from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY, check_columns, open_table, table_writer
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 _LEVEL = 1
 """Level of zstd: descriptors shrink by a fifth at any level."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -20,12 +21,8 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from vplog.data import Camera, Floats, Gps
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Camera, Floats, Gps
 
 Part = tuple[list[float], list[float]]
 """Position in m and quaternion x y z w of one pose, as plain numbers."""

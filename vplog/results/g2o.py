@@ -6,19 +6,15 @@ import heapq
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import EdgeKind, PoseGraph
+from vplog.data import Bools, EdgeKind, Floats, Int32s, Ints, PoseGraph
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Bools, Floats, Int32s, Ints
 
 _MOST_BYTES = 1 << 30
 """Largest file read: a million poses with as many edges, at 500 to 770 bytes of each. Arrays take up to 14 times the

@@ -6,22 +6,18 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import Verdict
+from vplog.data import Closures, Floats, Ints, Trajectory, Verdict
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic, utm, utm_zone
 from vplog.storage.parquet_limits import write_table
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Closures, Floats, Ints, Trajectory
 
 _DEGREE_DIGITS, _METRE_DIGITS = 8, 3
 """Decimals of GeoJSON: 1e-8 degrees are a millimetre."""

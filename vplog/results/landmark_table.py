@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import Features
+from vplog.data import Bytes, Camera, Features, Floats
 from vplog.errors import ResultError
 from vplog.results.camera_record import camera_from
 from vplog.results.run_record import plain
@@ -28,12 +30,6 @@ from vplog.storage.parquet_limits import (
     table_writer,
 )
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from vplog.data import Bytes, Camera, Floats
 
 _LEVEL = 3
 """Level of zstd."""

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from vplog.results.tables import MATRIX, TableMetadata, column, pose_columns
 from vplog.storage.parquet_limits import write_table
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 LOCALIZED = pa.schema(
     [
@@ -37,11 +36,7 @@ LOCALIZED = pa.schema(
 
 def write_localized(path: Path, records: Sequence[dict[str, Any]], metadata: TableMetadata) -> None:
     """Write the records of pictures, in order; `metadata` is that of the map."""
-    rows = [{**one, "covariance": _flat(one.get("covariance"))} for one in records]
+    rows = [{**one, "covariance": np.ravel(one["covariance"])} if "covariance" in one else one for one in records]
     table = pa.Table.from_pylist(rows, LOCALIZED.with_metadata({**metadata.record(), "vplog.table": "localized"}))
     with replacing(path) as stream:
         write_table(stream, table, compression="zstd")
-
-
-def _flat(matrix: list[list[float]] | None) -> list[float] | None:
-    return None if matrix is None else [value for row in matrix for value in row]

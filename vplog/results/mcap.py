@@ -8,33 +8,30 @@ from __future__ import annotations
 import heapq
 import re
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
 import vplog
-from vplog.data import EdgeKind, Verdict
+from vplog.data import Camera, Closures, EdgeKind, Floats, Gps, Ints, Keyframes, PoseGraph, Verdict
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
 from vplog.results.run_record import canonical_json
-from vplog.results.tables import covariance_of
+from vplog.results.tables import TableMetadata, covariance_of
 from vplog.storage.image_file import image_size
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from google.protobuf.message import Message
 
-    from vplog.data import Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph
     from vplog.results.foxglove import Part
     from vplog.results.geo import Earth
-    from vplog.results.tables import TableMetadata
 
     Timed = tuple[int, str, Message]
     """Log time in ns, topic, message."""

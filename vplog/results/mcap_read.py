@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -15,21 +16,13 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 
-from vplog.data import Gps
+from vplog.data import Floats, Gps
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.foxglove import CAMERA
 from vplog.results.mcap import FIXES, PICTURES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from mcap.reader import McapReader
-
-    from vplog.data import Floats
 
 
 @dataclass(frozen=True, eq=False)

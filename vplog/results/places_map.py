@@ -8,26 +8,23 @@ header has the type of the bytes.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from vplog.data import Floats, Int32s, Ints
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results import geo, run_record, tables
 from vplog.storage.parquet_limits import check_size, filled, open_table, read_schema, table_writer
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from vplog.data import Floats, Int32s, Ints
 
 ROWS_PER_GROUP = 16_384
 """Places of a row group: 2 MB of the default's descriptors."""

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from vplog.data import Trajectory
 from vplog.geometry import se3
 from vplog.geometry.tum import seconds
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Trajectory
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> Path:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bytes
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes
 
 
 class PictureSettings(Settings):

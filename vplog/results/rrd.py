@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Closures, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.geo import on_earth
@@ -15,9 +16,6 @@ from vplog.results.mcap_read import read_camera_pose, read_images
 from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Closures
     from vplog.results.report.page import Tracks
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)

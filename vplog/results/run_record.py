@@ -6,17 +6,14 @@ import hashlib
 import json
 import math
 import shlex
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import Any
 
 from vplog.errors import ResultError
 from vplog.results.staging import recover
 from vplog.storage.folders import check_regular
 from vplog.storage.parquet_limits import check_file, check_version
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FORMAT = 1
 """Version of the records of runs and maps, as `format` in them. A new value does not raise it, another meaning does."""

@@ -11,17 +11,14 @@ import fcntl
 import json
 import os
 import shutil
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, TextIO
+from pathlib import Path, PurePosixPath
+from typing import TextIO
 
 from vplog.errors import ResultError, SettingsError
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import files_in, made_folder, put_in_place, replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
 
 _LOCK, _STAGING, _COMMITTED = ".vplog-lock", ".vplog-staging", ".vplog-committed"
 _STALE = ".stale.json"

@@ -8,16 +8,18 @@ a table. No clock, path or thread count enters a file, and row groups have a fix
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 
 import vplog
-from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
+from vplog.data import Closures, EdgeKind, Floats, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
 from vplog.results.run_record import canonical_json
@@ -30,12 +32,6 @@ from vplog.storage.parquet_limits import (
     write_table,
 )
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.data import Floats, Ints, Solution
 
 T = TypeVar("T", bound=StrEnum)
 

@@ -5,35 +5,38 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vplog.cache.steps import step
-from vplog.data import EdgeKind, Solution, Verdict
+from vplog.data import (
+    Closures,
+    EdgeKind,
+    Floats,
+    Gps,
+    Ints,
+    Keyframes,
+    Odometry,
+    PoseGraph,
+    Solution,
+    Trajectory,
+    Verdict,
+)
 from vplog.errors import GraphError
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import cost_of_fixes, fixes_on, noisier, with_fixes
+from vplog.graph.gps_factors import Fixes, GpsSettings, cost_of_fixes, fixes_on, noisier, with_fixes
 from vplog.graph.hypotheses import bounded
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import pose_covariances
-from vplog.graph.noise import broken_edges, edge_covariance
+from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.graph.pieces import pieces_placed
-from vplog.graph.refine import Scale, refine, rescaled
-from vplog.graph.solve import decided
+from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
+from vplog.graph.solve import OptimiserSettings, decided
 from vplog.graph.variance_components import Sigmas
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from vplog.data import Closures, Floats, Gps, Ints, Keyframes, Odometry, PoseGraph, Trajectory
-    from vplog.graph.gps_factors import Fixes, GpsSettings
-    from vplog.graph.noise import NoiseSettings
-    from vplog.graph.refine import Refined, RefineSettings
-    from vplog.graph.solve import OptimiserSettings
-
 
 _log = logging.getLogger(__name__)
 
@@ -41,14 +44,10 @@ _log = logging.getLogger(__name__)
 class BackEnd(Protocol):
     """The settings that these steps take."""
 
-    @property
-    def noise(self) -> NoiseSettings: ...
-    @property
-    def solve(self) -> OptimiserSettings: ...
-    @property
-    def refine(self) -> RefineSettings: ...
-    @property
-    def gps(self) -> GpsSettings: ...
+    noise: NoiseSettings
+    solve: OptimiserSettings
+    refine: RefineSettings
+    gps: GpsSettings
 
 
 @dataclass(frozen=True, eq=False)

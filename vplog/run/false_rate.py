@@ -9,25 +9,28 @@ import numpy as np
 
 from vplog.cache.codecs import closures_codec
 from vplog.cache.steps import step
-from vplog.data import Verdict
+from vplog.data import Bools, Camera, Closures, Ints, Keyframes, Odometry, Verdict
 from vplog.evaluate.body_truth import TruthAt
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.geometry import se3
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import OdometryChain
-from vplog.graph.noise import broken_edges, edge_covariance
-from vplog.loops.false_rate import MOST_APART, at_rate, certain_pairs, evidence, mirrored_evidence, with_p_false
-from vplog.loops.propose import candidate_stops
-from vplog.loops.verify import drive_of, verify_between
+from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
+from vplog.loops.false_rate import (
+    MOST_APART,
+    FalseRateSettings,
+    at_rate,
+    certain_pairs,
+    evidence,
+    mirrored_evidence,
+    with_p_false,
+)
+from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.loops.verify import VerifySettings, drive_of, verify_between
 
 if TYPE_CHECKING:
     from vplog.cache.feature_shards import Extracted
-    from vplog.data import Bools, Camera, Closures, Ints, Keyframes, Odometry
     from vplog.execution.execution import Execution
-    from vplog.graph.noise import NoiseSettings
-    from vplog.loops.false_rate import FalseRateSettings
-    from vplog.loops.propose import ProposeSettings
-    from vplog.loops.verify import VerifySettings
 
 _log = logging.getLogger(__name__)
 _FAR_M = 1e6

@@ -12,8 +12,10 @@ keyframes become references.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -25,6 +27,7 @@ from vplog.cache.input_hashes import files_of, hash_inputs
 from vplog.cache.stage_cache import (
     AbsentError,
     DamagedError,
+    Inputs,
     check_file,
     content_of,
     file_name,
@@ -33,28 +36,20 @@ from vplog.cache.stage_cache import (
     key_of,
     sealed,
 )
-from vplog.cache.steps import step
-from vplog.data import Keyframes
+from vplog.cache.steps import Steps, step
+from vplog.data import Features, Frame, Keyframes
 from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
-from vplog.results.previews import preview
-from vplog.run.keyframes import select_keyframes
+from vplog.results.previews import PictureSettings, preview
+from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.storage.remote_path import address, located
 from vplog.storage.scratch import replacing
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.cache.stage_cache import Inputs
-    from vplog.cache.steps import Steps
-    from vplog.data import Features, Frame
     from vplog.features.extractors import FeatureSettings
     from vplog.features.stereo_depth import StereoSettings
-    from vplog.results.previews import PictureSettings
-    from vplog.run.keyframes import KeyframeSettings
     from vplog.stages import Log
 
     Decoded = tuple[int, Frame | None, Features | None, str]
@@ -79,14 +74,10 @@ _POOR_SHARE = 0.1
 class Extraction(Protocol):
     """The settings that extraction takes, as the pipeline has them."""
 
-    @property
-    def keyframes(self) -> KeyframeSettings: ...
-    @property
-    def features(self) -> FeatureSettings: ...
-    @property
-    def stereo(self) -> StereoSettings: ...
-    @property
-    def pictures(self) -> PictureSettings: ...
+    keyframes: KeyframeSettings
+    features: FeatureSettings
+    stereo: StereoSettings
+    pictures: PictureSettings
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Keyframes
+from vplog.data import Floats, Ints, Keyframes, Odometry
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, Odometry
 
 _PAPER_SPACING_M = 1.0
 """m; the paper takes views 1-5 m apart (section IV): the near end."""

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from vplog import logs
 from vplog.cache.code_hash import code_of
+from vplog.data import Features, Floats
 from vplog.errors import ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.landmarks import landmarks_of
 from vplog.loops.undistort import project
-from vplog.loops.verify import drive_of
+from vplog.loops.verify import VerifySettings, drive_of
 from vplog.results import run_record, tables
 from vplog.results.landmark_table import write_landmarks
 from vplog.results.run_record import CACHE
@@ -25,13 +28,8 @@ from vplog.run.reextraction import ReextractedFeatures
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.data import Features, Floats
     from vplog.execution.execution import Execution
     from vplog.loops.candidate import Drive
-    from vplog.loops.verify import VerifySettings
 
 LANDMARKS = "landmarks.parquet"
 """Name of the file."""
@@ -45,8 +43,7 @@ _LOOKED_AT = 16
 class DriveSettings(Extraction, Protocol):
     """The settings that landmarks take, as the pipeline has them."""
 
-    @property
-    def verify(self) -> VerifySettings: ...
+    verify: VerifySettings
 
 
 @contextmanager

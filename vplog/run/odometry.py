@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.cache.codecs import json_codec
-from vplog.cache.steps import step
-from vplog.data import Odometry
+from vplog.cache.steps import Steps, step
+from vplog.data import Camera, Frame, Keyframes, Odometry
 from vplog.errors import LogError
 from vplog.masking import masked
 from vplog.odometry.visual import visual_odometry
 from vplog.run.feature_extraction import image_topics
-from vplog.run.keyframes import select_keyframes
+from vplog.run.keyframes import KeyframeSettings, select_keyframes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from vplog.cache.stage_cache import Inputs
-    from vplog.cache.steps import Steps
-    from vplog.data import Camera, Frame, Keyframes
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
-    from vplog.run.keyframes import KeyframeSettings
     from vplog.stages import EncodedFrame, Log
 
 _log = logging.getLogger(__name__)

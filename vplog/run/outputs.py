@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.cache.steps import step
-from vplog.data import EdgeKind, Verdict
+from vplog.cache.steps import Steps, step
+from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Reference, Solution, Verdict
 from vplog.figures.run_figures import ClosureInputs, earth_of, mcap_extras, reference_use
 from vplog.geometry import tum
 from vplog.graph import consistency
@@ -15,22 +17,16 @@ from vplog.graph.certificate import certify
 from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
-from vplog.run.back_end import about_gps, keyframe_covariances
+from vplog.run.back_end import Solved, about_gps, keyframe_covariances
 from vplog.run.report import write_report
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
     from vplog.cache.feature_shards import Extracted
-    from vplog.cache.steps import Steps
-    from vplog.data import Camera, Closures, Keyframes, Odometry, PoseGraph, Reference, Solution
     from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
     from vplog.places.coverage import Coverage
     from vplog.results.previews import PictureSettings
-    from vplog.run.back_end import Solved
     from vplog.stages import Log, PlaceState
 
 

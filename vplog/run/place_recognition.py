@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -9,21 +10,15 @@ import numpy as np
 
 from vplog.cache.codecs import columns_codec, descriptors_codec
 from vplog.cache.steps import step
-from vplog.data import SharedReferences
-from vplog.loops.propose import Proposals, candidate_stops, propose
-from vplog.places.sequence import rank_places
+from vplog.data import Closures, Int32s, Keyframes, SharedReferences
+from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
+from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.places.views import views_of
-from vplog.stages import BoxState
+from vplog.stages import BoxState, Log, PlaceState
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from vplog.cache.feature_shards import Extracted
-    from vplog.data import Closures, Int32s, Keyframes
     from vplog.execution.execution import Execution
-    from vplog.loops.propose import ProposeSettings
-    from vplog.places.sequence import SequenceSettings
-    from vplog.stages import Log, PlaceState
 
 
 @step(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import vplog
@@ -16,9 +18,6 @@ from vplog.results import run_record
 from vplog.storage.remote_path import local_copy, located, original, reason
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
     from vplog.settings import Settings
     from vplog.stages import Log
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from vplog.data import Features, Ints
 from vplog.errors import LogError
 from vplog.features.extraction import extract_frames
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Features, Ints
     from vplog.execution.execution import Execution
     from vplog.features.store import FeatureStore
     from vplog.run.feature_extraction import Extraction

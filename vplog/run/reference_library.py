@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 from vplog import logs
 from vplog.cache.codecs import images_codec, json_codec
 from vplog.cache.steps import step
-from vplog.data import Reference
+from vplog.data import Bytes, Ints, Keyframes, Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
@@ -28,19 +30,14 @@ from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
 from vplog.places.library_files import check_descriptors, load_references, read_library_record, read_sources
 from vplog.places.plugin import PluginSettings
-from vplog.places.reference_choice import PAPER_SIZE, choose, evenly
+from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose, evenly
 from vplog.results.staging import recover, staged
 from vplog.storage.folders import check_regular
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
     from vplog.cache.feature_shards import Extracted
-    from vplog.data import Bytes, Ints, Keyframes
     from vplog.features.extractors import FeatureSettings
     from vplog.places import PlaceSettings
-    from vplog.places.reference_choice import LibrarySettings
     from vplog.stages import Log, PlaceState
 
 
@@ -50,12 +47,9 @@ _log = logging.getLogger(__name__)
 class Describing(Protocol):
     """The settings that a library is made with, as the pipeline has them."""
 
-    @property
-    def features(self) -> FeatureSettings: ...
-    @property
-    def library(self) -> LibrarySettings: ...
-    @property
-    def places(self) -> PlaceSettings: ...
+    features: FeatureSettings
+    library: LibrarySettings
+    places: PlaceSettings
 
 
 def check_library(folder: Path | None, pipeline: Describing) -> None:

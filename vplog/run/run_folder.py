@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from glob import escape
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import Any
 
 from vplog.cache.input_hashes import bytes_of, hash_inputs
 from vplog.cache.stage_cache import CACHE_FILES, ENDING
@@ -19,10 +20,6 @@ from vplog.results.staging import staged
 from vplog.run import provenance
 from vplog.storage.folders import check_regular
 from vplog.storage.remote_path import located, stands_for
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
-    from pathlib import Path
 
 _RUN_FILES = (
     "run.json", "report.html", "result.mcap", "graph.g2o", "trajectory.tum", "keyframes.parquet", "descriptors.parquet",

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Closures, Verdict
+from vplog.data import Bools, Closures, Int32s, Ints, SharedReferences, Verdict
 from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, propose
-from vplog.loops.verify import verify_between
+from vplog.loops.verify import Drive, verify_between
 from vplog.places.sequence import rank_places
 from vplog.run.place_recognition import shared_of
 from vplog.run.verification import merged
-from vplog.stages import index_of_part
+from vplog.stages import PlaceState, index_of_part
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Mapping, Sequence
-
-    from vplog.data import Bools, Int32s, Ints, SharedReferences
     from vplog.graph.joint import JoinSettings
-    from vplog.loops.verify import Drive
     from vplog.pipeline import Pipeline
-    from vplog.stages import PlaceState
 
 _NO_POSE = (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.TOO_FEW_INLIERS)
 """Verdicts without geometric evidence that both views are of one place."""

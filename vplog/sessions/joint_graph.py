@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import EdgeKind, Verdict
+from vplog.data import Closures, EdgeKind, Floats, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
 from vplog.graph.correct_trajectory import correct_trajectory
@@ -15,10 +17,6 @@ from vplog.results import tables
 from vplog.run.back_end import by_odometry
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from vplog.data import Closures, Floats, Keyframes, Odometry, PoseGraph, Trajectory
     from vplog.pipeline import Pipeline
 
     Ledgers = Mapping[tuple[int, int], Closures]

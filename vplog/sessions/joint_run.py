@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
+from vplog.data import Closures
 from vplog.errors import SettingsError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.timing import StageTimer
 from vplog.geometry import tum
-from vplog.loops.verify import calibration_share, drive_of, no_closures
+from vplog.loops.verify import Drive, calibration_share, drive_of, no_closures
+from vplog.pipeline import Pipeline, Run
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
@@ -25,13 +29,7 @@ from vplog.sessions.inter_session import candidates_among, closures_between, lik
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.data import Closures
     from vplog.graph.joint import Joined
-    from vplog.loops.verify import Drive
-    from vplog.pipeline import Pipeline, Run
     from vplog.sessions.joint_graph import Ledgers
     from vplog.stages import PlaceState
 

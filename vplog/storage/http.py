@@ -7,14 +7,12 @@ import re
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.storage.urls import without_secrets
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _TIMEOUT_S = 30.0
 """Timeout of a server without an answer."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 import struct
 import zlib as stored_zlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,8 +21,6 @@ try:
 except ImportError:  # no wheel for this processor
     import zlib
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors of files are raised here
 

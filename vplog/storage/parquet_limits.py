@@ -13,18 +13,16 @@ import io
 import stat
 import struct
 import zlib
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from vplog.errors import NewerError
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
-    from pathlib import Path
 
 ALWAYS_BYTES = 1 << 26
 """Any file may come to so much: hundreds of thousands of the default's places, of whatever size the file is."""

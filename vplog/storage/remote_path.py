@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import urllib.parse
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -24,8 +25,6 @@ from vplog.storage.scratch import scratch
 from vplog.storage.urls import shown, without_secrets
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from pyarrow.fs import FileInfo, FileSystem
 
 SCHEMES = ("s3", "gs", "http", "https")

@@ -6,21 +6,19 @@ import fcntl
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vplog.errors import ResultError
 from vplog.storage.folders import is_below, regular_files
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+Bytes = NDArray[np.uint8]
 
-    from numpy.typing import NDArray
-
-    Bytes = NDArray[np.uint8]
 
 _PIECE_BYTES = 2**24
 """Bytes of a file sent at once: Ray's smallest store has 75 MiB and needs room for several; 16 MiB take 10 ms to

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from vplog.data import Camera, Frame, LogInfo, Reference
+from vplog.data import Bytes, Camera, Frame, Gps, Ints, LogInfo, Odometry, Reference, Trajectory
 from vplog.features.sift import SiftSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from vplog.data import Bytes, Gps, Ints, Odometry, Trajectory
 
 WIDTH, HEIGHT = 320, 200
 

@@ -10,24 +10,20 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from vplog.data import Reference
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places.views import views_of
-from vplog.stages import index_of_part
+from vplog.stages import PlaceState, index_of_part
 from vplog.testing.pictures import Drive, reference
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Reference
-    from vplog.stages import PlaceState
 
 COUNT = 12
 """Pictures of a library and of a map."""

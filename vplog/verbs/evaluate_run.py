@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Gps, Trajectory
+from vplog.data import Floats, Gps, Keyframes, Trajectory
 from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, trajectory
-from vplog.evaluate.body_truth import body_truth
+from vplog.evaluate.body_truth import BodyTruth, body_truth
 from vplog.evaluate.closure_pose import pose_bounds
 from vplog.evaluate.truth import ate_to_gps, read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
@@ -20,11 +21,7 @@ from vplog.storage.folders import is_below
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog import logs
-    from vplog.data import Floats, Keyframes
-    from vplog.evaluate.body_truth import BodyTruth
 
 
 _PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."

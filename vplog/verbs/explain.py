@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import logs
+from vplog.data import Closures, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
-from vplog.figures.closure_view import find_agreement, find_boxes
+from vplog.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.results import run_record, tables
 from vplog.run.provenance import reopened
-from vplog.stages import BoxState
+from vplog.stages import BoxState, Log
 from vplog.verbs import explain_text
 from vplog.verbs.explain_figure import View, draw
 from vplog.verbs.report import frames_at, recorded_pipeline, recorded_places
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Closures, Keyframes
-    from vplog.figures.closure_view import SharedBoxes
     from vplog.pipeline import Pipeline
-    from vplog.stages import Log
 
 
 def explain(

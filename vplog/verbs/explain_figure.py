@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Bytes, Floats, Verdict
 from vplog.figures.canvas import as_text, saved_figure
 from vplog.results.report.charts import subsampled
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from matplotlib.axes import Axes
 
-    from vplog.data import Bytes, Floats
     from vplog.figures.closure_view import Agreement, SharedBoxes
     from vplog.verbs.explain_text import Explanation
 

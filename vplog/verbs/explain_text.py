@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Floats, Keyframes, Verdict
 from vplog.geometry import se3 as geometry
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Keyframes
     from vplog.pipeline import Pipeline
 
     Row = dict[str, Any]

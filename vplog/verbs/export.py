@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
@@ -16,8 +17,6 @@ from vplog.storage.scratch import replacing
 from vplog.verbs.export_images import FOLDERS, export_images
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.results.geo import Earth
     from vplog.results.report.page import Tracks
 

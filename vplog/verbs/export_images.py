@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from vplog import logs
+from vplog.data import Bytes, Features, Ints, Structure
 from vplog.errors import SettingsError
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
@@ -20,9 +22,6 @@ from vplog.storage.scratch import scratch
 from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Bytes, Features, Ints, Structure
     from vplog.execution.execution import Execution
     from vplog.pipeline import Pipeline
     from vplog.stages import EncodedFrame, Log

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from vplog import logs
+from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
 from vplog.errors import LogError
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
@@ -23,10 +26,6 @@ from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
     from vplog.logs import TopicChoice
     from vplog.stages import Log
 

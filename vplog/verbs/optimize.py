@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
 
-from vplog.data import EdgeKind, PoseGraph, Solution
+from vplog.data import EdgeKind, Ints, PoseGraph, Solution
 from vplog.errors import GraphError
 from vplog.execution.timing import StageTimer
 from vplog.geometry.se3 import inverse
 from vplog.graph.build import checked, parts, subgraph
 from vplog.graph.certificate import solve_certified
 from vplog.graph.solve import OptimiserSettings, decided
-from vplog.results.g2o import read_g2o, write_g2o
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from vplog.data import Ints
-    from vplog.results.g2o import GraphFile
+from vplog.results.g2o import GraphFile, read_g2o, write_g2o
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import logs
-from vplog.data import Gps
+from vplog.data import Bytes, Features, Gps, Ints
 from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
 from vplog.evaluate.closures import closure_sentences
 from vplog.execution.execution import Execution
@@ -26,11 +27,8 @@ from vplog.storage.urls import shown
 from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, log_truth
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pyarrow import Array
 
-    from vplog.data import Bytes, Features, Ints
     from vplog.stages import Log, PlaceState
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from vplog import logs
 from vplog.cache.stage_cache import inputs_of, key_of
@@ -16,10 +18,6 @@ from vplog.results.staging import recover
 from vplog.run.provenance import OWN_LIBRARY, stat_of, stored_log
 from vplog.storage.folders import check_regular
 from vplog.storage.remote_path import located
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,7 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
     if not isinstance(about, dict) or not all(path.exists() for path in paths) or stat_of(paths) == about:
         return  # of an older version; or the run reports what is missing
     now = inputs_of(paths, out / CACHE)
-    if now.token == key_of(
-        now.signature
-    ):  # the cache does not know the content either, so nothing of it would be found
+    if now.token == key_of(now.signature):  # the cache does not know it either: nothing of it would be found
         given = shlex.join(map(str, paths))
         raise LogError(f"{given} changed since the run in {out} began. Begin it again: vplog run {given} -o {out}")
 

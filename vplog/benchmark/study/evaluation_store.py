@@ -6,13 +6,15 @@ Results are stored under a hash of all their inputs, so an interrupted study res
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import permutations
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.benchmark.method_scores import describe_traversal, score_table, search, stored_bytes
-from vplog.benchmark.traversals import candidate_stops, extract_traversal, images_at
-from vplog.data import Reference
+from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, images_at
+from vplog.data import Bytes, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.execution.execution import Execution
@@ -21,12 +23,7 @@ from vplog.places.reference_choice import LibrarySettings, choose
 from vplog.results.run_record import canonical_json, read_run_json, write_run_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
     from vplog.benchmark.feature_cache import FeatureFolder
-    from vplog.benchmark.traversals import Traversal
-    from vplog.data import Bytes, Ints
     from vplog.evaluate.pairs import Pairs
     from vplog.evaluate.place_truth import PlaceTruth
     from vplog.evaluate.retrieval import Ranks

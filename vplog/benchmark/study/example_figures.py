@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.benchmark.study.charts import explain
-from vplog.benchmark.study.experiments import box_methods
+from vplog.benchmark.study.experiments import StudyOptions, box_methods
+from vplog.data import Boxes, Bytes, Floats
 from vplog.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
     from matplotlib.axes import Axes
 
     from vplog.benchmark.study.evaluation_store import Bench
-    from vplog.benchmark.study.experiments import StudyOptions
-    from vplog.data import Boxes, Bytes, Floats
     from vplog.stages import BoxState
 
 _SHOWN = 4

@@ -5,20 +5,18 @@ Numbers of figures are those of Tanaka et al., Mining Visual Phrases for Long-Te
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from vplog.benchmark.feature_cache import CacheChoice
 from vplog.benchmark.recogniser_specs import read_method
-from vplog.benchmark.study.evaluation_store import LESS_IS_BETTER, SCORES, Evaluation, Library
+from vplog.benchmark.study.evaluation_store import LESS_IS_BETTER, SCORES, Bench, Evaluation, Library
 from vplog.errors import SettingsError
 from vplog.places.reference_choice import PAPER_SIZE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from vplog.benchmark.study.evaluation_store import Bench
     from vplog.logs import TopicChoice
 
     Row = dict[str, Any]

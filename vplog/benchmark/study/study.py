@@ -8,6 +8,7 @@ import re
 import shutil
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from glob import escape
@@ -29,7 +30,7 @@ from vplog.benchmark.traversals import candidate_stops
 from vplog.cache.code_hash import code_of
 from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
-from vplog.evaluate.place_truth import TruthChoice, open_truth
+from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
 from vplog.results.staging import staged
@@ -37,9 +38,6 @@ from vplog.storage.folders import check_regular
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from vplog.evaluate.place_truth import PlaceTruth
     from vplog.pipeline import Pipeline
 
 EXPERIMENTS = (*NUMBERS, *PICTURES)

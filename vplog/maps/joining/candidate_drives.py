@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,17 +13,13 @@ from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import read_column, update_index
 from vplog.maps.search.sequences import PLACES_A_VIEW, drive_credits
 from vplog.maps.storage.damage import reading_drive
-from vplog.sessions.inter_session import candidates_among
-from vplog.stages import CodedState
+from vplog.sessions.inter_session import Candidates, candidates_among
+from vplog.stages import CodedState, PlaceState
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Mapping, Sequence
-
     from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
-    from vplog.sessions.inter_session import Candidates
-    from vplog.stages import PlaceState
 
 _CHOICE = 3
 """Drives searched for each that may be verified. Single views and sequences seldom differ in which drives score high,

@@ -13,15 +13,18 @@ KEY stands for all that the folder is made from, so one that a new drive does no
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.cache.code_hash import code_of
+from vplog.data import Closures, Odometry
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
-from vplog.graph.refine import about_odometry
+from vplog.graph.refine import Refined, about_odometry
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.storage.damage import DamagedDriveError, reading_drive
 from vplog.maps.storage.layout import key_of
@@ -30,12 +33,7 @@ from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solv
 from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from vplog.data import Closures, Odometry
     from vplog.execution.execution import Execution
-    from vplog.graph.refine import Refined
     from vplog.maps.joining.drive_pairs import JoinState
     from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store

@@ -11,23 +11,21 @@ What two drives have in common lies with the one that came later, so a new drive
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.cache.code_hash import code_of
+from vplog.data import SharedReferences
 from vplog.errors import ResultError
-from vplog.maps.joining.members import CameraTrust, camera_trust, keep_features, opened_drive
+from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_features, opened_drive
 from vplog.maps.storage.layout import folder_name, key_of, quoted
 from vplog.results import run_record, tables
 from vplog.sessions.inter_session import closures_between, with_shared
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import SharedReferences
     from vplog.execution.execution import Execution
     from vplog.loops.propose import Proposals
-    from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
 

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,23 +25,16 @@ from vplog.execution.timing import StageTimer
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
 from vplog.maps.joining.components import Drives, PairLedger, solve_groups
-from vplog.maps.joining.members import member_of, why_not_joined
+from vplog.maps.joining.members import CameraTrust, Member, member_of, why_not_joined
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.layout import PICTURES
-from vplog.maps.storage.map_store import reading, writing
+from vplog.maps.storage.map_store import Store, reading, writing
 from vplog.pipeline import Pipeline
 from vplog.results import tables
-from vplog.sessions.inter_session import likely_pairs
+from vplog.sessions.inter_session import DrivePair, likely_pairs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from concurrent.futures import Executor
-    from pathlib import Path
-
     from vplog.maps.joining.drive_pairs import PairTask
-    from vplog.maps.joining.members import CameraTrust, Member
-    from vplog.maps.storage.map_store import Store
-    from vplog.sessions.inter_session import DrivePair
     from vplog.stages import PlaceState
 
 _FLUSH_EVERY_S = 300.0

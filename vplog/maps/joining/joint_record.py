@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
@@ -11,9 +13,6 @@ from vplog.storage.folders import is_below
 from vplog.storage.parquet_limits import check_version
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from vplog.maps.storage.map_store import Store
 
 FORMAT = run_record.FORMAT

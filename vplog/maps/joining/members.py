@@ -3,39 +3,36 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import logs
 from vplog.cache.input_hashes import hash_inputs
+from vplog.data import Int32s, Ints
 from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
-from vplog.loops.verify import calibration_share, drive_of
+from vplog.loops.verify import VerifySettings, calibration_share, drive_of
 from vplog.maps.storage.layout import folder_name, key_of
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.camera_record import camera_from
 from vplog.results.feature_table import FeatureTable, write_features
-from vplog.run.feature_extraction import stored_features
+from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from vplog.data import Int32s, Ints
     from vplog.execution.execution import Execution
     from vplog.loops.candidate import Drive
-    from vplog.loops.verify import VerifySettings
     from vplog.maps.storage.map_store import Store
-    from vplog.run.feature_extraction import Extracted
     from vplog.stages import Log
 
     Fetch = Callable[[Int32s | Ints], None]

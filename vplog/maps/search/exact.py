@@ -7,23 +7,21 @@ their files, and the answers of shards are merged to those of one search.
 
 from __future__ import annotations
 
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
+from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import Segment, open_segment
 from vplog.places.code_search import CodeIndex
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from concurrent.futures import Executor
-    from pathlib import Path
-
-    from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
     from vplog.maps.search.index import SegmentView
     from vplog.places.bobb import Place
     from vplog.places.code_search import Pairing

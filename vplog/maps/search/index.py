@@ -10,14 +10,17 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
+from vplog.data import Int32s
 from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
@@ -28,10 +31,6 @@ from vplog.results import tables
 from vplog.storage.parquet_limits import check_file
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from vplog.data import Int32s
     from vplog.maps.storage.map_store import Store
     from vplog.stages import CodedState, PlaceState
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog import logs
+from vplog.data import Ints
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
-from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import update_index
+from vplog.maps.search.exact import Answers, best_places
+from vplog.maps.search.index import SegmentView, update_index
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
@@ -24,22 +28,14 @@ from vplog.places.views import views_of
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
 from vplog.run.keyframes import select_keyframes
-from vplog.stages import CodedState, FrameState, StoredState
+from vplog.stages import CodedState, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from concurrent.futures import Executor
-    from pathlib import Path
-
     import pyarrow as pa
 
-    from vplog.data import Ints
-    from vplog.maps.search.exact import Answers
-    from vplog.maps.search.index import SegmentView
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.map_store import Store
-    from vplog.stages import Log, PlaceState
 
 
 @dataclass(frozen=True)

@@ -15,23 +15,20 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from vplog.data import Bytes, Ints
 from vplog.errors import ResultError
 from vplog.places.code_search import MOST_ROWS, CodeLists, check_lists
 from vplog.results.run_record import canonical_json
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.data import Bytes, Ints
 
 SUFFIX = ".lists"
 _MAGIC = b"vplists\n"

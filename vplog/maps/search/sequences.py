@@ -9,25 +9,21 @@ views.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Floats, Int32s, Ints
 from vplog.execution.execution import Execution
 from vplog.maps.search.exact import NO_SCORE, Answers, answers_in_drive, merge, no_answers
 from vplog.maps.search.index import read_column
 from vplog.maps.storage.damage import reading_drive
-from vplog.places.sequence import rank_places
-from vplog.stages import index_of_part
+from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.stages import PlaceState, index_of_part
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from typing import Any
-
-    from vplog.data import Floats, Int32s, Ints
     from vplog.maps.storage.map_store import Store
-    from vplog.places.sequence import SequenceSettings
-    from vplog.stages import PlaceState
 
 EXACT_PLACES = 200_000
 """Up to so many places lines are drawn in every drive: some minutes of one core for a log of a thousand views."""

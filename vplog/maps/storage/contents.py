@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
@@ -21,9 +23,6 @@ from vplog.storage.folders import regular_files
 from vplog.storage.parquet_limits import check_version, read_footer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
     from vplog.maps.storage.remote_map import Mirror
     from vplog.results.geo import Earth
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from vplog.errors import LibraryError, NewerError, ResultError
 from vplog.maps.geo_bounds import earth_of_run, earth_record
@@ -11,10 +13,6 @@ from vplog.maps.storage.layout import FORMAT, RUN_TABLES, drive_record, sha256_o
 from vplog.results import run_record, tables
 from vplog.storage.folders import is_below
 from vplog.storage.scratch import files_in
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 
 class UnreachableError(ResultError):

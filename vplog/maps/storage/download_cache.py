@@ -15,19 +15,14 @@ import hashlib
 import json
 import os
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vplog.cache.user_cache import cache_folder, max_bytes, trim
 from vplog.maps.storage.layout import HASH, link, sha256_of
-from vplog.storage.remote_path import s3_place
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.storage.remote_path import RemotePath
+from vplog.storage.remote_path import RemotePath, s3_place
 
 _RECORD_BYTES = 10**5
 """Longest record of a library's few files."""

@@ -7,19 +7,16 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cache
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import Any
 from urllib.parse import quote
 
 from vplog.cache.code_hash import code_of
 from vplog.errors import NewerError, ResultError
 from vplog.results import run_record, tables
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-    from pathlib import Path
 
 FORMAT = run_record.FORMAT
 """Version of this layout. A reader refuses a newer one."""

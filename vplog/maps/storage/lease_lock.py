@@ -14,19 +14,15 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects
-from vplog.storage.remote_path import reason
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from vplog.storage.remote_path import RemotePath
+from vplog.storage.remote_path import RemotePath, reason
 
 NAME = ".lock"
 LEASE_S = 120.0

@@ -6,8 +6,9 @@ import ctypes
 import fcntl
 import os
 import shutil
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
@@ -17,9 +18,6 @@ from vplog.storage.folders import check_regular, regular_files
 from vplog.storage.scratch import made_folder, replacing, sync, sync_all
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
     from vplog.maps.storage.contents import Store
 
 _HERE, _EXCHANGE = -100, 2

@@ -17,7 +17,9 @@ deleted afterwards, by the next writer where this one is killed.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LibraryError, ResultError, VplogError
@@ -32,9 +34,6 @@ from vplog.storage.remote_path import RemotePath, check_writable
 from vplog.storage.scratch import put_in_place, scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
     from vplog.maps.storage.download_cache import Cache
 
 __all__ = ["TABLES", "Head", "Store", "add_library", "common_library", "folder_name", "publish", "reading", "remove"]

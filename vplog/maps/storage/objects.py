@@ -7,19 +7,15 @@ obstore 0.12 does not read.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from vplog.storage.remote_path import s3_place
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.storage.remote_path import RemotePath
+from vplog.storage.remote_path import RemotePath, s3_place
 
 _BLOCK_BYTES = 1 << 20
 """Bytes copied to or from the store at once."""

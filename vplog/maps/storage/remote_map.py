@@ -20,9 +20,10 @@ import json
 import shutil
 import threading
 from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any, cast
 from urllib.parse import unquote
 
@@ -34,15 +35,11 @@ from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, checked_record, folder_name
 from vplog.results import run_record
 from vplog.storage.folders import is_below
-from vplog.storage.remote_path import names_below, reason
+from vplog.storage.remote_path import RemotePath, names_below, reason
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
-    from pathlib import Path
-
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.lease_lock import Lock
-    from vplog.storage.remote_path import RemotePath
 
 _REQUESTS = 16
 """At once: a store answers each in some 20 to 50 ms, whatever its size."""

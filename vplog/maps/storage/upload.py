@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -15,17 +17,10 @@ import pyarrow.parquet as pq
 from vplog.errors import NewerError, ResultError, SettingsError
 from vplog.maps.storage import objects
 from vplog.maps.storage.layout import RUN_TABLES, TABLES, folder_name, sha256_of
-from vplog.maps.storage.remote_map import store_errors
+from vplog.maps.storage.remote_map import Mirror, store_errors
 from vplog.results import run_record
-from vplog.storage.remote_path import names_below
+from vplog.storage.remote_path import RemotePath, names_below
 from vplog.storage.scratch import files_in
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from vplog.maps.storage.remote_map import Mirror
-    from vplog.storage.remote_path import RemotePath
 
 _LEFT_OVER = timedelta(days=1)
 """Age from which an object that no manifest names is removed: far beyond any upload."""
