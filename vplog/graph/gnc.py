@@ -125,6 +125,8 @@ class GncSettings(Settings):
             return weight, poses
         poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
         chi2 = residual_sigma(factors.graph, poses, judged) ** 2
+        if (chi2 > bound).mean() <= 1.0 - self.inlier_probability:  # as many as there are where all are true
+            return weight, poses
         mu = bound / max(2.0 * chi2.max() - bound, bound)  # remark 5
         for _ in range(self.max_stages):
             weight[judged] = truncated_weights(chi2, bound, mu)

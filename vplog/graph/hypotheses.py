@@ -38,8 +38,8 @@ _STEADY = 0.2
 """Change of a sigma below which closures need not be tested again."""
 _ALIKE = 0.01
 """Share of the closures by which a start must differ from what was found to be tried."""
-_AS_CLAIMED = math.log(2.0)
-"""Logarithm of a sigma's factor up to which noise is as claimed: a factor of two."""
+_AS_CLAIMED = 2.0
+"""Factor of a sigma up to which noise is as claimed."""
 _FAMILIES = 2
 """Largest families of closures that are worth a solve: the true one and one that is taken for it."""
 _SHARES = (1.0, 0.25, 0.0625)
@@ -48,6 +48,8 @@ _VERY_STRONG = 5.0
 """Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
 a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. What another method that was chosen makes
 of them is used where the odds are even."""
+_ODOMETRY = (1.0, 0.5, 0.25)
+"""Factors of the odometry's sigmas by which closures are judged where none is true: nothing else checks it."""
 _FLIPS, _MOST_FLIPS = 4, 10
 """Runs of either kind that are tried at once, and turns."""
 _STEPS, _TOLERANCE = 100, 1e-4
@@ -83,8 +85,9 @@ def best_hypothesis(
         solution = optimiser(graph)
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
         found.append(_refit(graph, kept, solution.world_from_body, Sigmas()))
-    likeliest = [one.sigmas for one in sorted(found, key=lambda one: -one.log_evidence)[:1]]
-    for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
+    likeliest = max(found, key=lambda one: one.log_evidence).sigmas if found else Sigmas()
+    finer = [likeliest._replace(rotation=share, translation=share) for share in _ODOMETRY]
+    for sigmas in dict.fromkeys([Sigmas(), likeliest, *finer]):
         alone = _judged(graph, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
@@ -117,11 +120,15 @@ def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryCh
             found += _from_start(graph, gnc, sigmas, likely)
             tried += [one.weight[loops] > 0 for one in found[-2:]]
             best = max(found, key=lambda one: one.log_evidence, default=None)
-            if best is not None and best.weight.all() and not best.sigmas.differ(Sigmas(), _AS_CLAIMED):
-                return found  # all agree, as claimed
+            if best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED:  # all agree
+                if not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
+                    return found
+                found.append(_improved(graph, best))
+                if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
+                    return found
     of_families = []
     sigmas = likely_modes[0][0]
-    starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), _AS_CLAIMED) else [sigmas]
+    starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)) else [sigmas]
     for likely in [one for sigmas in starts for one in _families(graph, loops, sigmas)]:
         if _is_new(likely, tried):
             weight = np.ones(len(graph.a))
@@ -208,7 +215,10 @@ def _from_start(graph: PoseGraph, gnc: GncSettings, sigmas: Sigmas, likely: Bool
 
     def solve() -> list[Hypothesis]:
         weight, poses = gnc.annealed(Factors.of(claimed_times(graph, sigmas)), likely)
-        return _tested(graph, gnc, weight, poses, sigmas)
+        found = sigmas
+        if weight.all():  # none is suspect: noise first, by which least squares finds its way
+            poses, found = _estimated(graph, weight, poses, sigmas)
+        return _tested(graph, gnc, weight, poses, found)
 
     return _attempted(solve)
 

@@ -43,7 +43,7 @@ def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> 
         present = claimed_times(graph, Sigmas(rotation=rotation)) if rotation != 1.0 else graph
         mixture = _Mixture(present, loops[known], OdometryChain.of(present) if rotation != 1.0 else chain)
         for n, s in enumerate(_ODOMETRY.tolist()):
-            tried = (mixture.fit(Sigmas(rotation * s, s, t)) for t in _CLOSURES.tolist())
+            tried = (mixture.fit(Sigmas(rotation * s, s, t, t)) for t in _CLOSURES.tolist())
             fits[k, n] = max(tried, key=lambda fit: fit[0])
     likelihood = np.array([[fit[0] for fit in row] for row in fits])
     around = np.pad(likelihood, 1, constant_values=-np.inf)
@@ -79,7 +79,7 @@ class _Mixture:
 
     def fit(self, sigmas: Sigmas) -> tuple[float, Sigmas, Floats]:
         """Log likelihood with the prior of these sigmas, and the probability of each closure (K,) to be true."""
-        variance = sigmas.translation**2 * self._spread + sigmas.closures**2
+        variance = sigmas.translation**2 * self._spread + sigmas.closure_translation**2
         true = self._log_volume - 0.5 * (self._error2 / variance + np.log(2.0 * np.pi * variance)).sum(1)
         share, least = 0.5, 1.0 / (2.0 * len(true))  # half a closure, so that no share is 0 or 1
         sure = np.zeros(len(true))

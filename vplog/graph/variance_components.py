@@ -14,19 +14,19 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.consistency import degrees_of_freedom, is_loop
 from vplog.graph.marginals import edge_covariances
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, PoseGraph
+    from vplog.data import Bools, Floats, PoseGraph
     from vplog.graph.least_squares import Objective
 
 _SPREAD = 2.0 * math.log(4.0)
 """Sigma of the logarithm of a variance factor before anything was measured: drivers claim sigmas that are off by four
 and, now and then, by ten."""
 _LEAST_CLOSURES = 0.5
-"""Closures are not taken for much better than they claim: those of neighbouring keyframes share landmarks, so they
-agree with each other more than they are right."""
+"""Closures are not taken for much better than they claim, unless the odometry is, too: those of neighbouring keyframes
+share landmarks, so they agree with each other more than they are right."""
 _LEAST, _MOST = 2.0**-14, 2.0**10
 """Variance factors beyond which a claim is no longer one: sigmas 128 times too large, as of a log that tells none and
 of odometry far better than the model, or 32 times too small."""
@@ -43,11 +43,12 @@ _FURTHEST = math.log(2.0)
 
 
 class Sigmas(NamedTuple):
-    """Factors by which claimed sigmas are multiplied: rotation and translation of odometry, closures."""
+    """Factors by which claimed sigmas are multiplied: rotation and translation of odometry, and of closures."""
 
     rotation: float = 1.0
     translation: float = 1.0
-    closures: float = 1.0
+    closure_rotation: float = 1.0
+    closure_translation: float = 1.0
 
     def log_prior(self) -> float:
         """Log of the prior density but for a constant: normal in the logarithm of each variance."""
@@ -75,8 +76,8 @@ def most_likely_variance(chi2: float, redundancy: float) -> float:
 
 def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
     """The graph with its sigmas multiplied."""
-    odometry = np.repeat([sigmas.rotation, sigmas.translation], 3)
-    factor = np.where(is_loop(graph)[:, None], sigmas.closures, odometry)
+    odometry, closures = np.repeat(sigmas, 3).reshape(2, 6)
+    factor = np.where(is_loop(graph)[:, None], closures, odometry)
     return replace(graph, information=graph.information / (factor[:, :, None] * factor[:, None, :]))
 
 
@@ -87,24 +88,24 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     have for themselves.
     """
     graph, weight = objective.factors.graph, objective.weight
-    loops = is_loop(graph)
-    closures_dof = float(degrees_of_freedom(graph) * np.count_nonzero(weight[loops]))
+    loops = is_loop(graph) & (weight > 0)
+    closures_dof = float(degrees_of_freedom(graph) * np.count_nonzero(loops))
     most = closures_dof
     if objective.positions is not None:
         most += 3.0 * np.count_nonzero(objective.positions.Omega.any((1, 2)))
-    chi2, checks = _of_odometry(objective, poses, np.flatnonzero(~loops))
+    (chi2, checks), (closures, own) = _of_parts(objective, poses, [~is_loop(graph), loops])
     checks *= min(1.0, most / max(checks.sum(), 1e-12))
-    own = closures_dof * (1.0 - checks.sum() / max(most, 1.0))
-    closures = float((weight * residual_sigma(graph, poses) ** 2)[loops].sum())
-    rotation, translation = (  # the claim itself is always possible
+    rest = closures_dof * (1.0 - checks.sum() / max(most, 1.0))
+    own = np.array([min(own[0], rest), max(rest - own[0], 0.0)])  # that of translations drowns in rounding
+    odometry = [  # the claim itself is always possible
         min(math.sqrt(most_likely_variance(chi2[part] * factor**2, checks[part])), max(factor * most, 1.0))
         for part, (factor, most) in enumerate(zip(present[:2], _most_factors(graph), strict=True))
+    ]
+    of_closures = (
+        max(math.sqrt(most_likely_variance(chi2 * factor**2, redundancy)), _LEAST_CLOSURES * min(noise, 1.0))
+        for chi2, redundancy, factor, noise in zip(closures, own, present[2:], odometry, strict=True)
     )
-    return Sigmas(
-        rotation,
-        translation,
-        max(math.sqrt(most_likely_variance(closures * present.closures**2, own)), _LEAST_CLOSURES),
-    )
+    return Sigmas(*odometry, *of_closures)
 
 
 def _most_factors(graph: PoseGraph) -> list[float]:
@@ -131,21 +132,27 @@ def extrapolated(first: Sigmas, second: Sigmas, third: Sigmas) -> Sigmas:
     return Sigmas(*(np.array(third) * np.exp(ahead)).tolist())
 
 
-def _of_odometry(objective: Objective, poses: Floats, edges: Ints) -> tuple[Floats, Floats]:
-    """Chi-square and redundancy of the rotations and of the translations of odometry `edges`, (2,) each."""
+def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[tuple[Floats, Floats]]:
+    """Chi-square and redundancy of the rotations and of the translations of each kind of edges (E,), (2,) each."""
     graph = objective.factors.graph
     axes = np.array(AXES[graph.dimension])
+    edges = np.flatnonzero(np.logical_or.reduce(kinds))
     claimed = np.linalg.inv(informed(graph)[edges])
     error = se3.log(se3.between(graph.a_from_b[edges], se3.between(poses[graph.a[edges]], poses[graph.b[edges]])))
-    chi2, checks = np.zeros(2), np.zeros(2)
+    chi2, trusted = np.zeros((2, len(edges))), np.zeros((2, len(edges)))
     try:
         solved = edge_covariances(objective, poses, edges)
     except GraphError:  # noise so large that rounding decides
-        solved = None
-    for number, part in enumerate((axes < 3, axes >= 3)):  # of correlated noise, the marginal of each
+        solved = np.zeros_like(claimed)
+    parts = axes < 3, axes >= 3
+    for number, part in enumerate(parts):  # of correlated noise, the marginal of each
         Omega = np.linalg.inv(claimed[:, part][:, :, part])
         e = error[:, axes[part]]
-        chi2[number] = np.einsum("ni,nij,nj->", e, Omega, e)
-        trusted = 0.0 if solved is None else float(np.einsum("nij,nji->", Omega, solved[:, part][:, :, part]))
-        checks[number] = max(len(edges) * int(part.sum()) - trusted, 0.0)
-    return chi2, checks
+        chi2[number] = np.einsum("ni,nij,nj->n", e, Omega, e)
+        trusted[number] = np.einsum("nij,nji->n", Omega, solved[:, part][:, :, part])
+    size = np.array([int(part.sum()) for part in parts])
+    found = []
+    for kind in kinds:
+        own = kind[edges]
+        found.append((chi2[:, own].sum(1), np.maximum(own.sum() * size - trusted[:, own].sum(1), 0.0)))
+    return found
