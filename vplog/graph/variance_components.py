@@ -14,7 +14,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.consistency import degrees_of_freedom, residual_sigma
 from vplog.graph.marginals import edge_covariances
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def most_likely_variance(chi2: float, redundancy: float) -> float:
 def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
     """The graph with its sigmas multiplied."""
     odometry = np.repeat([sigmas.rotation, sigmas.translation], 3)
-    factor = np.where(is_loop(graph)[:, None], sigmas.closures, odometry)
+    factor = np.where(graph.odometry[:, None], odometry, sigmas.closures)
     return replace(graph, information=graph.information / (factor[:, :, None] * factor[:, None, :]))
 
 
@@ -87,7 +87,7 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     have for themselves.
     """
     graph, weight = objective.factors.graph, objective.weight
-    loops = is_loop(graph)
+    loops = ~graph.odometry
     closures_dof = float(degrees_of_freedom(graph) * np.count_nonzero(weight[loops]))
     most = closures_dof
     if objective.positions is not None:
@@ -110,7 +110,7 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
 def _most_factors(graph: PoseGraph) -> list[float]:
     """Most that the factors of rotation and translation can be: what odometry measures is motion and noise, and where
     more than `_MOST_NOISE` of its root mean square is noise, it is none."""
-    edges = np.flatnonzero(~is_loop(graph))
+    edges = np.flatnonzero(graph.odometry)
     axes = np.array(AXES[graph.dimension])
     motion = se3.log(graph.a_from_b[edges])[:, axes]
     covariance = np.asarray(np.linalg.inv(informed(graph)[edges]), np.float64)

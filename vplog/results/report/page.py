@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import USED, Verdict
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from vplog.results.geo import Earth
     from vplog.results.mcap_read import McapContent
 
-_TAKEN = (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY)
-"""Verdicts of closures that the solve used, at least in part."""
 _MOST_ROWS = 20_000
 """Rows of the ledger in the page: 1.5 MB. Accepted ones first, then by score; the table file has them all."""
 _MOST_LOSSES = 100
@@ -130,7 +128,7 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
         (f"{figure(path_m)} m", "path"),
         (f"{figure((int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0)} s", "of drive"),
         (figure(len(content.closures)), "candidates"),
-        (figure(content.closures.verdict.count(Verdict.ACCEPTED)), "accepted closures"),
+        (figure(int(content.closures.accepted.sum())), "accepted closures"),
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
     ]
@@ -162,7 +160,7 @@ def _loss(loss: dict[str, Any], content: Content) -> list[str]:
 def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
     """The legend and the map of the trajectory."""
     closures, judged, position = content.closures, content.judged, content.tracks.world_from_body[:, :3, 3]
-    accepted, false = closures.of(Verdict.ACCEPTED), np.zeros(len(closures), bool)
+    accepted, false = closures.accepted, np.zeros(len(closures), bool)
     if judged is not None and judged.true is not None and judged.known is not None:
         false = accepted & judged.known & ~judged.true
     segments = [
@@ -212,7 +210,7 @@ def _examples(content: Content) -> list[dict[str, Any]]:
         left -= len(jpeg)
         verdict = closures.verdict[row]
         one = {"row": row, "jpeg": jpeg, "verdict": verdict.value}
-        one |= {"kind": "accepted" if verdict in _TAKEN else "rejected"}
+        one |= {"kind": "accepted" if verdict in USED else "rejected"}
         one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
         examples.append(one)
     return examples
@@ -223,13 +221,13 @@ def _ledger(content: Content, pictures: list[int]) -> dict[str, Any] | None:
     if not len(content.closures):
         return None
     closures = content.closures
-    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*_TAKEN)))
+    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
     return {
         "columns": list(columns),
         "rows": list(map(list, zip(*columns.values(), strict=True))),
         "pictures": pictures,
-        "kept": [verdict.value for verdict in _TAKEN],
+        "kept": [verdict.value for verdict in USED],
     }
 
 
@@ -265,7 +263,7 @@ def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     """What accepted and rejected candidates differ in, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
-    taken = closures.of(*_TAKEN)
+    taken = closures.of(*USED)
     shown = []
     for label, values, name, least in (
         ("score", closures.score, "", None),
