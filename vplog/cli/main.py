@@ -88,7 +88,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
 @contextmanager
 def _local_copies(arguments: argparse.Namespace) -> Iterator[None]:
     """Run folders and libraries named by URL are copied for the verb; what it writes to one is sent when it is done."""
-    places = {name: getattr(arguments, name, None) for name in ("run", "runs", "library", "output")}
+    places = {name: getattr(arguments, name, None) for name in ("run", "runs", "baseline", "library", "output")}
     if not any("://" in str(place) for place in places.values()):
         yield
         return
