@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 
 def render(template: str, **values: Any) -> str:
@@ -39,9 +40,11 @@ def _environment() -> Environment:
 
 
 @cache
-def _inline(name: str) -> str:
+def _inline(name: str) -> Markup:
     """A style or script of ours as it stands between its tags."""
-    return files("vplog.results").joinpath("templates", name).read_text(encoding="utf-8")
+    from markupsafe import Markup  # of Jinja
+
+    return Markup(files("vplog.results").joinpath("templates", name).read_text(encoding="utf-8"))  # noqa: S704
 
 
 def _hashed(name: str) -> str:
