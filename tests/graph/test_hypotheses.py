@@ -81,7 +81,8 @@ def test_sigmas_are_those_of_the_world() -> None:
     honest = best_hypothesis(ring(240, 80, seed=6).graph, GncSettings()).sigmas
     found = best_hypothesis(claiming(ring(240, 80, seed=6), 0.25, 0.5).graph, GncSettings()).sigmas
     assert found.translation == pytest.approx(4.0 * honest.translation, rel=0.1)
-    assert found.closures == pytest.approx(2.0 * honest.closures, rel=0.1)
+    assert found.closure_rotation == pytest.approx(2.0 * honest.closure_rotation, rel=0.1)
+    assert found.closure_translation == pytest.approx(2.0 * honest.closure_translation, rel=0.1)
 
 
 def test_the_evidence_of_true_closures_is_their_density_under_the_odometry() -> None:

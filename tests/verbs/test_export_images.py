@@ -50,8 +50,7 @@ def scene(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def colmap(script: str, *arguments: object) -> Any:
-    """What a script that has pycolmap prints, in JSON. In a process of its own: its FFmpeg is not PyAV's, and one
-    process that has both decodes H.264 wrongly or hangs."""
+    """What a script that has pycolmap prints, in JSON: in a process that has none of our libraries."""
     if find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed")
     command = [sys.executable, "-c", f"import json, sys, pycolmap\n{dedent(script)}", *map(str, arguments)]

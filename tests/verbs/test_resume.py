@@ -322,7 +322,7 @@ def test_parts_are_those_of_the_whole_drive(kind: str, tmp_path: Path, monkeypat
         monkeypatch.setattr(feature_extraction, "PART_KEYFRAMES", 2)
         path = write_ros2(tmp_path / "drive", ros_messages(drives.Drive(), 2))
     else:
-        payloads = packets("h264")
+        payloads = list(packets("h264"))
         if kind == "damaged video":
             payloads[15] = b"\0" * len(payloads[15])
         path = write_raw(tmp_path / "drive.mcap", messages("foxglove", payloads))
