@@ -23,7 +23,7 @@ PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors", "data"},
     {"settings", "execution", "storage"},
-    {"stages", "geometry", "networks"},
+    {"stages", "geometry", "networks", "masking"},
     {"features", "places"},
     {"logs", "loops", "graph", "results", "evaluate", "demo"},
     {"cache", "figures", "testing", "odometry"},

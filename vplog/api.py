@@ -556,4 +556,4 @@ def _topics(topics: Topics | None) -> TopicChoice | None:
         return topics
     choice = TopicChoice.read(dict(topics), "topics")
     files = {name: path.resolve() for name in ("odometry_file", "calibration_file") if (path := getattr(choice, name))}
-    return choice.model_copy(update=files)
+    return choice.model_copy(update={**files, "masks": {one: path.resolve() for one, path in choice.masks.items()}})

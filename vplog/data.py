@@ -67,6 +67,8 @@ class Frame:
     colour: Bytes | None = None
     """(H, W, 3) uint8 red, green, blue of the image, where it was decoded in colour: three times the grey where it has
     none."""
+    mask: Bools | None = None
+    """(H, W) px of the image that count; None where all do. Of a right image the others are filled."""
 
 
 @dataclass(frozen=True, eq=False)

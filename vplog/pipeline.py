@@ -163,7 +163,7 @@ def run(
     ):
         odometry, camera, selected = do(read, log, topics, pipeline.keyframes)
         features = do(extract, log, topics, selected, pipeline)
-        keyframes = decoded(selected, features)
+        keyframes = decoded(selected, features, pipeline.features)
         decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
         if library is None:
             images = do(own_images, log, selected, keyframes, features, pipeline.library)

@@ -192,3 +192,16 @@ def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatc
         known_hashes({"large": large}, TopicChoice(), tmp_path / ".inputs.json", Execution(2, interrupt))
     assert told[-1][0] == "check (MB)"
     assert 0 < told[-1][1] < told[-1][2] == 10**7
+
+
+def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path]) -> None:
+    masks = {}
+    for topic, text in (("/left", b"one"), ("/right", b"two")):
+        masks[topic] = tmp_path / topic.strip("/") / "mask.png"
+        masks[topic].parent.mkdir()
+        masks[topic].write_bytes(text)
+    (found, *_), errors = known_hashes(logs, TopicChoice(masks=masks), tmp_path / "record", Execution(1))
+    assert not errors
+    beside = {name: text for name, text in found.items() if name.startswith("beside")}
+    assert {name: hashlib.sha256(masks[name.split()[2]].read_bytes()).hexdigest() for name in beside} == beside
+    assert len(beside) == 2

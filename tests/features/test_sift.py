@@ -39,16 +39,16 @@ def test_a_blob_is_found_at_its_middle(x: float, y: float, sigma: float, doubled
 @pytest.mark.parametrize("halvings", [1, 2])
 def test_reduced_images_keep_full_coordinates(width: int, height: int, x: float, y: float, halvings: int) -> None:
     image = blob(width, height, x, y, 10.0)
-    features = SiftSettings(max_megapixels=image.size / 4**halvings * 1e-6)(image)
+    features = SiftSettings(max_megapixels=image.size / 4**halvings * 1e-6, min_features=0)(image)
     np.testing.assert_allclose(features.points[0], [x, y], atol=0.3)
     assert (features.width, features.height) == (width, height)
-    whole = SiftSettings()(image)
+    whole = SiftSettings(min_features=0)(image)
     assert features.sizes[0] == pytest.approx(whole.sizes[0], rel=0.1)
 
 
 def test_strongest_first_and_no_more_than_asked_for() -> None:
     image = texture(1)
-    many, few = SiftSettings(max_features=300)(image), SiftSettings(max_features=40)(image)
+    many, few = (SiftSettings(max_features=most, min_features=0)(image) for most in (300, 40))
     assert len(few) == 40
     assert 40 < len(many) <= 300
     np.testing.assert_array_equal(few.points, many.points[:40])
@@ -109,7 +109,7 @@ def test_settings_that_cannot_work(change: dict[str, Any]) -> None:
 @pytest.mark.parametrize("sigma", [2.5, 4.0, 7.0])
 def test_a_blob_is_as_large_as_it_is(sigma: float) -> None:
     """A Gaussian blob of blur s is strongest at scale s (Lindeberg 1998); its size is the diameter."""
-    features = SiftSettings(doubled=False)(blob(200, 160, 99.3, 80.6, sigma))
+    features = SiftSettings(doubled=False, min_features=0)(blob(200, 160, 99.3, 80.6, sigma))
     np.testing.assert_allclose(features.points[0], [99.3, 80.6], atol=0.1)
     assert features.sizes[0] / 2 == pytest.approx(sigma, rel=0.15)
 
@@ -139,9 +139,43 @@ def test_features_are_found_again_in_a_turned_and_larger_picture() -> None:
 
 def test_doubling_finds_smaller_features() -> None:
     image = cv2.resize(texture(7, 640, 400), (160, 100), interpolation=cv2.INTER_AREA).astype(np.uint8)
-    plain, doubled = SiftSettings(doubled=False)(image), SiftSettings()(image)
+    plain, doubled = (SiftSettings(doubled=both, min_features=0)(image) for both in (False, True))
     assert len(doubled) > 2 * len(plain)
     assert doubled.sizes.min() < 2.0
     assert plain.sizes.min() > 2.8
     offset = np.linalg.norm(plain.points[:20, None] - doubled.points[None], axis=2).min(axis=1)
     assert np.median(offset) < 0.3
+
+
+POOR = {
+    "dark": lambda image, rng: image * 0.05 + rng.normal(0, 0.5, image.shape),
+    "flat": lambda image, rng: 127 + (image - 127.0) * 0.06 + rng.normal(0, 0.4, image.shape),
+    "small": lambda image, _: cv2.resize(image, (128, 80), interpolation=cv2.INTER_AREA),
+}
+
+
+@pytest.mark.parametrize("kind", POOR)
+def test_poor_pictures_give_the_features_of_good_ones(kind: str) -> None:
+    image = texture(3)
+    poor = np.clip(np.rint(POOR[kind](image, np.random.default_rng(1))), 0, 255).astype(np.uint8)
+    bare, found = SiftSettings(min_features=0)(poor), SiftSettings()(poor)
+    assert len(found) > max(2 * len(bare), 150)
+    good = SiftSettings()(image)
+    points = found.points * (image.shape[1] / poor.shape[1])
+    off = np.linalg.norm(points[:, None] - good.points[None], axis=2).min(axis=1)
+    assert np.median(off) < 2.0  # where those of the good picture are, not of the noise
+    assert (found.width, found.height) == poor.shape[::-1]
+
+
+@pytest.mark.parametrize("doubled", [True, False])
+def test_a_good_picture_is_taken_as_it_is(doubled: bool) -> None:
+    image = texture(5, 640, 400)
+    good = SiftSettings(doubled=doubled)
+    assert len(good(image)) > good.least_features
+    same = SiftSettings(doubled=doubled, min_features=0)
+    assert good(image).descriptors.tobytes() == same(image).descriptors.tobytes()
+
+
+def test_no_features_are_made_of_noise() -> None:
+    dark = np.random.default_rng(2).integers(0, 2, (200, 320)).astype(np.uint8)
+    assert len(SiftSettings()(dark)) == len(SiftSettings()(0 * dark)) == 0

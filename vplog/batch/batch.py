@@ -295,7 +295,7 @@ def _common_record(pipeline: Pipeline, topics: TopicChoice, library: str) -> dic
     """Fields of drive.json that are the same for each drive of a batch. Every setting counts, as every table names them
     all; the place of a log does not: a map may move with its logs."""
     return {
-        "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file"}),
+        "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file", "masks"}),
         "settings": layout.key_of(pipeline.model_dump(mode="json")),
         "library": library,
     }

@@ -46,7 +46,7 @@ def known_hashes(
     that cannot be read is made again, one that cannot be written is done without. Ctrl-C ends it within a block;
     progress is in MB read.
     """
-    beside = [file for file in (topics.odometry_file, topics.calibration_file) if file is not None]
+    beside = topics.files
     known = _read(record)
     current: dict[str, dict[str, Any]] = {}
     done, total, stop = [0] * len(logs), [0] * len(logs), Event()
@@ -64,7 +64,7 @@ def known_hashes(
             if stop.is_set():
                 raise CancelledError
 
-        if path not in beside:
+        if path not in beside.values():
             all_logs.check(path)  # a folder of other things may hold anything
         began, total[number] = time.time(), total[number] + bytes_of(path)
         hashes = hash_inputs(path, read)
@@ -74,12 +74,17 @@ def known_hashes(
 
     def of_log(path: Path, number: int) -> Hashes | str:
         try:
-            found = [one(file, number) for file in (path, *beside)]
+            found = [one(file, number) for file in (path, *beside.values())]
         except LogError as error:
             return str(error)
         except OSError as error:
             return f"Cannot read {error.filename or path}: {error.strerror or error}."
-        return {**found[0], **{f"beside {name}": text for other in found[1:] for name, text in other.items()}}
+        names = [name if name.startswith("mask") else "" for name in beside]  # several may be called alike
+        return found[0] | {
+            " ".join(filter(None, ("beside", what, name))): text
+            for what, other in zip(names, found[1:], strict=True)
+            for name, text in other.items()
+        }
 
     with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, path, number) for number, path in enumerate(logs.values())]

@@ -10,6 +10,7 @@ import numpy as np
 from vplog.data import Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
+from vplog.masking import masked
 
 if TYPE_CHECKING:
     from vplog.benchmark.feature_cache import FeatureFolder
@@ -84,7 +85,7 @@ def extract_traversal(
 
 def images_at(log: Log, stamp_ns: Ints) -> list[Bytes]:
     """The grey images of the frames with these stamps (K,), increasing. Raises LogError where one is gone."""
-    images = [frame.decode().image for frame in log.frames(stamp_ns)] if len(stamp_ns) else []
+    images = [masked(frame.decode()).image for frame in log.frames(stamp_ns)] if len(stamp_ns) else []
     if len(images) < len(stamp_ns):
         raise LogError(f"{log.name}: a frame that was read before cannot be read again. Leave the log unchanged.")
     return images

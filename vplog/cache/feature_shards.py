@@ -104,6 +104,11 @@ class Extracted:
         return features_from(data, row.features, row.width, row.height, bool(row.thumbnail), row.values)
 
     @property
+    def counts(self) -> list[int]:
+        """Number of features of each keyframe."""
+        return [row.features for _, _, row in self._rows]
+
+    @property
     def has_pictures(self) -> bool:
         return any(row.picture for _, _, row in self._rows)
 

@@ -230,7 +230,7 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
 
     if "://" in str(arguments.shown):
         arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
-    fixed = ("pipeline", "set", "library", "gps", "false_rate", "decisions")
+    fixed = ("pipeline", "set", "library", "gps", "false_rate", "decisions", "mask")
     names = [name for name in vars(arguments) if name in fixed or name.endswith(("_topic", "_file"))]
     given = [name for name in names if getattr(arguments, name) not in (None, [], False, "default")]
     if given or not arguments.cache:

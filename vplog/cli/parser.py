@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu")
+_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -180,7 +180,7 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
 
     chosen = {role.replace("-", "_"): getattr(arguments, f"{role.replace('-', '_')}_topic") for role in _ROLES}
     others = ("odometry_file", "calibration_file", "start_s", "stop_s", "wheelbase_m", "track_m", "wheel_radius_m")
-    return TopicChoice(**chosen, **{name: getattr(arguments, name) for name in others})
+    return TopicChoice(**chosen, masks=dict(arguments.mask), **{name: getattr(arguments, name) for name in others})
 
 
 def topic_options() -> argparse.ArgumentParser:
@@ -196,7 +196,19 @@ def topic_options() -> argparse.ArgumentParser:
     option(topics, "--odometry-file", resolved, "FILE.tum", "use these poses as the odometry")
     text = "YAML of ROS, OpenCV, Kalibr, EuRoC, VSLAM-LAB or ORB-SLAM, KITTI's calib.txt, COLMAP's cameras"
     option(topics, "--calibration", resolved, "FILE", text, dest="calibration_file")
+    text = (
+        "image whose zero px give no features, of a camera with several TOPIC=FILE; or a folder of one for each image"
+    )
+    option(topics, "--mask", _mask, "[TOPIC=]FILE", text, action="append", default=[])
     return topics
+
+
+def _mask(text: str) -> tuple[str, Path]:
+    """Image topic, empty where none is named, and file or folder."""
+    topic, given, path = text.partition("=")
+    if not given or Path(text).exists():
+        topic, path = "", text
+    return topic, resolved(path)
 
 
 def settings_options(unless_given: str | None, called: str) -> argparse.ArgumentParser:

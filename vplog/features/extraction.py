@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from vplog.errors import LogError
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
+from vplog.masking import masked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -29,12 +32,22 @@ def extract_frames(
             frame = encoded.decode()
         except LogError as error:
             return encoded.stamp_ns, None, None, str(error)
-        features = extractor(frame.image, frame.depth)
+        features = describe(extractor, frame)
         if stereo is not None and frame.depth is None:
             features = with_stereo_depth(features, frame, extractor, stereo)
         return encoded.stamp_ns, frame, features, ""
 
     return execution.map(work, frames, ahead=2)
+
+
+def describe(extractor: Extractor, frame: Frame) -> Features:
+    """The features of a frame, none of them with a masked centre."""
+    features = extractor(masked(frame).image, frame.depth)
+    if frame.mask is None:
+        return features
+    column, row = np.rint(features.points).astype(np.int64).T
+    height, width = frame.mask.shape
+    return features.rows(np.flatnonzero(frame.mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]))
 
 
 def with_stereo_depth(features: Features, frame: Frame, extractor: Extractor, settings: StereoSettings) -> Features:

@@ -10,8 +10,10 @@ import numpy as np
 
 from vplog.data import Verdict
 from vplog.errors import LibraryError, LogError
+from vplog.features.extraction import describe
 from vplog.geometry import se3
 from vplog.loops.localize import Localization, localize
+from vplog.masking import masked
 from vplog.results.geo import on_earth
 from vplog.stages import FrameState, StoredState
 
@@ -131,8 +133,8 @@ def _describe(places: Places, frame: Frame) -> _Picture:
             f"The places of {places.name} have descriptors from a file, which new pictures lack. Make the map with a "
             "recogniser that describes pictures: --set places.kind=bobb."
         )
-    features = pipeline.features(frame.image, frame.depth)  # depths of a pair would cost as much again, and add little
-    descriptor = state.describe_frame(frame) if isinstance(state, FrameState) else state.describe(features)
+    features = describe(pipeline.features, frame)  # depths of a pair would cost as much again, and add little
+    descriptor = state.describe_frame(masked(frame)) if isinstance(state, FrameState) else state.describe(features)
     return _Picture(frame.stamp_ns, frame.camera, features, descriptor)
 
 

@@ -38,6 +38,8 @@ class Content:
     """Where the depth image of each lies."""
     right_places: list[Place | None]
     """Where the right image of each lies."""
+    mask_places: list[Place | None]
+    """Where the mask of each lies."""
     calibrations: list[CalibrationMessage]
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""
@@ -77,12 +79,13 @@ class Content:
     def with_images(self, wanted: np.ndarray) -> Content:
         """With those of the images for which (F,) `wanted` is true."""
         rows = np.flatnonzero(wanted).tolist()
-        places, depth, right = (
-            [listed[row] for row in rows] for listed in (self.places, self.depth_places, self.right_places)
+        places, *others = (
+            [listed[row] for row in rows]
+            for listed in (self.places, self.depth_places, self.right_places, self.mask_places)
         )
         return replace(
             self, stamp_ns=self.stamp_ns[wanted], places=places, stream_rows=self.stream_rows[wanted],
-            depth_places=depth, right_places=right,
+            depth_places=others[0], right_places=others[1], mask_places=others[2],
         )  # fmt: skip
 
 
@@ -115,7 +118,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images.finish(notes)
     paired = []
-    for name, images in (("depth", read.depths), ("right", read.rights)):
+    for name, images in (("depth", read.depths), ("right", read.rights), ("mask", read.masks)):
         other_ns, other_places, _ = images.finish(notes)
         pairs = nearest(stamp_ns, other_ns)
         paired.append([None if pair < 0 else other_places[pair] for pair in pairs.tolist()])
@@ -142,6 +145,6 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     calibrations = read.calibrations.finish(notes)
     right_calibration = next(iter(read.right_calibrations.finish(notes)), None)
     return Content(
-        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], calibrations, right_calibration,
+        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], paired[2], calibrations, right_calibration,
         odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,
     )  # fmt: skip

@@ -14,25 +14,30 @@ from vplog.data import Frame
 from vplog.errors import LogError
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.formats.container import plural
+from vplog.logs.masks import resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import depth_m, drive_levels, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
+from vplog.masking import filled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from av import VideoFrame
 
-    from vplog.data import Bytes, Camera, Float32s, Floats
+    from vplog.data import Bools, Bytes, Camera, Float32s, Floats
     from vplog.logs.content import Content
     from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
+    from vplog.logs.masks import Mask
     from vplog.logs.messages.pixels import Levels
     from vplog.logs.messages.records import CalibrationMessage
     from vplog.logs.rectification import Pair
 
 
+_HALF = 127
+"""Of a mask of 0 and 255 that was resampled."""
 _TRIED = 10
 """Images tried for the size of all; a drive whose first second is damaged is not usable."""
 
@@ -108,18 +113,25 @@ class RecordedFrame:
     """Notes of the log, where what does not decode is counted."""
     calibration: CalibrationMessage | None = None
     """The calibration of the image, where a later one differs from the camera's."""
+    mask: Mask | EncodedImage | None = None
+    right_mask: Mask | None = None
 
     def decode(self, colour: bool = False) -> Frame:
         """The frame, without depth or right image where that does not decode or fit. Raises LogError where the image
         does not."""
         image, affine = self._image()
+        mask = self._mask(image)
         rgb = self.image.rgb(self.stamp_ns) if colour else None
         if self.pair is not None:
             rgb = None if rgb is None else self.pair.rectify(rgb, 0)
-            return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), None, self._right(self.pair), rgb)
+            right = self._right(self.pair)
+            mask = None if mask is None else self.pair.rectify(255 * mask.astype(np.uint8), 0) > _HALF
+            return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), None, right, rgb, mask)
         depth = None if self.depth is None else self._registered(self.depth, image, affine)
         rgb = None if rgb is None else warped(rgb, affine, self.camera)
-        return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth, colour=rgb)
+        if mask is not None and affine is not None:
+            mask = warped(255 * mask.astype(np.uint8), affine, self.camera) > _HALF
+        return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth, colour=rgb, mask=mask)
 
     def _image(self) -> tuple[Bytes, Floats | None]:
         """The image, and what leads from its px to the camera's. Raises LogError."""
@@ -133,6 +145,18 @@ class RecordedFrame:
             self._count_undecodable(channel, "" if image is None else str(error))
             raise
         return image, None
+
+    def _mask(self, image: Bytes) -> Bools | None:
+        """(H, W) px of the image as it comes that count; None where all do. Raises LogError where its mask does not fit
+        or decode."""
+        size = (image.shape[1], image.shape[0])
+        try:
+            if not isinstance(self.mask, EncodedImage):
+                return None if self.mask is None else self.mask.used(size)
+            return resized_mask(self.mask.grey(self.stamp_ns) > 0, size, self.mask.channel.topic)
+        except LogError as error:
+            self._count_undecodable(self.image.channel, str(error))
+            raise
 
     def _registered(self, depth: EncodedImage, image: Bytes, affine: Floats | None) -> Float32s | None:
         """The depth of the camera's px, NaN beyond the image; None, and counted, where it does not decode or has
@@ -158,6 +182,8 @@ class RecordedFrame:
         try:
             image = self.right.grey(self.stamp_ns)
             _check_size(self.right.channel, image, self.camera)
+            if self.right_mask is not None:
+                image = filled(image, self.right_mask.used((image.shape[1], image.shape[0])))
         except LogError:
             return self._count_undecodable(self.right.channel)
         return pair.rectify(image, 1)

@@ -15,6 +15,7 @@ from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
+    FixesMessage,
     FixMessage,
     ImageMessage,
     ImuMessage,
@@ -117,6 +118,7 @@ class TopicCollector:
 
     def __init__(self, chosen: Selection) -> None:
         self.images, self.depths, self.rights = Images(chosen.image), Images(chosen.depth), Images(chosen.right)
+        self.masks = Images(chosen.mask)
         self.calibrations = Calibrations(chosen.camera_info)
         self.right_calibrations = Calibrations(chosen.right_info)
         self.poses = {
@@ -144,7 +146,7 @@ class TopicCollector:
     @cached_property
     def by_channel(self) -> dict[Channel, Images]:
         """The image topics in use."""
-        return {one.channel: one for one in (self.rights, self.depths, self.images) if one.channel}
+        return {one.channel: one for one in (self.masks, self.rights, self.depths, self.images) if one.channel}
 
     def add_block(self, block: Block) -> None:
         """Add the messages of a block, odometry in batches."""
@@ -177,11 +179,13 @@ class TopicCollector:
             self._add_message(block, row, first + row)
 
     def finish_poses(self) -> None:
-        """Add the messages of odometry that wait."""
+        """Add the messages of odometry, and fixes of NMEA, that wait."""
         for channel in list(self._waiting):
             self._add_poses(channel)
         for channel, (data, log_ns) in self._paths.items():
             self._add_message(Block(data, [channel], [log_ns], [0], [len(data)], [()]), 0, self._messages)
+        if self.fixes:
+            self.fixes.add_sentences()
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
@@ -218,7 +222,11 @@ class TopicCollector:
 
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
-        images = [(one.channel.topic, one.stamps) for one in (self.images, self.depths, self.rights) if one.channel]
+        images = [
+            (one.channel.topic, one.stamps)
+            for one in (self.images, self.depths, self.rights, self.masks)
+            if one.channel
+        ]
         gyro = [(self.gyro.topic, self.gyro.stamps)] if self.gyro.topic else []
         return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one] + gyro
 
@@ -253,6 +261,9 @@ class TopicCollector:
                 self.gyro.add(imu, message.log_ns, position)
             case FixMessage() as fix if self.fixes:
                 self.fixes.add(fix, message.log_ns, position)
+            case FixesMessage(_, fixes) if self.fixes:
+                for fix in fixes:
+                    self.fixes.add(fix, message.log_ns, position)
             case list() as transforms if channel in self._tf:
                 self.dynamic.add(transforms, message.log_ns, position)
             case list() as transforms:

@@ -15,6 +15,7 @@ from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import ImageReader, RecordedFrame, size_of
+from vplog.logs.masks import masks_of
 from vplog.logs.messages.records import GEOMETRY, short_type
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
@@ -50,6 +51,8 @@ class RecordedLog:
         self._candidates = read_candidates(self._container, self._contents)
         self._selection = select(self._candidates, choice, path.name)
         self._sidecar, self._choice = SidecarFiles(choice, notes), choice
+        topics = {c.channel.topic: self._contents.files.get(c.channel.topic, {}) for c in self._candidates}
+        self._masks = masks_of(choice.masks, topics, self._selection.image, self._selection.right)
 
     @property
     def warnings(self) -> list[str]:
@@ -96,8 +99,9 @@ class RecordedLog:
             right = None if pair is None else images.companion(self._selection.right, content.right_places, row)
             depth = images.companion(self._depth, content.depth_places, row)
             at_ns, image = int(content.stamp_ns[row]), images.image(row)
-            own = self._calibration_at(at_ns)
-            yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own)
+            own, mask = self._calibration_at(at_ns), images.companion(self._selection.mask, content.mask_places, row)
+            mask, right_mask = mask or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
+            yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own, mask, right_mask)
 
     def file_names(self) -> list[str] | None:
         names = self._contents.names
@@ -217,6 +221,8 @@ class RecordedLog:
         known = self._sidecar.camera(image.topic)
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
+        for masks in self._masks:
+            masks.check(content.stamp_ns.tolist(), size, notes)
         named = content.body and frame and content.tree.between(content.body, frame) is not None
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)

@@ -13,7 +13,7 @@ other parts the first by these rules does, unless TopicChoice names another:
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
 - odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
   chain from its root to the body is taken;
-- gps: most messages, then name.
+- gps: sentences of NMEA last, then most messages, then name.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from vplog.errors import LogError, nearest
-from vplog.logs.messages.records import GEOMETRY, TWISTS, WHEELS, short_type
+from vplog.logs.messages.records import GEOMETRY, NMEA, TWISTS, WHEELS, short_type
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -62,6 +62,10 @@ class TopicChoice(Settings):
     EuRoC's sensor.yaml."""
     gps: str | None = None
     """Topic of the satellite fixes; an empty string uses none."""
+    mask: str | None = None
+    """Topic of masks of the camera's images, in which a px of zero is masked."""
+    masks: dict[str, Path] = Field(default_factory=dict)
+    """By image topic, empty for that in use, the file of its mask, or a folder with one for each image."""
     imu: str | None = None
     """Topic of the IMU whose gyroscope turns velocities that are the odometry; an empty string uses none."""
     wheelbase_m: float | None = Field(default=None, gt=0, le=100)
@@ -74,6 +78,12 @@ class TopicChoice(Settings):
     """s after the first image, before which images are left out."""
     stop_s: float | None = Field(default=None, ge=0, le=1e9)
     """s after the first image, from which on images are left out."""
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The files and folders beside the log, by what they are."""
+        named = {"odometry_file": self.odometry_file, "calibration_file": self.calibration_file}
+        return {name: path for name, path in named.items() if path} | {f"mask {k}": v for k, v in self.masks.items()}
 
 
 @dataclass(frozen=True)
@@ -119,11 +129,12 @@ class Selection:
     """Transforms over time: read where odometry may come from them, or where no topic is of static ones alone."""
     right: Channel | None = None
     right_info: Channel | None = None
+    mask: Channel | None = None
 
     @property
     def parts(self) -> dict[Channel, str]:
         """What each topic in use is used as, in the words of `vplog.data.Topic.part`."""
-        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu")
+        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask")
         many = [(channel, name) for name in ("tf_static", "tf") for channel in getattr(self, name)]
         one = [(channel, name) for name in named if (channel := getattr(self, name)) is not None]
         return dict(many) | dict(one)
@@ -145,9 +156,9 @@ class Selection:
 
 _NAMES = {
     "image": "Image", "depth": "Depth", "right": "Image", "camera_info": "Calibration", "odometry": "Odometry",
-    "gps": "GPS", "imu": "IMU",
+    "gps": "GPS", "imu": "IMU", "mask": "Image",
 }  # fmt: skip
-_ROLES = {"right": "image"}
+_ROLES = {"right": "image", "mask": "image"}
 """What a topic of a part is taken for before parts are given out, where it is called otherwise."""
 _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"),
           ("image_0", "image_1"), ("image_2", "image_3"), ("rgb_0", "rgb_1"))  # fmt: skip
@@ -162,7 +173,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     ) -> Candidate | None:
         wanted = getattr(choice, role)
         found = sorted((c for c in candidates if c.role == _ROLES.get(role, role) and c.count), key=key)
-        found = [c for c in found if c is not taken]
+        found = [c for c in found if c is not taken and (role == "mask" or c.channel.topic != choice.mask)]
         if wanted is None:
             return found[0] if found else None
         if wanted == "":
@@ -213,17 +224,18 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     requested = pick("odometry", _by_size, "tf") if kind == "topic" else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(candidates, kind, requested, geometry)
-    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
     imu = pick("imu", _by_size) if sources and turned else None
-    gps = pick("gps", _by_size)
+    gps = pick("gps", lambda c: (short_type(c.channel.type) == NMEA, *_by_size(c)))
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     parts = {
         "image": image, "depth": depth, "camera_info": calibration, "odometry": requested, "gps": gps,
         "right": right, "right_info": right_info, "imu": imu,
+        "mask": pick("mask", _by_size, "depth") if choice.mask else None,
     }  # fmt: skip
     found = {name: part.channel for name, part in parts.items() if part is not None}
-    tf = tuple(c.channel for c in moving) if not static or any(c.role == "tf" for c in sources) else ()
+    moving = tuple(c.channel for c in sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size))
+    tf = moving if not static or any(c.role == "tf" for c in sources) else ()
     return Selection(
         **found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
+from dataclasses import replace
 from itertools import compress, pairwise
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.logs.formats.container import Notes, plural
 from vplog.logs.messages.decode import Poses
+from vplog.logs.messages.nmea import SENTENCES
 from vplog.logs.stamps import Stamps
 from vplog.logs.tf_odometry import are_usable, clean
 
@@ -193,8 +195,21 @@ class FixTrack:
         """Frame of the antenna, by the first fix."""
         self._dropped: Counter[str] = Counter()
         """Messages by why they are no fix."""
+        self._sentences: list[tuple[FixMessage, int, int | None]] = []
+        """Fixes of NMEA, of which several sentences are one."""
+
+    def add_sentences(self) -> None:
+        """Add the fixes of the one type of NMEA's sentences with a position that comes often and holds most."""
+        counts = Counter(one.sentence for one, _, _ in self._sentences if not _no_position(one))
+        often = [kind for kind in SENTENCES if counts and counts[kind] > max(counts.values()) / 2]
+        found, self._sentences = [one for one in self._sentences if one[0].sentence in often[:1]], []
+        for message, log_ns, position in found:
+            self.add(replace(message, sentence=""), log_ns, position)
 
     def add(self, message: FixMessage, log_ns: int, position: int | None = None) -> None:
+        if message.sentence:
+            self._sentences.append((message, log_ns, position))
+            return
         if why := _no_position(message):
             self._dropped[why] += 1
             return

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from vplog.features.extraction import describe
 from vplog.features.matching import MatchSettings, match_features
 from vplog.features.sift import SiftSettings
 from vplog.geometry import se3
@@ -16,7 +17,7 @@ from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_ala
 from vplog.odometry.sensor import follow
 
 if TYPE_CHECKING:
-    from vplog.data import Bytes, Float32s, Floats, Frame
+    from vplog.data import Float32s, Floats, Frame
     from vplog.odometry.sensor import Points, Sensor
 
 _CORNERS = 300
@@ -73,11 +74,12 @@ class Motion:
     """(6, 6) covariance by what all points err in together, which no number of them averages out."""
 
 
-def corners(image: Bytes, taken: Float32s) -> Float32s:
+def corners(frame: Frame, taken: Float32s) -> Float32s:
     """(K, 2) px of corners away from those `taken`, the strongest first: as many as are left to _CORNERS."""
+    image = frame.image
     height, width = image.shape
     apart = _SPREAD * np.sqrt(width * height / _CORNERS)
-    mask = np.full(image.shape, 255, np.uint8)
+    mask = np.full(image.shape, 255, np.uint8) * (True if frame.mask is None else frame.mask)
     for x, y in np.rint(taken).astype(int).tolist():
         cv2.circle(mask, (x, y), round(apart), 0, -1)
     left = _CORNERS - len(taken)
@@ -102,7 +104,7 @@ def track(reference: Reference, frame: Frame, guess: Floats, sensor: Sensor) -> 
 
 def rematch(reference: Frame, frame: Frame, sensor: Sensor) -> tuple[Points, Points]:
     """SIFT features that match, with a depth in the first frame, as points of the one and of the other."""
-    a, b = (SiftSettings()(one.image) for one in (reference, frame))
+    a, b = (describe(SiftSettings(), one) for one in (reference, frame))
     mine, theirs = match_features(a, b, MatchSettings())
     first, second = (
         sensor.measure(one, np.ascontiguousarray(features.points[rows]))

@@ -94,7 +94,7 @@ class _Tracker:
 
     def _start(self, frame: Frame) -> None:
         """Begin a piece where the last one ended; nothing where the frame has too few points with depth."""
-        points = self._usable(frame, corners(frame.image, np.zeros((0, 2), np.float32)))
+        points = self._usable(frame, corners(frame, np.zeros((0, 2), np.float32)))
         if len(points.px) < _LEAST:
             return
         if self.stamp_ns:
@@ -110,7 +110,7 @@ class _Tracker:
     def _add_view(self, frame: Frame, reference: Reference, motion: Motion) -> None:
         """Make a tracked frame the next reference, and adjust the window."""
         ids, points = reference.ids[motion.rows], motion.points
-        new = self._usable(frame, corners(frame.image, points.px))
+        new = self._usable(frame, corners(frame, points.px))
         first = max(self.world) + 1
         pose = self.views[-1].world_from_camera @ motion.reference_from_camera
         view = _View(pose, len(self.stamp_ns) - 1, motion.covariance + motion.systematic)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from vplog.masking import masked
 from vplog.stages import FrameState, StoredState
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def views_of(
     if isinstance(state, StoredState):
         return Views(state.stored(log, stamp_ns, query), _same, _same)
     if isinstance(state, FrameState):
-        return Views(log.frames(stamp_ns), lambda encoded: encoded.decode(state.colour), state.describe_frame)
+        return Views(log.frames(stamp_ns), lambda encoded: masked(encoded.decode(state.colour)), state.describe_frame)
     return Views(range(len(stamp_ns)), features, state.describe)
 
 

@@ -11,7 +11,6 @@ keyframes become references.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from dataclasses import dataclass
 from itertools import islice
@@ -22,7 +21,7 @@ import numpy as np
 from vplog import logs
 from vplog.cache.code_hash import code_of
 from vplog.cache.feature_shards import Extracted, packed
-from vplog.cache.input_hashes import files_of
+from vplog.cache.input_hashes import files_of, hash_inputs
 from vplog.cache.stage_cache import (
     AbsentError,
     DamagedError,
@@ -66,6 +65,15 @@ _log = logging.getLogger(__name__)
 PART_KEYFRAMES = 64
 """Keyframes of a part: about 6 s of one core and 20 MB. A kill costs at most one part, and who computes one elsewhere
 opens the log for it, which reads it through once."""
+
+
+_LOOKED_AT = 16
+"""Keyframes whose light and contrast are measured."""
+_SMALL_PX, _DARK, _FLAT = 160 * 160, 16.0, 40.0
+"""Pictures are small below so many px, dark below this mean grey, and low in contrast where 98 % of grey levels lie
+closer: those of drives by day have 10^5 px, a mean of 80 to 130 and 150 to 250 levels, of a lit park at night 240."""
+_POOR_SHARE = 0.1
+"""Share of keyframes with few features from which that is said."""
 
 
 class Extraction(Protocol):
@@ -191,11 +199,10 @@ def split_keyframes(
 
 def image_topics(topics: logs.TopicChoice) -> dict[str, Any]:
     """The choice of topics as far as images depend on it; files beside the log by their content."""
-    named = topics.model_dump(mode="json", exclude={"gps"})
-    for name, file in (("odometry_file", topics.odometry_file), ("calibration_file", topics.calibration_file)):
-        if file is not None:
-            with file.open("rb") as stream:
-                named[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    named = topics.model_dump(mode="json", exclude={"gps", "masks"})
+    for name, path in topics.files.items():
+        hashes = hash_inputs(path)
+        named[name] = hashes if path.is_dir() else list(hashes.values())  # a file may be called otherwise
     return named
 
 
@@ -235,12 +242,36 @@ def extract(
     return found
 
 
-def decoded(keyframes: Keyframes, found: Extracted) -> Keyframes:
-    """The keyframes whose images decode, with a warning where that is not all of them."""
+def decoded(keyframes: Keyframes, found: Extracted, settings: FeatureSettings) -> Keyframes:
+    """The keyframes whose images decode, with a warning where that is not all of them, or where they are poor."""
     rows, total = np.searchsorted(keyframes.stamp_ns, found.stamp_ns), len(keyframes.stamp_ns)
     for why in found.lost[:1]:
         _log.warning("%d of %d keyframes were lost to damaged images. First: %s", total - len(rows), total, why)
+    if why := poor_pictures(found, getattr(settings, "least_features", 0)):
+        _log.warning(why)
     return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows])
+
+
+def poor_pictures(found: Extracted, least: int) -> str:
+    """What makes pictures too poor to recognise places by, in sentences; empty where few have less than `least`
+    features and the usual one has light, contrast and size."""
+    counts = np.array(found.counts)
+    sample = [found[row] for row in np.linspace(0, len(counts) - 1, _LOOKED_AT).astype(int).tolist()]
+    width, height = sample[0].width, sample[0].height
+    grey = np.array([one.thumbnail for one in sample if one.thumbnail is not None])
+    reasons = [f"small ({width} x {height} px)"] if width * height < _SMALL_PX else []
+    if len(grey) and (mean := float(np.median(grey.mean(axis=(1, 2))))) < _DARK:
+        reasons.append(f"dark (a mean of {mean:.0f} of 255)")
+    elif len(grey) and (levels := float(np.median(np.ptp(np.percentile(grey, [1, 99], axis=(1, 2)), axis=0)))) < _FLAT:
+        reasons.append(f"low in contrast ({levels:.0f} of 255 levels)")
+    few = int((counts < least).sum())
+    if not least or (not reasons and few < _POOR_SHARE * len(counts)):
+        return ""
+    poor = f", and {few} of {len(counts)} have less than {least}: hardly a place is recognised by those" if few else ""
+    return (
+        f"Pictures are {' and '.join(reasons) or 'blurred, or without texture'}. With contrast and size raised, the "
+        f"usual one has {int(np.median(counts))} features{poor}."
+    )
 
 
 def _is_cached(

@@ -12,6 +12,7 @@ from vplog.cache.codecs import json_codec
 from vplog.cache.steps import step
 from vplog.data import Odometry
 from vplog.errors import LogError
+from vplog.masking import masked
 from vplog.odometry.visual import visual_odometry
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import select_keyframes
@@ -101,7 +102,7 @@ def _decoded(log: Log, stamp_ns: np.ndarray, execution: Execution) -> Iterator[F
 
     def work(encoded: EncodedFrame) -> Frame | None:
         try:
-            return encoded.decode()
+            return masked(encoded.decode())
         except LogError:
             return None  # counted by the log
 

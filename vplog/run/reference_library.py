@@ -15,6 +15,7 @@ from vplog.data import Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
+from vplog.masking import masked
 from vplog.places.coverage import (
     STRONGEST,
     Coverage,
@@ -92,7 +93,7 @@ def own_images(
         chosen_ns = selected.stamp_ns[choose(selected.stamp_ns, settings)]
         rows = np.flatnonzero(np.isin(keyframes.stamp_ns, chosen_ns))
     frames = log.frames(keyframes.stamp_ns[rows])
-    return [(row, encoded.decode().image) for row, encoded in zip(rows.tolist(), frames, strict=True)]
+    return [(row, masked(encoded.decode()).image) for row, encoded in zip(rows.tolist(), frames, strict=True)]
 
 
 def own_references(keyframes: Keyframes, features: Extracted, images: Sequence[tuple[int, Bytes]]) -> list[Reference]:
@@ -158,7 +159,7 @@ def build_library(
             frames = extract_frames(log.frames(stamps), pipeline.features, execution)
             for stamp_ns, frame, features, _ in execution.counted(f"extract {log.name}", frames, len(stamps)):
                 if frame is not None and features is not None:
-                    references.append(Reference(frame.image, features, log.name, stamp_ns))
+                    references.append(Reference(masked(frame).image, features, log.name, stamp_ns))
         for line in dict.fromkeys(line for log in opened for line in log.warnings):
             warn(line)
         state = pipeline.places.learn(references, execution)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.errors import SettingsError
+from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
 from vplog.loops.structure import pairs_to_match, triangulate
 from vplog.results import colmap, tables
@@ -67,7 +69,7 @@ def _pictures(
         name = f"{frame.stamp_ns}.jpg"
         data = cv2.imencode(".jpg", np.asarray(frame.colour)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
         (made / "images" / name).write_bytes(data.tobytes())
-        return name, pipeline.features(frame.image, None)
+        return name, describe(pipeline.features, replace(frame, depth=None))
 
     names = []
     found = execution.map(work, drive.frames(stamp_ns), ahead=2)

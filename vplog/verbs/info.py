@@ -44,7 +44,7 @@ _OPTIONS = {
     "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
     "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
-    "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
+    "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
 _PART_WORDS = {
@@ -56,6 +56,7 @@ _PART_WORDS = {
     "odometry": "odometry",
     "gps": "satellite fixes",
     "imu": "gyroscope, which turns the velocities",
+    "mask": "masks of the camera's images",
     "tf_static": "static transforms",
     "tf": "transforms",
 }
@@ -134,8 +135,9 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
 
 def command(path: Path, topics: TopicChoice) -> str:
     """The command that runs on this log with these topics."""
-    chosen = {name: value for name, value in topics if value is not None}
+    chosen = {name: value for name, value in topics if name in _OPTIONS and value is not None}
     options = [f"--{_OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
+    options += [f"--mask {shlex.quote(f'{name}={path}' if name else str(path))}" for name, path in topics.masks.items()]
     log = "LOG" if address(path) != str(path) else shlex.quote(str(path))  # a URL with its query is shown nowhere
     return " ".join(["vplog run", log, "-o OUT", *options])
 

@@ -87,13 +87,16 @@ def test_a_drive_in_flatbuffers_is_the_drive(tmp_path: Path) -> None:
 def test_every_type_agrees_with_protobuf() -> None:
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
     from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+    from foxglove_schemas_protobuf.Pose_pb2 import Pose
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
     from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
     raw = RawImage(frame_id="c", width=WIDTH, height=HEIGHT, encoding="mono8", step=WIDTH, data=bytes(WIDTH * HEIGHT))
     odometry = Odometry(frame_id="odom", body_frame_id="base", pose_covariance=np.arange(36.0))
     odometry.pose.position.x, odometry.pose.orientation.w, odometry.timestamp.seconds = 3.0, 1.0, 7
     several = FrameTransforms(transforms=[m.message for m in foxglove_messages(Drive())[:2]])
-    messages = [m.message for m in foxglove_messages(Drive())] + [raw, odometry, several]
+    poses = PosesInFrame(frame_id="odom", poses=[Pose(), odometry.pose])
+    messages = [m.message for m in foxglove_messages(Drive())] + [raw, odometry, several, poses]
     for message in messages:
         name = message.DESCRIPTOR.full_name
         by_flat = decode(Channel("/t", name, "flatbuffer"), flat(message))

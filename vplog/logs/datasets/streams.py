@@ -42,6 +42,8 @@ class Stream:
     """The message of a row."""
     length: Callable[[int], int] | None = None
     """Bytes of a message without making it; None of small ones."""
+    files: Sequence[Path] = ()
+    """(K,) of images, where each message is a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,12 @@ class DataSetContainer:
             counts[one.channel] += len(one.stamp_ns)
         stamps = np.concatenate([one.stamp_ns for one in self._streams] or [np.zeros(0, np.int64)])
         span_ns = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
-        return Contents(dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names)
+        files = {
+            one.channel.topic: dict(zip(one.stamp_ns.tolist(), map(str, one.files), strict=True))
+            for one in self._streams
+            if one.files
+        }
+        return Contents(dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names, files)
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         """The messages in order of time."""
@@ -108,7 +115,7 @@ def camera_streams(
     def length(row: int) -> int:
         return 0 if files[row] in damaged else _length_of(files[row])
 
-    return [Stream(channel, stamp_ns, message, length), *calibration_streams(topic, topic, stamp_ns, camera)]
+    return [Stream(channel, stamp_ns, message, length, files), *calibration_streams(topic, topic, stamp_ns, camera)]
 
 
 def calibration_streams(topic: str, frame: str, stamp_ns: Ints, camera: CalibratedCamera | None) -> list[Stream]:

@@ -111,6 +111,8 @@ class Contents:
     """Frame that the truth is of."""
     names: dict[int, str] = field(default_factory=dict)
     """Image file by stamp, of images that are known by their names."""
+    files: dict[str, dict[int, str]] = field(default_factory=dict)
+    """By topic, the path of each image by its stamp, of those that are files."""
 
     @property
     def messages(self) -> int:

@@ -20,10 +20,12 @@ _FIELDS = {
     "foxglove.RawImage": "timestamp frame_id width height encoding step data",
     "foxglove.CameraCalibration": "timestamp frame_id width height distortion_model D K R P",
     "foxglove.PoseInFrame": "timestamp frame_id pose",
+    "foxglove.PosesInFrame": "timestamp frame_id poses",
     "foxglove.Odometry": "timestamp frame_id body_frame_id pose linear_velocity angular_velocity pose_covariance",
     "foxglove.LocationFix": (
         "timestamp frame_id latitude longitude altitude position_covariance position_covariance_type"
     ),
+    "foxglove.LocationFixes": "fixes",
     "foxglove.FrameTransform": "timestamp parent_frame_id child_frame_id translation rotation",
     "foxglove.FrameTransforms": "transforms",
     "foxglove.Pose": "position orientation",

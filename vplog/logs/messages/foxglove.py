@@ -17,6 +17,7 @@ from vplog.logs.messages.flatbuffers import parse_flatbuffer
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
+    FixesMessage,
     FixMessage,
     ImageMessage,
     PoseMessage,
@@ -143,6 +144,11 @@ def _fix(m: Any) -> Record:
     return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance, m.frame_id)
 
 
+def _fixes(m: Any) -> Record:
+    found = [one for one in map(_fix, m.fixes) if isinstance(one, FixMessage)]
+    return FixesMessage(found[0].stamp_ns if found else 0, found)
+
+
 def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
     """Zeros where the field was left out."""
     return np.array(values, np.float64).reshape(shape) if len(values) else np.zeros(shape)
@@ -157,6 +163,7 @@ _READERS: dict[str, Callable[[Any], Record]] = {
     "foxglove.PosesInFrame": _poses,
     "foxglove.Odometry": _odometry,
     "foxglove.LocationFix": _fix,
+    "foxglove.LocationFixes": _fixes,
     "foxglove.FrameTransform": lambda m: [_transform(m)],
     "foxglove.FrameTransforms": lambda m: [_transform(t) for t in m.transforms],
 }

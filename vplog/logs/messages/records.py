@@ -105,10 +105,30 @@ class FixMessage:
     """(3, 3) m^2 east-north-up; NaN where unknown by its covariance type."""
     frame: str
     """Frame of the antenna."""
+    sentence: str = ""
+    """Type of the NMEA sentence that it is of."""
 
 
-Record = ImageMessage | CalibrationMessage | PoseMessage | PathMessage | ImuMessage | FixMessage | list[PoseMessage]
+class FixesMessage(NamedTuple):
+    """Several fixes."""
 
+    stamp_ns: int
+    fixes: list[FixMessage]
+
+
+Record = (
+    ImageMessage
+    | CalibrationMessage
+    | PoseMessage
+    | PathMessage
+    | ImuMessage
+    | FixMessage
+    | FixesMessage
+    | list[PoseMessage]
+)
+
+NMEA = "nmea_msgs/Sentence"
+"""The type of sentences of satellite receivers, several of which are one fix."""
 _KINDS = {
     "sensor_msgs/Image": "image",
     "sensor_msgs/CompressedImage": "image",
@@ -136,6 +156,10 @@ _KINDS = {
     "foxglove.Odometry": "odometry",
     "sensor_msgs/NavSatFix": "gps",
     "foxglove.LocationFix": "gps",
+    "foxglove.LocationFixes": "gps",
+    "gps_common/GPSFix": "gps",
+    "gps_msgs/GPSFix": "gps",
+    NMEA: "gps",
     "tf2_msgs/TFMessage": "tf",
     "tf/tfMessage": "tf",
     "foxglove.FrameTransform": "tf",

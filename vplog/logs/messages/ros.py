@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.geometry import se3
+from vplog.logs.messages.nmea import fix_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 _UNKNOWN_COVARIANCE = 0
 """NavSatFix.COVARIANCE_TYPE_UNKNOWN."""
+_RADIUS_95, _NORMAL_95 = 2.448, 1.960
+"""Sigmas that 95 % of errors are below, in the plane and along an axis."""
 _UNKNOWN_VARIANCES = (math.nan,) * 6
 _SIDE = re.compile(r"(left|right|(?<![a-z])[lr](?![a-z]))", re.IGNORECASE)
 """The side of a wheel in the name of its joint."""
@@ -99,6 +102,11 @@ class _Fields:
         values = np.frombuffer(self._data, f"{self._order}f8", count, self._at).astype(np.float64)
         self._at += 8 * count
         return values
+
+    def skip_int32s(self) -> None:
+        """int32[]."""
+        (count,) = self.numbers("I")
+        self._at += 4 * count
 
     def stamp_ns(self) -> int:
         return nanoseconds(*self.numbers("iI" if self._cdr else "II"))
@@ -275,6 +283,27 @@ def _fix(fields: _Fields) -> Record:
     return FixMessage(stamp_ns, status >= 0, latitude, longitude, altitude, known, frame)
 
 
+def _gps_fix(fields: _Fields) -> Record:
+    """gps_common of ROS 1 and gps_msgs of ROS 2; its errors are those that 95 % are below."""
+    stamp_ns, frame = fields.header()
+    fields.header()
+    for lists in (1, 4):  # satellites used and visible
+        fields.numbers("H")
+        for _ in range(lists):
+            fields.skip_int32s()
+    status, *_ = fields.numbers("h3H")
+    latitude, longitude, altitude, *others, kind = fields.numbers("34dB")
+    known = np.array(others[22:]).reshape(3, 3)
+    if kind == _UNKNOWN_COVARIANCE:
+        horizontal, vertical = (max(error, 0.0) or math.nan for error in others[13:15])
+        known = np.diag([(horizontal / _RADIUS_95) ** 2] * 2 + [(vertical / _NORMAL_95) ** 2])
+    return FixMessage(stamp_ns, status >= 0, latitude, longitude, altitude, known, frame)
+
+
+def _sentence(fields: _Fields) -> Record:
+    return fix_of(*fields.header(), fields.text()) or []
+
+
 _READERS: dict[str, Callable[[_Fields], Record]] = {
     "sensor_msgs/Image": _image,
     "sensor_msgs/CompressedImage": _compressed,
@@ -294,6 +323,9 @@ _READERS: dict[str, Callable[[_Fields], Record]] = {
     "sensor_msgs/JointState": _wheels,
     "sensor_msgs/Imu": _imu,
     "sensor_msgs/NavSatFix": _fix,
+    "gps_common/GPSFix": _gps_fix,
+    "gps_msgs/GPSFix": _gps_fix,
+    "nmea_msgs/Sentence": _sentence,
     "tf2_msgs/TFMessage": _transforms,
     "tf/tfMessage": _transforms,
 }

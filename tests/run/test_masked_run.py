@@ -1,0 +1,87 @@
+"""A drive whose camera sees its own bonnet: it recognises nothing by that once it is masked."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from tests.logs.drives import store
+from vplog.demo import SMALL
+from vplog.results.run_record import read_run_json
+from vplog.results.tables import read_keyframes
+from vplog.run.feature_extraction import stored_features
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.conftest import Said
+    from vplog.demo.record import Drive
+
+QUICK = ("--set", "pictures.closures=0", "--threads", "2")
+HORIZON = 0.6
+
+
+@pytest.fixture(scope="module")
+def bonnet(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive with the same texture in the lower part of each image, and its mask."""
+    folder = tmp_path_factory.mktemp("bonnet")
+    size = (SMALL.height, SMALL.width)
+    texture = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, size).astype(np.float32), (0, 0), 1.2)
+    texture = ((texture - texture.min()) / np.ptp(texture) * 255).astype(np.uint8)
+    used = np.arange(SMALL.height)[:, None] < HORIZON * SMALL.height + np.zeros(SMALL.width)
+    cv2.imwrite(str(folder / "mask.png"), used * np.uint8(255))
+    with drive.log.open("rb") as stream, (folder / "drive.mcap").open("wb") as file:
+        writer, channels = Writer(file), dict[int, int]()
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            data = message.data
+            if schema.name == "sensor_msgs/msg/CompressedImage":
+                image = store(2).deserialize_cdr(data, schema.name)
+                pixels = np.asarray(cv2.imdecode(np.asarray(image.data), cv2.IMREAD_GRAYSCALE))
+                pixels[~used] = texture[~used]
+                image.data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].ravel()
+                data = store(2).serialize_cdr(image, schema.name)
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], message.log_time, bytes(data), message.publish_time)
+        writer.finish()
+    return folder
+
+
+def test_a_masked_bonnet_neither_hides_closures_nor_makes_them(
+    bonnet: Path, finished: Path, verb: Callable[..., Said], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    assert verb("run", bonnet / "drive.mcap", "-o", out, "--mask", bonnet / "mask.png", *QUICK).code == 0
+    plain, bare = (read_run_json(folder / "run.json") for folder in (finished, out))
+    assert bare["counts"]["verdicts"]["accepted"] > 0.7 * plain["counts"]["verdicts"]["accepted"]
+    features = stored_features(out / ".cache")
+    assert features is not None
+    points = np.concatenate([features[row].points for row in range(len(features))])
+    assert points[:, 1].max() < HORIZON * SMALL.height
+    keyframes, _ = read_keyframes(out / "keyframes.parquet")
+    assert len(keyframes.stamp_ns) == len(features)
+
+    # the mask counts to what results depend on, its name does not
+    moved = (bonnet / "mask.png").rename(bonnet / "other.png")
+    again = verb("run", bonnet / "drive.mcap", "-o", out, "--mask", f"/camera={moved}", *QUICK)
+    assert "no topic /camera" in again.error
+    again = verb("run", bonnet / "drive.mcap", "-o", out, "--mask", moved, *QUICK, "--json").json
+    assert again["stages"]["extract"]["result"] == "reused"
+    cv2.imwrite(str(moved), np.asarray(cv2.imread(str(moved), cv2.IMREAD_GRAYSCALE))[::-1])
+    again = verb("run", bonnet / "drive.mcap", "-o", out, "--mask", moved, *QUICK, "--json").json
+    assert again["stages"]["extract"]["result"] == "computed"
+
+
+def test_resume_takes_no_mask(verb: Callable[..., Said], tmp_path: Path) -> None:
+    found = verb("run", "--resume", "-o", tmp_path, "--mask", "mask.png")
+    assert found.code == 2
+    assert "leave out --mask" in found.err
