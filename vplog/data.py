@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,6 +199,8 @@ class Verdict(StrEnum):
     DIRECTION_ONLY = "direction_only"
     REJECTED_BY_SOLVER = "rejected_by_solver"
     NOT_SIGNIFICANT = "not_significant"
+    ACCEPTED_BY_DECISION = "accepted_by_decision"
+    REJECTED_BY_DECISION = "rejected_by_decision"
 
     @property
     def sentence(self) -> str:
@@ -218,7 +221,15 @@ _SENTENCES = {
     Verdict.DIRECTION_ONLY: "Kept by the robust solve with rotation and direction only, without metres.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
     Verdict.NOT_SIGNIFICANT: "Verified by geometry, but likelier to be false than the rate asked for.",
+    Verdict.ACCEPTED_BY_DECISION: "A known inlier by decision: the robust solve kept it without a test.",
+    Verdict.REJECTED_BY_DECISION: "Left out by decision, whatever geometry and the robust solve make of it.",
 }
+
+
+ACCEPTED = (Verdict.ACCEPTED, Verdict.ACCEPTED_BY_DECISION)
+"""Verdicts of closures with metres in the solution."""
+USED = (*ACCEPTED, Verdict.DIRECTION_ONLY)
+"""Verdicts of closures in the solution, at least in part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,6 +288,18 @@ class Closures:
 
         return np.array([verdict in verdicts for verdict in self.verdict], bool)
 
+    def rows(self, rows: Ints) -> Closures:
+        """Some of the candidates."""
+        columns: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        for name, column in columns.items():
+            columns[name] = [column[row] for row in rows.tolist()] if isinstance(column, list) else column[rows]
+        return Closures(**columns)
+
+    @property
+    def accepted(self) -> Bools:
+        """(C,) whether each candidate is a closure with metres, by the robust solve or by decision."""
+        return self.of(*ACCEPTED)
+
     def lines(self, positions: Floats, rows: Bools) -> Floats:
         """(S, 2, 3) from the match to the query of some candidates (C,), by positions of the keyframes (N, 3)."""
         import numpy as np
@@ -287,6 +310,9 @@ class Closures:
 class EdgeKind(StrEnum):
     ODOMETRY = "odometry"
     LOOP = "loop"
+    """A closure, which may be false."""
+    KNOWN_LOOP = "known_loop"
+    """A closure that is a known inlier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,6 +331,13 @@ class PoseGraph:
     dimension: int = 3
     """3, or 2 for a planar graph: all poses and edges then are turns about z and shifts along x and y, and only rows
     and columns 2, 3, 4 of `information` (yaw, x, y) are used, the others being zero."""
+
+    @property
+    def odometry(self) -> Bools:
+        """(E,) whether each edge is odometry, not a closure."""
+        import numpy as np
+
+        return np.array([kind == EdgeKind.ODOMETRY for kind in self.kind], bool)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
 from vplog.run.back_end import solve
+from vplog.run.decisions import DecisionSettings, decide, read_decisions
 from vplog.run.false_rate import rate_closures
 from vplog.run.feature_extraction import decoded, extract
 from vplog.run.keyframes import KeyframeSettings
@@ -67,6 +68,8 @@ class Pipeline(Settings):
     """Geometry of a candidate."""
     false_rate: FalseRateSettings = FalseRateSettings()
     """The share of false closures that is admitted."""
+    decisions: DecisionSettings = DecisionSettings()
+    """Closures decided by a person."""
     noise: NoiseSettings = NoiseSettings()
     """Odometry noise."""
     solve: OptimiserSettings = GncSettings()
@@ -159,6 +162,7 @@ def run(
         odometry, camera, selected = do(read, log, topics, pipeline.keyframes)
         features = do(extract, log, topics, selected, pipeline)
         keyframes = decoded(selected, features, pipeline.features)
+        decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
         if library is None:
             images = do(own_images, log, selected, keyframes, features, pipeline.library)
             references = own_references(keyframes, features, images)
@@ -173,6 +177,8 @@ def run(
             rate_closures, closures, odometry, keyframes, camera, features, pipeline.null_pairs, pipeline.propose,
             pipeline.verify, pipeline.noise,
         )  # fmt: skip
+        if decisions is not None:
+            closures = do(decide, closures, decisions, keyframes, camera, features, pipeline.verify)
         closures = name_shared(closures, state, descriptors)
         solved = do(solve, odometry, keyframes, closures, log.gps(), pipeline)
         result = Run(

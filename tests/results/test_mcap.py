@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from tests.results.example import COUNT, METADATA, Run, make_run
-from vplog.data import Closures, EdgeKind, Keyframes, Verdict
+from vplog.data import ACCEPTED, Closures, EdgeKind, Keyframes, Verdict
 from vplog.geometry import se3
 from vplog.results.mcap import McapExtras, write_mcap
 
@@ -124,11 +124,12 @@ def test_graph_shows_edges_in_the_colour_of_their_fate(tmp_path: Path) -> None:
     odometry, accepted, partly, rejected = scene.entities
     assert {entity.frame_id for entity in scene.entities} == {"map"}
     assert len(odometry.lines[0].points) == 2 * RUN.graph.kind.count(EdgeKind.ODOMETRY)
-    for entity, verdict in (
-        (accepted, Verdict.ACCEPTED), (partly, Verdict.DIRECTION_ONLY), (rejected, Verdict.REJECTED_BY_SOLVER),
+    for entity, verdicts in (
+        (accepted, ACCEPTED), (partly, [Verdict.DIRECTION_ONLY]), (rejected, [Verdict.REJECTED_BY_SOLVER]),
     ):  # fmt: skip
-        row = RUN.closures.verdict.index(verdict)
-        ends = RUN.solution.world_from_body[[RUN.closures.match[row], RUN.closures.query[row]], :3, 3]
+        rows = [RUN.closures.verdict.index(verdict) for verdict in verdicts]
+        nodes = [node for row in rows for node in (RUN.closures.match[row], RUN.closures.query[row])]
+        ends = RUN.solution.world_from_body[nodes, :3, 3]
         np.testing.assert_allclose([[p.x, p.y, p.z] for p in entity.lines[0].points], ends)
     assert accepted.lines[0].color.g > accepted.lines[0].color.r
     assert rejected.lines[0].color.r > rejected.lines[0].color.g

@@ -19,7 +19,7 @@ import pytest
 
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_mcap import decode, of
-from vplog.data import Gps, Verdict
+from vplog.data import USED, Gps, Verdict
 from vplog.errors import ResultError
 from vplog.results import geo, mcap_read
 from vplog.results.contracts import TOPICS
@@ -141,14 +141,13 @@ def test_fixes_and_the_way_on_earth(tmp_path: Path) -> None:
     stamps = RUN.keyframes.stamp_ns
     tree = geo.feature_collection(earth, RUN.solution.world_from_body, stamps, RUN.closures)
     assert json.loads(message.geojson) == tree
-    assert len(tree["features"]) == 1 + RUN.closures.verdict.count(Verdict.ACCEPTED)
+    assert len(tree["features"]) == 1 + RUN.closures.accepted.sum()
 
 
 def test_every_candidate_of_geometry_is_in_the_graph_of_the_rejected(tmp_path: Path) -> None:
     [(_, scene)] = of(decode(write(tmp_path / "r.mcap")), "/graph/rejected")
     rejected = len(RUN.closures) - sum(
-        verdict in (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY, Verdict.REJECTED_BY_SOLVER)
-        for verdict in RUN.closures.verdict
+        verdict in (*USED, Verdict.REJECTED_BY_SOLVER) for verdict in RUN.closures.verdict
     )
     assert len(scene.entities[0].lines[0].points) == 2 * rejected
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import hashlib
 import html.parser
 import json
 import re
 import shutil
 import subprocess
+import sys
+from html import unescape
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -23,6 +27,7 @@ from vplog.results import mcap_read, tables
 from vplog.results.report.page import TruthComparison
 from vplog.results.report.page import page as write_page
 from vplog.results.run_record import read_run_json
+from vplog.run.decisions import read_decisions
 from vplog.run.report import gather
 
 if TYPE_CHECKING:
@@ -64,7 +69,8 @@ class Page(html.parser.HTMLParser):
 
 
 def ledger(text: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="ledger">(.*?)</script>', text, re.DOTALL)
+    """What the page's script works on."""
+    found = re.search(r'<script type="application/json" id="audit">(.*?)</script>', text, re.DOTALL)
     assert found is not None
     return json.loads(found[1])
 
@@ -87,12 +93,26 @@ def test_the_page_is_whole_and_fetches_nothing(page: str) -> None:
 
 def test_the_table_has_every_candidate(page: str, finished: Path) -> None:
     closures = tables.read_closures(finished / "closures.parquet")
-    told = ledger(page)
-    rows = [dict(zip(told["columns"], row, strict=True)) for row in told["rows"]]
-    assert [row["row"] for row in rows] == list(range(len(closures)))
-    assert [row["verdict"] for row in rows] == [verdict.value for verdict in closures.verdict]
-    assert [row["inliers"] for row in rows] == closures.inliers.tolist()
-    assert [row["weight"] is None for row in rows] == np.isnan(closures.weight).tolist()
+    columns = ledger(page)["columns"]
+    assert columns["row"] == list(range(len(closures)))
+    assert columns["verdict"] == [verdict.value for verdict in closures.verdict]
+    assert columns["inliers"] == closures.inliers.tolist()
+    assert [weight is None for weight in columns["weight"]] == np.isnan(closures.weight).tolist()
+
+
+def test_thumbnails_are_of_keyframes_of_closures_first(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closures = tables.read_closures(finished / "closures.parquet")
+    used = closures.accepted
+    ends = set(closures.query[used].tolist()) | set(closures.match[used].tolist())
+    assert ends <= set(gather(finished, {}).thumbnails)
+    monkeypatch.setattr(sys.modules["vplog.run.report"], "_MOST_THUMBNAILS", 4)
+    few = gather(finished, {}).thumbnails
+    assert len(few) == 4
+    assert set(few) <= ends
+    for data in few.values():
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        assert 0 < image.size < 3 * 41_000
 
 
 def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finished: Path) -> None:
@@ -141,10 +161,10 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     told = ledger(text)
     evaluation = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     assert f"{evaluation['ate_after']['rmse_m']:.3f}" in text
-    accepted = [row for row in (dict(zip(told["columns"], r, strict=True)) for r in told["rows"])
-                if row["verdict"] == "accepted"]  # fmt: skip
-    for name, count in (("true", "accepted_true"), ("same place", "same_place")):
-        assert sum(row[name] == "yes" for row in accepted) == evaluation["closures"][count] > 0
+    accepted = [verdict == "accepted" for verdict in told["columns"]["verdict"]]
+    for name, count in (("true", "accepted_true"), ("same_place", "same_place")):
+        yes = [one == "yes" for one in told["columns"][name]]
+        assert sum(np.logical_and(yes, accepted)) == evaluation["closures"][count] > 0
     assert f"within {evaluation['closures']['criterion']['translation_m']:.2f} m and 5 deg" in text
     narrow = ("--distance-m", 0.01, "--heading-deg", 3)
     assert verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "n.html", *narrow).code == 0
@@ -157,19 +177,17 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])
 def test_accepted_closures_that_are_false_stand_out(finished: Path, wrong: int) -> None:
-    """The map draws them apart, and the ledger has their truth beside the verdict."""
+    """The legend names them, and the ledger has their truth beside the verdict."""
     verdicts = tables.read_closures(finished / "closures.parquet").verdict
     accepted = [row for row, verdict in enumerate(verdicts) if verdict is Verdict.ACCEPTED]
     true, known = np.ones(len(verdicts), bool), np.ones(len(verdicts), bool)
     true[accepted[:wrong]] = False
     known[accepted[-1]] = False
     text = write_page(gather(finished, {}, TruthComparison("truth.tum", {}, true=true, known=known)))
-    assert ("accepted closures that are false" in text) == bool(wrong)
-    [edges] = re.findall(r'<path class="edge false" d="(.*?)"/>', text)
-    assert edges.count("M") == wrong
-    told = ledger(text)
-    assert told["columns"][1:3] == ["verdict", "true"]
-    assert [told["rows"][row][2] for row in accepted] == ["no"] * wrong + ["yes"] * (len(accepted) - 1 - wrong) + [None]
+    assert ("closures in the solution that are false" in text) == bool(wrong)
+    columns = ledger(text)["columns"]
+    assert list(columns)[1:3] == ["verdict", "true"]
+    assert [columns["true"][row] for row in accepted] == ["no"] * wrong + ["yes"] * (len(accepted) - 1 - wrong) + [None]
 
 
 def test_the_curves_enclose_the_average_precision(finished: Path, drive: Drive) -> None:
@@ -199,7 +217,7 @@ def test_pictures_come_from_the_log_where_the_run_kept_none(
     closures = tables.read_closures(folder / "closures.parquet")
     write_mcap(folder / "result.mcap", keyframes, world, graph, closures, tables.TableMetadata({}, ""))
     assert verb("report", folder).code == 0
-    assert "<img" not in (folder / "report.html").read_text()
+    assert "<img loading" not in (folder / "report.html").read_text()
     assert verb("report", folder, "--log", drive.log).code == 0
     text = (folder / "report.html").read_text()
     kept = mcap_read.read_pictures(finished / "result.mcap").pictures
@@ -298,30 +316,111 @@ def opened(browser: str, page: Path, tmp_path: Path, *options: str) -> tuple[str
     return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
 
 
-def cells(dom: str) -> list[list[str]]:
-    body = re.search(r'<tbody id="rows">(.*?)</tbody>', dom, re.DOTALL)
-    assert body is not None
-    rows = re.findall(r"<tr>(.*?)</tr>", body[1])
-    return [[re.sub("<[^>]*>", "", cell) for cell in re.findall(r"<td.*?>(.*?)</td>", row)] for row in rows]
+def driven(browser: str, page: str, tmp_path: Path, script: str, *options: str) -> Any:
+    """What a script beside the page's own returns, as the page's policy would have it; no word on the console."""
+    script = f"document.title = JSON.stringify((() => {{{script}}})())"
+    source = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    page = page.replace("; script-src ", f"; script-src &#39;sha256-{source}&#39; ", 1)
+    (tmp_path / "page.html").write_text(page.replace("</body>", f"<script>{script}</script></body>"))
+    dom, console = opened(browser, tmp_path / "page.html", tmp_path, "--dump-dom", *options)
+    assert not console
+    found = re.search("<title>(.*?)</title>", dom, re.DOTALL)
+    assert found is not None
+    return json.loads(unescape(found[1]))
 
 
-def test_a_browser_fills_and_sorts_the_table_without_a_complaint(
+HELPERS = """
+const $ = (id) => document.getElementById(id), shown = () => [...document.querySelectorAll("#rows tr[data-row]")];
+const column = (name) => [...document.querySelectorAll("#closures th")].findIndex((th) => th.textContent === name);
+const values = (name) => shown().map((tr) => tr.children[column(name)].textContent);
+const set = (id, value) => {
+  $(id).value = value; $(id).dispatchEvent(new Event(id === "search" ? "input" : "change"));
+};
+const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+const pointer = (kind, x, y) => {
+  const { left, top } = $("map").getBoundingClientRect();
+  $("map").dispatchEvent(new PointerEvent(kind, { pointerId: 1, clientX: left + x, clientY: top + y, bubbles: true }));
+};
+$("map").setPointerCapture = () => {};
+"""
+
+
+def test_a_browser_fills_sorts_and_filters_the_ledger(browser: str, finished: Path, page: str, tmp_path: Path) -> None:
+    closures = tables.read_closures(finished / "closures.parquet")
+    least = int(np.median(closures.matches))
+    found = driven(
+        browser, page, tmp_path,
+        f"""{HELPERS} set("filter", "accepted");
+        [...document.querySelectorAll("#closures th button")].find((one) => one.textContent === "matches").click();
+        const sorted = values("matches"), verdicts = values("verdict");
+        set("filter", "");
+        for (let n = 0; n < 40; n++) press("j");
+        const box = $("ledger").getBoundingClientRect();
+        const chosen = document.querySelector("[aria-selected=true]").getBoundingClientRect();
+        const inView = chosen.top > box.top && chosen.bottom < box.bottom;
+        $("ledger").scrollTop = 1e9; $("ledger").dispatchEvent(new Event("scroll"));
+        const bottom = shown().at(-1).getBoundingClientRect().bottom - box.top - $("ledger").clientHeight;
+        set("search", "matches>{least} keyframe={closures.query[-1]}");
+        return [sorted, verdicts, values("row"), $("count").textContent, inView, bottom];""",
+    )  # fmt: skip
+    accepted = closures.of(Verdict.ACCEPTED)
+    expected = sorted(closures.matches[accepted].tolist(), reverse=True)
+    assert list(map(int, found[0])) == expected[: len(found[0])]
+    assert len(found[0]) >= min(len(expected), 10)
+    assert set(found[1]) == {"accepted"}
+    at = (closures.query == closures.query[-1]) | (closures.match == closures.query[-1])
+    rows = np.flatnonzero(at & (closures.matches > least))
+    assert sorted(map(int, found[2])) == rows.tolist()
+    assert found[3] == f"{len(rows)} of {len(closures)} candidates"
+    assert found[4]
+    assert abs(found[5]) < 4  # the last row ends where the box does
+
+
+def test_a_closure_is_selected_from_map_and_ledger_and_decisions_are_downloaded(
     browser: str, finished: Path, page: str, tmp_path: Path
 ) -> None:
-    clicks = (
-        "<script>const f=document.getElementById('filter');f.value='accepted';f.dispatchEvent(new Event('change'));"
-        "[...document.querySelectorAll('#closures th button')].find(b=>b.textContent==='matches').click();</script>"
-    )
-    (tmp_path / "page.html").write_text(page.replace("</body>", f"{clicks}</body>"))
-    dom, console = opened(browser, tmp_path / "page.html", tmp_path, "--dump-dom")
-    assert not console
+    """The map finds a dot after it was moved and zoomed, keys decide, and a run reads the file that is downloaded."""
+    found = driven(
+        browser, page, tmp_path,
+        f"""{HELPERS} let text = null;
+        window.Blob = class extends Blob {{ constructor(parts, about) {{ super(parts, about); text = parts[0]; }} }};
+        set("filter", "accepted"); $("who").value = 'Jo "J", Doe'; $("reason").value = "a\\nb";
+        const first = values("row").slice(0, 4).map(Number);
+        shown()[0].click();
+        const fromLedger = $("closure-title").textContent, command = $("command").value, pictures = !$("query").hidden;
+        press("r"); press("j"); press("r"); press("j"); press("r"); press("u"); press("j"); press("a");
+        pointer("pointerdown", 5, 5); pointer("pointermove", 60, 45); pointer("pointerup", 60, 45);
+        $("map").dispatchEvent(new WheelEvent("wheel", {{ deltaY: -100, cancelable: true }}));
+        let fromMap = "";
+        for (let y = 0; y < 560 && !fromMap; y += 6) for (let x = 0; x < 900 && !fromMap; x += 6) {{
+          pointer("pointermove", x, y);
+          if (!$("tip").hidden) {{
+            const told = $("tip").textContent;
+            pointer("pointerdown", x, y); pointer("pointerup", x, y);
+            fromMap = [told, $("closure-title").textContent];
+          }}
+        }}
+        $("add-query").value = "40"; $("add-match").value = "2"; $("add").click();
+        $("download").click();
+        return [fromLedger, command, pictures, fromMap, $("decided").textContent, text, first,
+          document.documentElement.scrollWidth <= window.innerWidth];""",
+        "--window-size=1000,900",
+    )  # fmt: skip
+    ledger_title, command, pictures, (tip, map_title), decided, text, first, fits = found
+    numbers = re.fullmatch(r"Closure (\d+): keyframe (\d+) as a return to (\d+)", ledger_title)
+    assert numbers is not None
+    assert command.endswith(f"--closure {numbers[2]}:{numbers[3]}")
+    assert pictures
+    query, match = re.findall(r"\d+", tip)[:2]
+    assert f"keyframe {query} as a return to {match}" in map_title
+    assert decided == "4 decisions"
+    (tmp_path / "decisions.csv").write_text(text)
     closures = tables.read_closures(finished / "closures.parquet")
-    accepted = [row for row, verdict in enumerate(closures.verdict) if verdict is Verdict.ACCEPTED]
-    shown = cells(dom)
-    assert len(shown) == min(len(accepted), 100)
-    at = ledger(page)["columns"].index("matches")
-    assert [int(row[at]) for row in shown] == sorted(closures.matches[accepted].tolist(), reverse=True)[:100]
-    assert {row[1] for row in shown} == {"accepted"}
+    pairs = [(int(closures.query[row]), int(closures.match[row])) for row in first]
+    decisions = read_decisions(tmp_path / "decisions.csv", tables.read_keyframes(finished / "keyframes.parquet")[0])
+    assert decisions.rejected == sorted(pairs[:2])
+    assert decisions.accepted == sorted([pairs[3], (40, 2)])
+    assert fits
 
 
 def test_a_browser_runs_nothing_of_a_strangers(verb: Verb, browser: str, hostile: Path, tmp_path: Path) -> None:
@@ -329,7 +428,7 @@ def test_a_browser_runs_nothing_of_a_strangers(verb: Verb, browser: str, hostile
     dom, console = opened(browser, hostile / "report.html", tmp_path, "--dump-dom")
     assert not console
     assert "<title>owned" not in dom
-    assert cells(dom)
+    assert "<tr data-row=" in dom
 
 
 def test_a_run_that_proposed_nothing_is_a_page_too(verb: Verb, browser: str, finished: Path, tmp_path: Path) -> None:
@@ -348,11 +447,9 @@ def test_a_run_that_proposed_nothing_is_a_page_too(verb: Verb, browser: str, fin
 @pytest.mark.parametrize("size", ["1280,900", "500,900"])
 def test_nothing_is_wider_than_the_window(browser: str, page: str, tmp_path: Path, size: str) -> None:
     """Tables scroll inside their box, so the page itself never scrolls sideways; dark paper where dark is asked for."""
-    probe = "<script>document.title=[document.documentElement.scrollWidth<=innerWidth]</script>"
-    (tmp_path / "page.html").write_text(page.replace("</body>", f"{probe}</body>"))
-    dom, console = opened(browser, tmp_path / "page.html", tmp_path, f"--window-size={size}", "--dump-dom")
-    assert "<title>true</title>" in dom
-    assert not console
+    assert driven(
+        browser, page, tmp_path, "return document.documentElement.scrollWidth <= innerWidth", f"--window-size={size}"
+    )
     shots = []
     for scheme in ("0", "1"):  # blink's numbers of dark and light
         flags = (f"--window-size={size}", f"--blink-settings=preferredColorScheme={scheme}")

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from vplog.data import Camera, Features, Keyframes, Verdict
+from vplog.data import ACCEPTED, Camera, Features, Keyframes, Verdict
 from vplog.execution.execution import Execution
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import se3
@@ -81,7 +81,7 @@ def told(row: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("verdict", Verdict)
 def test_every_verdict_is_told_in_whole_sentences_and_says_what_would_change_it(verdict: Verdict) -> None:
     words = told(a_row(verdict))
-    became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, "Rejected")
+    became = {**dict.fromkeys(ACCEPTED, "Accepted"), Verdict.DIRECTION_ONLY: "Used"}.get(verdict, "Rejected")
     assert words.verdict.startswith(became)
     assert verdict.sentence in words.verdict
     for text in (words.verdict, words.proposed, words.geometry, words.solver, words.change):

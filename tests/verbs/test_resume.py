@@ -440,7 +440,13 @@ def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, v
     (out / "run.json").write_text(json.dumps({**account, "finished": False}))
     other = tmp_path / "other.mcap"
     assert "Leave out the log" in verb("run", "--resume", other, "-o", out).error
-    for option in (["--set", "verify.min_matches=3"], ["--gps"], ["--no-cache"], ["--image-topic", "/a"]):
+    for option in (
+        ["--set", "verify.min_matches=3"],
+        ["--gps"],
+        ["--no-cache"],
+        ["--image-topic", "/a"],
+        ["--decisions", "d.csv"],
+    ):
         said = verb("run", "--resume", "-o", out, *option)
         assert said.code == 2
         assert f"leave out {option[0]}" in said.err

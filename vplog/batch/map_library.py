@@ -32,8 +32,10 @@ def map_library(
 ) -> str:  # fmt: skip
     """The hash of the map's library, which is put into the map where it has none yet.
 
-    Raises LibraryError where another one is given, or where the settings describe places otherwise.
+    Raises LibraryError where another one is given, or where the settings describe places otherwise, and SettingsError
+    where they have decisions.
     """
+    pipeline.decisions.check_single_drive()
     begun = (store.root / "map.json").exists()
     known = store.recovered_head().library if begun else None
     if known is not None and not store.library(known).is_dir():

@@ -28,6 +28,7 @@ from vplog.cli.parser import (
     option,
     pipeline_of,
     place,
+    resolved,
     settings_options,
     share,
     topic_options,
@@ -86,7 +87,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
 @contextmanager
 def _local_copies(arguments: argparse.Namespace) -> Iterator[None]:
     """Run folders and libraries named by URL are copied for the verb; what it writes to one is sent when it is done."""
-    places = {name: getattr(arguments, name, None) for name in ("run", "runs", "library", "output")}
+    places = {name: getattr(arguments, name, None) for name in ("run", "runs", "baseline", "library", "output")}
     if not any("://" in str(place) for place in places.values()):
         yield
         return
@@ -219,6 +220,8 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
             arguments.refuse("the following arguments are required: LOG")
         if arguments.gps:
             arguments.set.append("gps.use=true")
+        if arguments.decisions is not None:
+            arguments.set.append(f"decisions.file={json.dumps(str(arguments.decisions))}")
         if arguments.false_rate is not None:
             arguments.set.append(f"false_rate.rate={arguments.false_rate!r}")
         return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
@@ -226,7 +229,7 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
 
     if "://" in str(arguments.shown):
         arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
-    fixed = ("pipeline", "set", "library", "gps", "false_rate", "mask")
+    fixed = ("pipeline", "set", "library", "gps", "false_rate", "decisions", "mask")
     names = [name for name in vars(arguments) if name in fixed or name.endswith(("_topic", "_file"))]
     given = [name for name in names if getattr(arguments, name) not in (None, [], False, "default")]
     if given or not arguments.cache:
@@ -350,6 +353,7 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     flag(sub, "--one-drive", "the logs are the parts of one recording")
     flag(sub, "--gps", "use the log's satellite fixes as constraints")
     option(sub, "--false-rate", share, "R", "share of false closures to allow, as 0.01 (default: all verified ones)")
+    option(sub, "--decisions", resolved, "FILE.csv", "closures to accept, reject or add, as report.html writes")
     flag(sub, "--resume", "continue the interrupted run in OUT; needs no LOG")
     _add_force(sub)
     flag(sub, "--no-cache", "do not cache results of stages in OUT for later runs", "cache")

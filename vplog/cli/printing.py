@@ -86,6 +86,22 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print_line("", ", ".join(f"{' '.join(title.split())} {cell}" for title, cell in named if cell))
 
 
+def print_diff(found: dict[str, Any]) -> None:
+    def cell(value: Any) -> str:
+        return f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)
+
+    named = [(name, *map(cell, pair)) for name, pair in found["settings"].items()]
+    if named:
+        print_table(("setting", "baseline", "run"), named)
+    print_table(("figure", "baseline", "run", "change"), [(k, *map(cell, v)) for k, v in found["figures"].items()])
+    print_table(("stage", "seconds\nbaseline", "\nrun"), [(k, *map(cell, v)) for k, v in found["seconds"].items()])
+    for kind in ("gained", "lost"):
+        pairs = [f"{query}:{match}" for query, match in found["closures"][kind]]
+        if pairs:
+            more = f" and {len(pairs) - 5} more (--json)" if len(pairs) > 5 else ""
+            print_line(kind, f"{', '.join(pairs[:5])}{more}")
+
+
 def print_next(look: str, *commands: str) -> None:
     """Where the results are, and the next commands, each on a line to be copied."""
     print_line("look at", look)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.cli.parser import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
 from vplog.cli.printing import (
     Progress,
+    print_diff,
     print_evaluation,
     print_explanation,
     print_json,
@@ -72,6 +73,22 @@ def report(arguments: argparse.Namespace) -> None:
         _truth_options(arguments), Execution(arguments.threads),
     )  # fmt: skip
     print_result(arguments, found, lambda found: print(found["report"]))
+
+
+def diff(arguments: argparse.Namespace) -> None:
+    """Compare two runs of one drive: settings, closures, trajectories, scores and times."""
+    from vplog.errors import ResultError
+    from vplog.verbs.diff import check_limits, exceeded
+    from vplog.verbs.diff import diff as diff_runs
+
+    runs = [*([arguments.baseline] if arguments.baseline else []), *arguments.runs]
+    if len(runs) != 2:
+        arguments.refuse(f"two runs are compared, BASELINE RUN or RUN --baseline BASELINE, and {len(runs)} were given")
+    check_limits(arguments.fail_on)
+    found = diff_runs(runs[0], runs[1], arguments.truth, topics_of(arguments), _truth_options(arguments))
+    print_result(arguments, found, print_diff)
+    if sentences := exceeded(found, arguments.fail_on):
+        raise ResultError(" ".join(sentences))
 
 
 def export(arguments: argparse.Namespace) -> None:
@@ -138,6 +155,14 @@ def add_results(
     _add_truth_options(sub)
     option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
     option(sub, "-o --output", local_file, "FILE.html", "page (default: RUN/report.html)")
+    sub = add("diff", diff, topics)
+    sub.set_defaults(refuse=sub.error)
+    option(sub, "runs", place, "RUN", nargs="+")
+    option(sub, "--baseline", place, "RUN", "the run to compare with (default: the first of two)")
+    option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
+    _add_truth_options(sub)
+    text = "exit status 1 where a change fails this, as 'recall<-0.01' or 'seconds>20%%'; repeatable"
+    option(sub, "--fail-on", str, "LIMIT", text, action="append", default=[])
     sub = add("export", export, threads)
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")

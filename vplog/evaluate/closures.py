@@ -174,7 +174,7 @@ def score_closures(
 
 def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion) -> dict[str, Any]:
     """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
-    accepted = closures.of(Verdict.ACCEPTED)
+    accepted = closures.accepted
     right, wrong = accepted & judged.right, accepted & judged.wrong
     here = accepted & judged.known
     return {
@@ -228,7 +228,7 @@ def closure_sentences(closures: dict[str, Any]) -> list[str]:
 def _score(
     closures: Closures, judged: Judgement, covered: Bools, revisit: Bools, place: PlaceCriterion
 ) -> ClosureScore:
-    accepted, direction = closures.of(Verdict.ACCEPTED), closures.of(Verdict.DIRECTION_ONLY) & judged.known
+    accepted, direction = closures.accepted, closures.of(Verdict.DIRECTION_ONLY) & judged.known
     found = np.unique(closures.query[accepted & judged.right])
     found = found[revisit[found]]
     by_score, by_inliers = (_area(judged.curves.get(name), bool(revisit.any())) for name in ("score", "inliers"))
@@ -304,7 +304,7 @@ def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) 
     """Score the accepted closures of a ledger."""
     at = truth.at(keyframes.stamp_ns)
     poses, known = at.world_from_body, at.known & truth.oriented
-    usable = closures.of(Verdict.ACCEPTED) & known[closures.query] & known[closures.match]
+    usable = closures.accepted & known[closures.query] & known[closures.match]
     rows = np.flatnonzero(usable & np.isfinite(closures.information).all((1, 2)))
     query, match = closures.query[rows], closures.match[rows]
     measured = closures.match_from_query[rows]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import ACCEPTED, Verdict
 from vplog.errors import ResultError
 from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
@@ -100,11 +100,11 @@ def reference_use(state: PlaceState, places: Sequence[Any]) -> list[int] | None:
 def choose_examples(closures: Closures, count: int) -> list[int]:
     """Rows worth a picture: accepted ones evenly along the drive, and of every reason of rejection the best scored."""
     verdicts = np.array([verdict.value for verdict in closures.verdict])
-    accepted = np.flatnonzero(verdicts == Verdict.ACCEPTED.value)
+    accepted = np.flatnonzero(closures.accepted)
     others = [
         rows[np.argsort(-closures.score[rows], kind="stable")].tolist()
         for verdict in reversed(Verdict)  # the reasons that come last in the checks are the most telling
-        if verdict is not Verdict.ACCEPTED and len(rows := np.flatnonzero(verdicts == verdict.value))
+        if verdict not in ACCEPTED and len(rows := np.flatnonzero(verdicts == verdict.value))
     ]
     room = count - min(count // 2, sum(map(len, others)))
     chosen = accepted[np.linspace(0, len(accepted) - 1, min(room, len(accepted))).astype(np.int64)].tolist()

@@ -35,8 +35,8 @@ def build_graph(
     """The graph, the ledger row (L,) of each of its loop edges in order, and warnings.
 
     Odometry edges join consecutive keyframes, with the inverses of `edge_covariances` (N-1, 6, 6, in the later
-    body's frame). They are followed by one loop edge per ledger row whose verdict is `accepted`: a the match, b the
-    query. Raises GraphError where a pose or a matrix is not one.
+    body's frame). One loop edge per accepted ledger row follows, a known one where it is by decision: a the match,
+    b the query. Raises GraphError where a pose or a matrix is not one.
     """
     poses, n = keyframes.odom_from_body, len(keyframes.stamp_ns)
     if n < 2:
@@ -47,7 +47,7 @@ def build_graph(
         raise GraphError(f"{n} keyframes need ({n - 1}, 6, 6) edge covariances, not {edge_covariances.shape}.")
     _check_matrices(edge_covariances, "covariance", np.arange(n - 1), np.arange(1, n))
 
-    rows = np.flatnonzero(closures.of(Verdict.ACCEPTED) if closures is not None else [])
+    rows = np.flatnonzero(closures.accepted if closures is not None else [])
     a, b = np.arange(n - 1), np.arange(1, n)
     a_from_b = se3.between(poses[:-1], poses[1:])
     information = np.linalg.inv(edge_covariances)
@@ -63,13 +63,14 @@ def build_graph(
         a, b = np.concatenate([a, match]), np.concatenate([b, query])
         a_from_b = np.concatenate([a_from_b, closures.match_from_query[rows]])
         information = np.concatenate([information, closures.information[rows] / busier(match, query)[:, None, None]])
+    by_decision = [closures.verdict[row] is Verdict.ACCEPTED_BY_DECISION for row in rows.tolist()] if closures else []
     graph = PoseGraph(
         world_from_body=np.array(poses, np.float64),
         a=a.astype(np.int32),
         b=b.astype(np.int32),
         a_from_b=a_from_b,
         information=(information + np.swapaxes(information, 1, 2)) / 2,
-        kind=[EdgeKind.ODOMETRY] * (n - 1) + [EdgeKind.LOOP] * len(rows),
+        kind=[EdgeKind.ODOMETRY] * (n - 1) + [EdgeKind.KNOWN_LOOP if one else EdgeKind.LOOP for one in by_decision],
     )
     graph, warnings = checked(graph)
     return graph, rows.astype(np.int64), warnings

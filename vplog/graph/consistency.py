@@ -35,8 +35,8 @@ def degrees_of_freedom(graph: PoseGraph) -> int:
 
 
 def is_loop(graph: PoseGraph) -> Bools:
-    """Edges (E,) that are not odometry, the ones that may be false."""
-    return np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    """Edges (E,) that may be false: closures but known inliers."""
+    return np.array([kind == EdgeKind.LOOP for kind in graph.kind], bool)
 
 
 def residual_before(graph: PoseGraph, chain: OdometryChain | None = None) -> Floats:
@@ -48,7 +48,7 @@ def residual_before(graph: PoseGraph, chain: OdometryChain | None = None) -> Flo
     it is at hand.
     """
     result = np.zeros(len(graph.a))
-    loops = np.flatnonzero([kind == EdgeKind.LOOP for kind in graph.kind])
+    loops = np.flatnonzero(~graph.odometry)
     if len(loops) == 0:
         return result
     result[loops] = (chain or OdometryChain.of(graph)).distance(loops, graph)
@@ -113,7 +113,7 @@ def odometry_chain(graph: PoseGraph) -> tuple[Floats, Ints]:
     An edge may be written either way round. A pose without an edge from its predecessor (a second robot, a gap) stays
     at its initial place.
     """
-    edges = np.flatnonzero(~is_loop(graph))
+    edges = np.flatnonzero(graph.odometry)
     edges = edges[np.abs(graph.b[edges] - graph.a[edges]) == 1][::-1]  # reversed: the first of several wins
     leads = np.full(len(graph.world_from_body), -1)
     leads[np.maximum(graph.a[edges], graph.b[edges])] = edges

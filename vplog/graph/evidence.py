@@ -69,7 +69,7 @@ def log_evidence(factors: Factors, weight: Floats, poses: Floats, chain: Odometr
     `poses` are their least squares, `chain` the graph's odometry.
     """
     graph = factors.graph
-    loops = is_loop(graph)
+    loops = ~graph.odometry
     true, false = np.flatnonzero(loops & (weight > 0)), np.flatnonzero(loops & (weight == 0))
     room = log_room(graph, chain.poses)
     total, accidents = _log_false(graph, false, chain, room)

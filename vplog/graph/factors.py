@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import EdgeKind
 from vplog.graph.build import parts
 from vplog.graph.sparse.symbolic import Elimination
 
@@ -30,7 +29,7 @@ class Factors:
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Factors:
-        odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+        odometry = graph.odometry
         return cls(graph, parts(len(graph.world_from_body), graph.a[odometry], graph.b[odometry]))
 
     def elimination(self, on: Bools) -> Elimination:

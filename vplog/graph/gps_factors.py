@@ -14,7 +14,7 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.graph.build import informed
-from vplog.graph.consistency import chi2_quantile, is_loop
+from vplog.graph.consistency import chi2_quantile
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective, Positions, minimised
 from vplog.graph.marginals import positions_redundancy
 from vplog.graph.robust_kernels import truncated_weights
@@ -328,7 +328,7 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
 def _log_determinant(objective: Objective, poses: Floats) -> float:
     """Log determinant of the information matrix; of a chain, where rounding may leave none, that of its edges."""
     graph, on = objective.factors.graph, objective.weight > 0
-    if is_loop(graph)[on].any():
+    if not graph.odometry[on].all():
         return objective.information(poses).log_determinant()
     held = 1 + len(objective.factors.loose(objective.weight))
     return float(np.linalg.slogdet(informed(graph)[on])[1].sum()) - 2.0 * held * 6.0 * float(np.log(GAUGE_SIGMA))

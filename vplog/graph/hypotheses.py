@@ -200,7 +200,7 @@ def _flipped(graph: PoseGraph, best: Hypothesis, run: Ints) -> list[Hypothesis]:
 
 def bounded(graph: PoseGraph) -> PoseGraph:
     """The graph with the information of each closure at most `_MOST_INFORMATION` times the median one's."""
-    loops = np.flatnonzero(is_loop(graph))
+    loops = np.flatnonzero(~graph.odometry)
     if not len(loops):
         return graph
     axes = np.diagonal(informed(graph)[loops], axis1=1, axis2=2)
@@ -259,7 +259,7 @@ def _estimated(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) 
 
 def _judged(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
     factors = Factors.of(claimed_times(graph, sigmas))
-    if (weight[is_loop(graph)] > 0).any():
+    if (weight[~graph.odometry] > 0).any():
         poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
     found = log_evidence(factors, weight, poses, OdometryChain.of(factors.graph)) + sigmas.log_prior()
     return Hypothesis(weight, poses, sigmas, found)

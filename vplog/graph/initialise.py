@@ -94,7 +94,7 @@ def _lago(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     graph = factors.graph
     turn = np.arctan2(graph.a_from_b[:, 1, 0], graph.a_from_b[:, 0, 0])
     yaw = np.unwrap(np.arctan2(chain[:, 1, 0], chain[:, 0, 0]))
-    if (1.0 / graph.information[~is_loop(graph), 2, 2]).sum() > _LOST_RAD**2:
+    if (1.0 / graph.information[graph.odometry, 2, 2]).sum() > _LOST_RAD**2:
         yaw = _turned_least(graph, weight, turn, yaw)
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
     yaw = yaw[0] + _potentials(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]

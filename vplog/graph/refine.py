@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from vplog.graph.consistency import is_loop, residual_sigma
+from vplog.graph.consistency import residual_sigma
 from vplog.graph.evidence import runs
 from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
@@ -122,7 +122,7 @@ def refine(
     GraphError where too few fixes agree.
     """
     weight, poses, inlier = solution.weight, solution.world_from_body, np.zeros(0)
-    loops = is_loop(graph)
+    loops = ~graph.odometry
     scales = []
     if fixes is not None:
         scales = [Scale("odometry", of_odometry, settings.scale_sigma, settings.significance, scale)]

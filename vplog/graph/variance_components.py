@@ -14,7 +14,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import degrees_of_freedom, is_loop
+from vplog.graph.consistency import degrees_of_freedom
 from vplog.graph.marginals import edge_covariances
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def most_likely_variance(chi2: float, redundancy: float) -> float:
 def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
     """The graph with its sigmas multiplied."""
     odometry, closures = np.repeat(sigmas, 3).reshape(2, 6)
-    factor = np.where(is_loop(graph)[:, None], closures, odometry)
+    factor = np.where(graph.odometry[:, None], odometry, closures)
     return replace(graph, information=graph.information / (factor[:, :, None] * factor[:, None, :]))
 
 
@@ -88,12 +88,12 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     have for themselves.
     """
     graph, weight = objective.factors.graph, objective.weight
-    loops = is_loop(graph) & (weight > 0)
+    loops = ~graph.odometry & (weight > 0)
     closures_dof = float(degrees_of_freedom(graph) * np.count_nonzero(loops))
     most = closures_dof
     if objective.positions is not None:
         most += 3.0 * np.count_nonzero(objective.positions.Omega.any((1, 2)))
-    (chi2, checks), (closures, own) = _of_parts(objective, poses, [~is_loop(graph), loops])
+    (chi2, checks), (closures, own) = _of_parts(objective, poses, [graph.odometry, loops])
     checks *= min(1.0, most / max(checks.sum(), 1e-12))
     rest = closures_dof * (1.0 - checks.sum() / max(most, 1.0))
     own = np.array([min(own[0], rest), max(rest - own[0], 0.0)])  # that of translations drowns in rounding
@@ -111,7 +111,7 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
 def _most_factors(graph: PoseGraph) -> list[float]:
     """Most that the factors of rotation and translation can be: what odometry measures is motion and noise, and where
     more than `_MOST_NOISE` of its root mean square is noise, it is none."""
-    edges = np.flatnonzero(~is_loop(graph))
+    edges = np.flatnonzero(graph.odometry)
     axes = np.array(AXES[graph.dimension])
     motion = se3.log(graph.a_from_b[edges])[:, axes]
     covariance = np.asarray(np.linalg.inv(informed(graph)[edges]), np.float64)
@@ -125,7 +125,7 @@ def _most_factors(graph: PoseGraph) -> list[float]:
 
 def extrapolated(first: Sigmas, second: Sigmas, third: Sigmas) -> Sigmas:
     """Where three estimates in a row lead to: Aitken's delta-squared process in their logarithms, bounded."""
-    steps = np.diff(np.log([first, second, third]), axis=0)
+    steps = np.diff(np.log(np.array([first, second, third])), axis=0)
     ratio = np.divide(steps[1], steps[0], out=np.zeros(len(first)), where=np.abs(steps[0]) > _STILL)
     ratio = np.clip(ratio, 0.0, _MOST_RATIO)
     ahead = np.clip(steps[1] * ratio / (1.0 - ratio), -_FURTHEST, _FURTHEST)

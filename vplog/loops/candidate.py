@@ -52,6 +52,12 @@ class VerifySettings(Settings):
     """When two images agree, for an uncalibrated camera."""
 
 
+def lenient(settings: VerifySettings) -> VerifySettings:
+    """Settings under which a pair that a person accepts has its pose wherever chance does not explain it."""
+    metric = settings.metric.model_copy(update=_LENIENT)
+    return settings.model_copy(update={"min_matches": metric.min_inliers, "both_ways": False, "metric": metric})
+
+
 @dataclass(frozen=True, eq=False)
 class Drive:
     """Keyframes, camera, features and settings of a drive, as verification takes them."""
@@ -119,14 +125,14 @@ def check_reverse(
     """
     landmarks = _landmarks(later, query)
     # the limits have been checked in one direction; in reverse only the pose is compared
-    lenient = later.settings.metric.model_copy(update=_LENIENT)
+    metric = lenient(later.settings).metric
     result = []
     for match, row in zip(matches, rows, strict=True):
         if row.pairs is None:
             raise ValueError("only a row with a pose is checked in reverse")
         start = None if row.pose.match_from_query is None else se3.inverse(row.pose.match_from_query)
         theirs, pairs = earlier.features(match), (row.pairs[1], row.pairs[0])
-        reverse = _check_metric(earlier, theirs, pairs, landmarks, later.stereo, lenient, start)
+        reverse = _check_metric(earlier, theirs, pairs, landmarks, later.stereo, metric, start)
         if reverse.landmarks < later.settings.metric.min_inliers:
             result.append(row)
         else:

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import Closures, Floats, Ints, Trajectory, Verdict
+from vplog.data import Closures, Floats, Ints, Trajectory
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic, utm, utm_zone
 from vplog.storage.parquet_limits import write_table
@@ -48,7 +48,7 @@ def feature_collection(earth: Earth, world_from_body: Floats, stamp_ns: Ints, cl
     if len(where) > 1:
         about = {"name": "optimised", "start_ns": str(stamp_ns[0]), "end_ns": str(stamp_ns[-1])}
         features.append(_line(where, about))
-    for row in np.flatnonzero(closures.of(Verdict.ACCEPTED)).tolist():
+    for row in np.flatnonzero(closures.accepted).tolist():
         query, match = int(closures.query[row]), int(closures.match[row])
         about = {"name": "closure", "closure": row, "query": query, "match": match}
         features.append(_line([where[match], where[query]], about))
@@ -65,7 +65,7 @@ def write_kml(path: Path, earth: Earth, world_from_body: Floats, closures: Closu
     where = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in on_earth(earth, world_from_body).tolist()]
     kml = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = ElementTree.SubElement(kml, "Document")
-    rows = np.flatnonzero(closures.of(Verdict.ACCEPTED)).tolist()
+    rows = np.flatnonzero(closures.accepted).tolist()
     ends = [(f"closure {row}", [where[closures.match[row]], where[closures.query[row]]]) for row in rows]
     for title, points in [(name, where), *ends]:
         mark = ElementTree.SubElement(document, "Placemark")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import math
 from functools import cache, partial
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 
 def render(template: str, **values: Any) -> str:
@@ -30,9 +33,23 @@ def _environment() -> Environment:
         undefined=ChainableUndefined,  # a run.json of another version may lack any field
     )
     indented = partial(json.dumps, indent=1, ensure_ascii=False)
+    environment.filters |= {"inline": _inline, "hashed": _hashed}
     environment.filters |= {"figure": figure, "data_url": data_url, "mapping": mapping, "indented": indented}
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return environment
+
+
+@cache
+def _inline(name: str) -> Markup:
+    """A style or script of ours as it stands between its tags."""
+    from markupsafe import Markup  # of Jinja
+
+    return Markup(files("vplog.results").joinpath("templates", name).read_text(encoding="utf-8"))  # noqa: S704
+
+
+def _hashed(name: str) -> str:
+    """The source expression by which a Content-Security-Policy allows this inline text, and no other."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(_inline(name).encode()).digest()).decode()}'"
 
 
 def figure(value: Any, digits: int = 1) -> str:

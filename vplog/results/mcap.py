@@ -17,7 +17,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 import vplog
-from vplog.data import Camera, Closures, EdgeKind, Floats, Gps, Ints, Keyframes, PoseGraph, Verdict
+from vplog.data import ACCEPTED, Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph, Verdict
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
@@ -235,26 +235,26 @@ class _Channels:
 
 
 _VERDICT_COLOURS = {
-    "closures accepted": (Verdict.ACCEPTED, foxglove.GREEN),
-    "closures taken without metres": (Verdict.DIRECTION_ONLY, foxglove.AMBER),
-    "closures rejected by the solver": (Verdict.REJECTED_BY_SOLVER, foxglove.RED),
+    "closures accepted": (ACCEPTED, foxglove.GREEN),
+    "closures taken without metres": ((Verdict.DIRECTION_ONLY,), foxglove.AMBER),
+    "closures rejected by the solver": ((Verdict.REJECTED_BY_SOLVER,), foxglove.RED),
 }
-"""Closures given to the solver: name, verdict and colour."""
+"""Closures given to the solver: name, verdicts and colour."""
 
 
 def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: Closures) -> SceneUpdate:
     """Odometry edges grey, closures in the colour of their verdict."""
-    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    odometry = graph.odometry
     ends = world_from_body[:, :3, 3]
     named = [("odometry", np.stack([ends[graph.a[odometry]], ends[graph.b[odometry]]], 1), foxglove.GREY)]
-    for name, (verdict, color) in _VERDICT_COLOURS.items():
-        named.append((name, closures.lines(ends, closures.of(verdict)), color))
+    for name, (verdicts, color) in _VERDICT_COLOURS.items():
+        named.append((name, closures.lines(ends, closures.of(*verdicts)), color))
     return foxglove.lines(stamp_ns, named)
 
 
 def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
     """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
-    given = closures.of(*(verdict for verdict, _ in _VERDICT_COLOURS.values()))
+    given = closures.of(*(one for verdicts, _ in _VERDICT_COLOURS.values() for one in verdicts))
     ends = closures.lines(world_from_body[:, :3, 3], ~given)
     return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
 

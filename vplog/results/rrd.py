@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Closures, Verdict
+from vplog.data import ACCEPTED, Closures, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.geo import on_earth
@@ -54,12 +54,12 @@ def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
         strip = rr.LineStrips3D([trajectory.world_from_body[:, :3, 3]], colors=[colour])
         recording.log(f"map/path/{name}", strip, static=True)
     ends = tracks.world_from_body[:, :3, 3]
-    for name, verdict, colour in (
-        ("accepted", Verdict.ACCEPTED, _GREEN),
-        ("without_metres", Verdict.DIRECTION_ONLY, _AMBER),
-        ("rejected_by_solver", Verdict.REJECTED_BY_SOLVER, _RED),
+    for name, verdicts, colour in (
+        ("accepted", ACCEPTED, _GREEN),
+        ("without_metres", (Verdict.DIRECTION_ONLY,), _AMBER),
+        ("rejected_by_solver", (Verdict.REJECTED_BY_SOLVER,), _RED),
     ):
-        lines = rr.LineStrips3D(closures.lines(ends, closures.of(verdict)), colors=[colour])
+        lines = rr.LineStrips3D(closures.lines(ends, closures.of(*verdicts)), colors=[colour])
         recording.log(f"map/closures/{name}", lines, static=True)
     if tracks.earth is not None:
         where = on_earth(tracks.earth, tracks.after.world_from_body)[:, [1, 0]]

@@ -139,7 +139,12 @@ EDGES = pa.schema(
     [
         column("a", pa.int32(), "row", "Keyframe."),
         column("b", pa.int32(), "row", "Keyframe."),
-        column("kind", pa.string(), "", "`odometry` or `loop`. GPS fixes are no edges: see run.json."),
+        column(
+            "kind",
+            pa.string(),
+            "",
+            "`odometry`, `loop` or, by decision, `known_loop`. GPS fixes are no edges.",
+        ),
         *pose_columns("", "a_from_b, as measured"),
         column("information", MATRIX, _INFORMATION_UNIT, "6x6 of a_from_b, in the frame of b."),
         column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1."),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
@@ -25,6 +26,7 @@ from vplog.data import (
     Verdict,
 )
 from vplog.errors import GraphError
+from vplog.geometry import se3
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
@@ -35,10 +37,12 @@ from vplog.graph.marginals import pose_covariances
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.graph.pieces import pieces_placed
 from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
-from vplog.graph.solve import OptimiserSettings, decided
+from vplog.graph.solve import Decision, OptimiserSettings, decided
 from vplog.graph.variance_components import Sigmas
 
 _log = logging.getLogger(__name__)
+_CONFIRMED = 0.99
+"""Probability that the noise of a true closure leaves it within the bound of its distance to the solution."""
 
 
 class BackEnd(Protocol):
@@ -88,6 +92,8 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
     refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
     warnings += _apart(broken, keyframes, graph, refined.solution)
+    warnings += _contradicted(present, partial(decided, optimiser=settings.solve, cost=cost))
+    warnings += _confirmed(closures, refined.solution.world_from_body)
     for warning in warnings:
         _log.warning(warning)
     return Solved(
@@ -102,7 +108,7 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
 
 def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
     """A warning of the breaks of the odometry (edges) that no closure kept spans."""
-    kept = is_loop(graph) & (solution.weight > 0.5)
+    kept = ~graph.odometry & (solution.weight > 0.5)
     begin, end = (np.sort(rows[kept]) for rows in (graph.a, graph.b))
     open_ = begin.searchsorted(broken, "right") == end.searchsorted(broken, "right")  # as many ended as had begun
     if not open_.any():
@@ -114,9 +120,37 @@ def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solut
     ]
 
 
+def _contradicted(graph: PoseGraph, solve: Callable[[PoseGraph], Decision]) -> list[str]:
+    """A warning of each closure accepted by decision that the robust solve rejects where none is known to be true."""
+    known = np.array([kind == EdgeKind.KNOWN_LOOP for kind in graph.kind], bool)
+    if not known.any():
+        return []
+    kind = [EdgeKind.ODOMETRY if one == EdgeKind.ODOMETRY else EdgeKind.LOOP for one in graph.kind]
+    weight = solve(replace(graph, kind=kind)).solution.weight
+    return [
+        f"Decision to accept keyframes {graph.b[edge]} and {graph.a[edge]}: the robust solve without decisions rejects "
+        f"this closure. Look at it: vplog explain RUN --closure {graph.b[edge]}:{graph.a[edge]}"
+        for edge in np.flatnonzero(known & (weight < 0.5)).tolist()
+    ]
+
+
+def _confirmed(closures: Closures, poses: Floats) -> list[str]:
+    """A warning of each closure rejected by decision that the solution predicts within the noise of its own pose."""
+    rejected = closures.of(Verdict.REJECTED_BY_DECISION) & np.isfinite(closures.information).all((1, 2))
+    query, match = closures.query[rejected], closures.match[rejected]
+    error = se3.log(se3.between(closures.match_from_query[rejected], se3.between(poses[match], poses[query])))
+    sigma = np.sqrt(np.einsum("ki,kij,kj->k", error, closures.information[rejected], error))
+    return [
+        f"Decision to reject keyframes {one} and {other}: the other constraints have them {value:.1f} sigma from the "
+        "pose that geometry finds, so it seems to be a true closure."
+        for one, other, value in zip(query.tolist(), match.tolist(), sigma.tolist(), strict=True)
+        if value**2 < consistency.chi2_quantile(_CONFIRMED, 6)
+    ]
+
+
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
     """(E,) edges whose metres are the odometry's: its own, and closures (ledger `rows`) with its scale."""
-    result = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    result = graph.odometry
     result[~result] = [closures.scale[row] == "odometry" for row in rows.tolist()]
     return result
 
@@ -156,7 +190,7 @@ def judged_ledger(closures: Closures, graph: PoseGraph, refined: Refined, rows: 
     Residuals before are relative to the assumed odometry noise, those after to the estimated one.
     """
     solution = refined.solution
-    loops = is_loop(graph)
+    loops = ~graph.odometry
     before, after, weight = (np.full(len(closures), np.nan) for _ in range(3))
     before[rows] = consistency.residual_before(graph)[loops]
     after[rows] = consistency.residual_sigma(refined.graph, solution.world_from_body)[loops]

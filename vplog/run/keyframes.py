@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from pydantic import Field
 
@@ -54,6 +56,15 @@ def select_keyframes(
     spacing = settings.distance_m if settings.distance_m is not None else settings.sparseness * _spacing(poses)
     rows = _far_enough(poses, spacing, np.deg2rad(settings.rotation_deg))
     return Keyframes(drive, stamp_ns[rows], poses[rows]), warnings
+
+
+def row_of(keyframes: Keyframes, name: int | str) -> int | None:
+    """The row of the keyframe that a row or a stamp in ns names, None where there is none."""
+    if not re.fullmatch("[0-9]{1,19}", str(name)):
+        return None
+    number, count = int(name), len(keyframes.stamp_ns)
+    row = number if number < count else int(np.searchsorted(keyframes.stamp_ns, number))
+    return row if row == number or (row < count and keyframes.stamp_ns[row] == number) else None
 
 
 def _has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> np.ndarray:

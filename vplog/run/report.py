@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import USED, Trajectory
 from vplog.figures.run_figures import earth_of
 from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
-from vplog.results.report.page import Content, Tracks, page
+from vplog.results.previews import jpeg, shrink
+from vplog.results.report.page import Content, Tracks, false_closures, page
+from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.results.report.page import TruthComparison
+
+
+_MOST_THUMBNAILS, _THUMBNAIL_MEGAPIXELS, _THUMBNAIL_QUALITY = 5000, 0.04, 60
+"""Keyframes with a thumbnail in the page, of 230 x 170 px and some 5 kB: 35 MB in base64."""
 
 
 def write_report(
@@ -82,4 +88,21 @@ def gather(
     tracks = gather_tracks(folder, record)
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
-    return Content(record, tracks, covariance, closures, tracks.found.pictures or pictures or {}, judged)
+    content = Content(record, tracks, covariance, closures, tracks.found.pictures or pictures or {}, judged=judged)
+    return replace(content, thumbnails=_thumbnails(folder, content))
+
+
+def _thumbnails(folder: Path, content: Content) -> dict[int, bytes]:
+    """Small JPEGs of at most `_MOST_THUMBNAILS` keyframes of closures: of false ones, those in the solution, then
+    the nearest misses, by inliers; empty where result.mcap has no pictures."""
+    closures = content.closures
+    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content)))
+    ends = np.stack([closures.query[nearest], closures.match[nearest]], 1).ravel().tolist()
+    wanted = set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
+    row_at = {stamp: row for row, stamp in enumerate(content.tracks.keyframes.stamp_ns.tolist()) if row in wanted}
+    found = {
+        row_at[one.stamp_ns]: jpeg(shrink(decode_image(one.image), _THUMBNAIL_MEGAPIXELS), _THUMBNAIL_QUALITY)
+        for one in mcap_read.read_images(folder / "result.mcap")
+        if one.stamp_ns in row_at
+    }
+    return dict(sorted(found.items()))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Closures, EdgeKind, Floats, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
+from vplog.data import Closures, Floats, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
 from vplog.graph.correct_trajectory import correct_trajectory
@@ -47,7 +47,7 @@ def solve_drives(
 
 def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joint.Drive:
     """The graph of a drive at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0)."""
-    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind], bool)
+    odometry = graph.odometry
     used = np.flatnonzero(np.isfinite(closures.weight))
     metric = np.array([closures.scale[row] != "none" for row in used.tolist()], bool)
     of_odometry = by_odometry(graph, closures, np.concatenate([used[metric], used[~metric]]))
@@ -97,7 +97,7 @@ def write_drive(
 
 def _accepted(ledger: Closures) -> np.ndarray:
     """Rows of the verified closures."""
-    return np.flatnonzero([verdict is Verdict.ACCEPTED for verdict in ledger.verdict])
+    return np.flatnonzero(ledger.accepted)
 
 
 def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:

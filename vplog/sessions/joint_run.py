@@ -61,6 +61,7 @@ def run_joint(
     """
     if pipeline.gps.use:
         raise SettingsError("GPS is for one drive at a time: run each by itself with --gps, or several without.")
+    pipeline.decisions.check_single_drive()
     opened = [logs.open(path, topics) for path in paths]
     drives_at = dict(zip(_names([log.name for log in opened]), paths, strict=True))
     check_library(library, pipeline)

@@ -14,6 +14,7 @@ from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.results import run_record, tables
+from vplog.run.keyframes import row_of
 from vplog.run.provenance import reopened
 from vplog.stages import BoxState, Log
 from vplog.verbs import explain_text
@@ -69,11 +70,10 @@ def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyf
         return int(np.nanargmax(closures.residual_after))
     if len(closure) == 1:
         return closure[0]
-    count = len(keyframes.stamp_ns)
-    rows = [one if one < count else int(np.searchsorted(keyframes.stamp_ns, one)) for one in closure]
-    for one, at in zip(closure, rows, strict=True):
-        if at >= count or (one >= count and keyframes.stamp_ns[at] != one):
-            raise ResultError(f"No keyframe has the row or stamp {one}. Rows are 0..{count - 1}; stamps are in ns.")
+    rows = [row_of(keyframes, one) for one in closure]
+    if None in rows:
+        one, last = closure[rows.index(None)], len(keyframes.stamp_ns) - 1
+        raise ResultError(f"No keyframe has the row or stamp {one}. Rows are 0..{last}; stamps are in ns.")
     found = np.flatnonzero((closures.query == rows[0]) & (closures.match == rows[1]))
     if not len(found):
         known = closures.match[closures.query == rows[0]].tolist()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Bytes, Floats, Verdict
+from vplog.data import ACCEPTED, Bytes, Floats
 from vplog.figures.canvas import as_text, saved_figure
 from vplog.results.report.charts import subsampled
 
@@ -71,7 +71,7 @@ def draw(path: Path, view: View) -> None:
 
 def _title(view: View) -> str:
     row = view.row
-    outcome = "accepted" if row["verdict"] == Verdict.ACCEPTED else f"rejected: {row['verdict'].replace('_', ' ')}"
+    outcome = "accepted" if row["verdict"] in ACCEPTED else f"rejected: {row['verdict'].replace('_', ' ')}"
     return f"Closure {view.number}: keyframe {row['query']} as a return to keyframe {row['match']}, {outcome}"
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Floats, Keyframes, Verdict
+from vplog.data import ACCEPTED, USED, Floats, Keyframes, Verdict
 from vplog.geometry import se3 as geometry
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def describe(
     the solver's sentence on the whole run.
     """
     verdict = Verdict(row["verdict"])
-    became = {Verdict.ACCEPTED: "Accepted", Verdict.DIRECTION_ONLY: "Used"}.get(verdict, f"Rejected, {verdict.value}")
+    became = "Accepted" if verdict in ACCEPTED else "Used" if verdict in USED else f"Rejected, {verdict.value}"
     return Explanation(
         f"{became}: {verdict.sentence}",
         _proposed(row, keyframes, siblings),
@@ -66,7 +66,7 @@ def _proposed(row: Row, keyframes: Keyframes, siblings: list[str]) -> str:
         f"Keyframe {query} ({at_s[0]:.1f} s into the drive) was proposed as a return to keyframe {match} "
         f"({at_s[1]:.1f} s), {between_m:.1f} m of path earlier.",
         f"It ranks {row['rank'] + 1} of this keyframe's {len(siblings)} candidates, "
-        f"{siblings.count(Verdict.ACCEPTED.value)} of them accepted; its score is {row['score']:.3f}"
+        f"{sum(one in ACCEPTED for one in siblings)} of them accepted; its score is {row['score']:.3f}"
         + (
             f", with {_count(row['support'], 'neighbouring pair')} in agreement by sequence." if row["support"] else "."
         ),
@@ -186,6 +186,8 @@ _CHANGES = {
     "odometry's noise is set too small or the neighbouring closures are false: look at the candidates around keyframe "
     "{query} with a weight of 1, and at the noise settings (`noise`).",
     "not_significant": "It would be used at a false rate of {p_false:.2g} (--false-rate), or without one.",
+    "accepted_by_decision": "Without its line in the file of decisions geometry and the robust solve would judge it.",
+    "rejected_by_decision": "Without its line in the file of decisions geometry and the robust solve would judge it.",
     "direction_only": "Metres would need landmarks: keyframes around the match that moved further, a depth image or a "
     "stereo pair.",
 }

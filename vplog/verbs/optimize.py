@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from vplog.data import EdgeKind, Ints, PoseGraph, Solution
+from vplog.data import Ints, PoseGraph, Solution
 from vplog.errors import GraphError
 from vplog.execution.timing import StageTimer
 from vplog.geometry.se3 import inverse
@@ -128,7 +128,7 @@ def _record(
     path: Path, out: Path, method: str, file: GraphFile, solution: Solution, warnings: list[str], watch: StageTimer
 ) -> dict[str, Any]:
     graph = file.graph
-    loop = np.array([kind != EdgeKind.ODOMETRY for kind in graph.kind])
+    loop = ~graph.odometry
     rejected = np.flatnonzero(solution.weight < 0.5)
     return {
         "graph": str(path),

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
-from vplog.data import Verdict
+from vplog.data import ACCEPTED
 from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
@@ -255,7 +255,7 @@ def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[
                 "match": earlier.drive,
                 "match_key": earlier.key,
                 "candidates": len(verdicts),
-                "verified": sum(verdict is Verdict.ACCEPTED for verdict in verdicts),
+                "verified": sum(verdict in ACCEPTED for verdict in verdicts),
                 "ledger": "" if why else tables.read_metadata(path).get("vplog.made_from", ""),
                 **({"reason": why} if why else {}),
             })  # fmt: skip

@@ -3,7 +3,6 @@ alone; what colour distinguishes, dashes or words distinguish too."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +23,8 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 12.0, 28.0, 44.0
 _ACROSS, _DOWN = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
 _BINS, _QUANTILE = 40, 0.995
 """Bins of a distribution; values above that quantile stand in the last one."""
-_MAP_WIDTH, _MAP_HEIGHT = 720.0, 520.0
-_MOST_POINTS = 2000
+MOST_POINTS = 2000
 """Points of a path: more than a screen has pixels across adds nothing but bytes."""
-_MOST_SEGMENTS = 3000
-"""Closures drawn on the map, subsampled."""
 
 
 @dataclass(frozen=True)
@@ -49,35 +45,7 @@ def subsampled(rows: NDArray[Any], most: int) -> NDArray[Any]:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
-def trajectory_map(
-    paths: Sequence[tuple[str, Floats]], dots: Sequence[tuple[str, Floats]], segments: Sequence[tuple[str, Floats]]
-) -> Chart:
-    """Paths (T, 3), dots (T, 3) and segments (S, 2, 3) in m, each with its class, viewed along the shortest axis.
-
-    Equal scale in both directions, with a bar of a round length.
-    """
-    points = [points for _, points in (*paths, *dots) if len(points)]
-    view, axes = _view(np.concatenate(points) if points else np.zeros((1, 3)))
-    flat = np.concatenate(points) @ view.T if points else np.zeros((1, 2))
-    low, extent = flat.min(0), np.maximum(np.ptp(flat, axis=0), 1e-6)
-    scale = float(min((_MAP_WIDTH - 40.0) / extent[0], _MAP_HEIGHT / extent[1]))
-    height = max(100.0, float(extent[1]) * scale) + 70.0
-    margin = (_MAP_WIDTH - float(extent[0]) * scale) / 2.0
-
-    def place(points: Floats) -> Floats:
-        moved = (points @ view.T - low) * scale
-        return np.stack([margin + moved[..., 0], height - 50.0 - moved[..., 1]], axis=-1)
-
-    drawn = [(f"dot {kind}", _dots(place(subsampled(points, _MOST_POINTS)))) for kind, points in dots]
-    drawn += [(f"edge {kind}", _segments(place(subsampled(ends, _MOST_SEGMENTS)))) for kind, ends in segments]
-    drawn += [(f"track {kind}", _line(place(subsampled(points, _MOST_POINTS)))) for kind, points in paths]
-    bar_m = _round_length(float(extent.max()) / 4.0)
-    bar = f"M20 {height - 22:.1f}h{bar_m * scale:.1f}m0 -4v8M20 {height - 26:.1f}v8"
-    label = (f"{28 + bar_m * scale:.1f}", f"{height - 18:.1f}", "start", f"{bar_m:g} m ({axes})")
-    return Chart("map of the trajectory", [*drawn, ("axis", bar)], [label], (f"{_MAP_WIDTH:.0f}", f"{height:.0f}"))
-
-
-def _view(points: Floats) -> tuple[Floats, str]:
+def map_view(points: Floats) -> tuple[Floats, str]:
     """(2, 3) from the world to the right and up of the map, and what that is in words.
 
     From above where the ground is flat, else without the shortest axis; the longer of both goes to the right, which
@@ -128,7 +96,7 @@ def curves(named: Sequence[tuple[str, Floats]]) -> Chart:
     paths = []
     for kind, points in named:
         x, y = _LEFT + points[:, 0] * _ACROSS, _TOP + (1.0 - points[:, 1]) * _DOWN
-        paths.append((f"track {kind}", _line(subsampled(np.stack([x, y], 1), _MOST_POINTS))))
+        paths.append((f"track {kind}", _line(subsampled(np.stack([x, y], 1), MOST_POINTS))))
     return _with_axes("precision over recall", paths, [], (0.0, 1.0), "recall", (0.0, 1.0), "precision")
 
 
@@ -184,16 +152,6 @@ def _dots(points: Floats) -> str:
     return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist())
 
 
-def _segments(ends: Floats) -> str:
-    return "".join(f"M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}" for a, b, c, d in ends.reshape(-1, 4).tolist())
-
-
 def _line(points: Floats) -> str:
     """A path through points (T, 2); one point alone is a dot."""
     return _dots(points) if len(points) < 2 else "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points.tolist())
-
-
-def _round_length(most: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer."""
-    power = 10.0 ** math.floor(math.log10(most))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most * (1.0 + 1e-9))

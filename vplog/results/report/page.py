@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import shlex
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import USED, Verdict
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
@@ -17,10 +19,10 @@ if TYPE_CHECKING:
     from vplog.results.geo import Earth
     from vplog.results.mcap_read import McapContent
 
-_TAKEN = (Verdict.ACCEPTED, Verdict.DIRECTION_ONLY)
-"""Verdicts of closures that the solve used, at least in part."""
-_MOST_ROWS = 20_000
-"""Rows of the ledger in the page: 1.5 MB. Accepted ones first, then by score; the table file has them all."""
+_MOST_ROWS = 100_000
+"""Rows of the ledger in the page: 10 MB. Accepted ones first, then by score; the table file has them all."""
+_AFTER_GEOMETRY = (Verdict.REJECTED_BY_SOLVER, Verdict.NOT_SIGNIFICANT, Verdict.REJECTED_BY_DECISION)
+"""Verdicts of closures that geometry found and the solution leaves out."""
 _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
 _MOST_PICTURE_BYTES = 6_000_000
@@ -88,6 +90,8 @@ class Content:
     closures: Closures
     pictures: dict[int, bytes]
     """JPEG of a candidate closure by its row."""
+    thumbnails: dict[int, bytes] = field(default_factory=dict)
+    """Small JPEG of a keyframe by its row."""
     judged: TruthComparison | None = None
 
 
@@ -96,7 +100,7 @@ def page(content: Content) -> str:
     record, closures, judged = content.record, content.closures, content.judged
     counts = [(verdict, closures.verdict.count(verdict)) for verdict in Verdict]
     examples = _examples(content)
-    lines, trajectory_map = _map(content)
+    legend, drawn = _map(content)
     return render(
         "report.html",
         record=record,
@@ -105,15 +109,14 @@ def page(content: Content) -> str:
         tiles=_tiles(content),
         warnings=_list(record.get("warnings")),
         losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
-        map_lines=lines,
-        map=trajectory_map,
+        map_lines=legend,
         judged=judged,
         truth=_truth(judged) if judged else [],
         curves=_curves(judged) if judged else None,
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
         candidates=len(closures),
         examples=examples,
-        ledger=_ledger(content, [one["row"] for one in examples]),
+        audit=_audit(content, drawn, [one["row"] for one in examples]),
         distributions=_distributions(content),
         references=_references(content),
         stages=_stages(mapping(record.get("stages"))),
@@ -130,7 +133,7 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
         (f"{figure(path_m)} m", "path"),
         (f"{figure((int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0)} s", "of drive"),
         (figure(len(content.closures)), "candidates"),
-        (figure(content.closures.verdict.count(Verdict.ACCEPTED)), "accepted closures"),
+        (figure(int(content.closures.accepted.sum())), "accepted closures"),
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
     ]
@@ -159,17 +162,23 @@ def _loss(loss: dict[str, Any], content: Content) -> list[str]:
     return [loss.get("topic") or "-", figure(loss.get("messages")), figure(loss.get("of")), when, why]
 
 
-def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
-    """The legend and the map of the trajectory."""
+def false_closures(content: Content) -> Bools:
+    """(C,) closures in the solution that are false by the truth; none without one."""
+    judged = content.judged
+    if judged is None or judged.true is None or judged.known is None:
+        return np.zeros(len(content.closures), bool)
+    return content.closures.of(*USED) & judged.known & ~judged.true
+
+
+def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+    """The legend, and paths and keyframes seen along the shortest axis, in m to the right and up."""
     closures, judged, position = content.closures, content.judged, content.tracks.world_from_body[:, :3, 3]
-    accepted, false = closures.of(Verdict.ACCEPTED), np.zeros(len(closures), bool)
-    if judged is not None and judged.true is not None and judged.known is not None:
-        false = accepted & judged.known & ~judged.true
-    segments = [
-        ("yes", "accepted closures", closures.lines(position, accepted & ~false)),
-        ("other", "closures taken without metres", closures.lines(position, closures.of(Verdict.DIRECTION_ONLY))),
-        ("no", "closures the solver rejected", closures.lines(position, closures.of(Verdict.REJECTED_BY_SOLVER))),
-        ("false", "accepted closures that are false", closures.lines(position, false)),
+    false = false_closures(content)
+    groups = [
+        ("yes", "closures in the solution", closures.of(*USED) & ~false),
+        ("no", "closures the solver or a decision rejected", closures.of(*_AFTER_GEOMETRY)),
+        ("no", "closures in the solution that are false", false),
+        ("before", "candidates that geometry rejected", ~closures.of(*USED, *_AFTER_GEOMETRY)),
     ]
     paths = [
         ("before", "odometry", content.tracks.before.world_from_body[:, :3, 3]),
@@ -178,13 +187,17 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], charts.Chart]:
     if judged is not None and judged.path is not None:
         paths.insert(0, ("truth", "truth", judged.path))
     gps, earth = content.tracks.found.gps, content.tracks.earth
-    dots = []
     if gps is not None and earth is not None:
         fixes_m = se3.transform(se3.inverse(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
-        dots = [("gps", "GPS fixes", fixes_m)]
-    legend = [(kind, name) for kind, name, points in (*dots, *paths, *segments) if len(points)]
-    drawn = ([(kind, points) for kind, _, points in group] for group in (paths, dots, segments))
-    return legend, charts.trajectory_map(*drawn)
+        paths.insert(0, ("gps", "GPS fixes", fixes_m))
+    view, axes = charts.map_view(np.concatenate([points for _, _, points in paths]))
+    legend = [(kind, name) for kind, name, points in paths if len(points)]
+    legend += [(f"dot {kind}", name) for kind, name, rows in groups if rows.any()]
+    flat = [
+        {"kind": kind, "points": np.round(charts.subsampled(points, charts.MOST_POINTS) @ view.T, 3).tolist()}
+        for kind, _, points in paths
+    ]
+    return legend, {"axes": axes, "paths": flat, "keyframes": np.round(position @ view.T, 3).tolist()}
 
 
 def _truth(judged: TruthComparison) -> list[list[str]]:
@@ -212,24 +225,27 @@ def _examples(content: Content) -> list[dict[str, Any]]:
         left -= len(jpeg)
         verdict = closures.verdict[row]
         one = {"row": row, "jpeg": jpeg, "verdict": verdict.value}
-        one |= {"kind": "accepted" if verdict in _TAKEN else "rejected"}
+        one |= {"kind": "accepted" if verdict in USED else "rejected"}
         one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
         examples.append(one)
     return examples
 
 
-def _ledger(content: Content, pictures: list[int]) -> dict[str, Any] | None:
-    """Columns and rows as JSON, None without candidates; `pictures` are the rows that have one in the page."""
-    if not len(content.closures):
-        return None
-    closures = content.closures
-    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*_TAKEN)))
-    columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
+def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict[str, Any]:
+    """What the script of the page works on; `pictures` are the rows that have one in the page."""
+    closures, log = content.closures, content.record.get("log")
+    order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
+    command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
     return {
-        "columns": list(columns),
-        "rows": list(map(list, zip(*columns.values(), strict=True))),
+        "columns": _columns(content, sorted(order[:_MOST_ROWS].tolist())),
+        "kept": [verdict.value for verdict in USED],
+        "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
+        "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
+        "map": drawn,
         "pictures": pictures,
-        "kept": [verdict.value for verdict in _TAKEN],
+        "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.thumbnails.items()},
+        "explain": "vplog explain RUN --closure ",
+        "again": command,
     }
 
 
@@ -241,19 +257,14 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
         true = np.where(judged.true, "yes", "no")[rows].tolist()
         columns["true"] = [one if known else None for one, known in zip(true, judged.known[rows], strict=True)]
         if judged.at_place is not None:
-            columns["same place"] = ["yes" if one else None for one in judged.at_place[rows].tolist()]
-    reverse = closures.reverse_inliers[rows].tolist()
-    return columns | {
-        **{name: getattr(closures, name)[rows].tolist() for name in ("query", "match", "rank")},
-        "score": _rounded(closures.score[rows], 4),
-        **{name: getattr(closures, name)[rows].tolist() for name in ("support", "matches", "inliers")},
-        "reverse inliers": [value if value >= 0 else None for value in reverse],
-        "spread": _rounded(closures.spread[rows], 3),
-        "metres": _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2),
-        "sigma before": _rounded(closures.residual_before[rows], 2),
-        "sigma after": _rounded(closures.residual_after[rows], 2),
-        "weight": _rounded(closures.weight[rows], 3),
-    }
+            columns["same_place"] = ["yes" if one else None for one in judged.at_place[rows].tolist()]
+    whole = ("query", "match", "rank", "matches", "inliers", "reverse_inliers", "support")
+    shares = {"residual_before": 2, "residual_after": 2, "p_false": 4, "weight": 3, "score": 4, "spread": 3}
+    columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
+    columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}
+    columns["metres"] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
+    columns["reverse_inliers"] = [value if value >= 0 else None for value in columns["reverse_inliers"]]
+    return columns
 
 
 def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
@@ -265,7 +276,7 @@ def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     """What accepted and rejected candidates differ in, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
-    taken = closures.of(*_TAKEN)
+    taken = closures.of(*USED)
     shown = []
     for label, values, name, least in (
         ("score", closures.score, "", None),

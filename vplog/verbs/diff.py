@@ -1,0 +1,156 @@
+"""What differs between two runs of one drive: settings, closures, trajectories, scores, stages; and limits of that."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.data import USED
+from vplog.errors import ResultError, SettingsError, nearest
+from vplog.geometry import se3
+from vplog.results import run_record, tables
+from vplog.results.html import mapping
+from vplog.verbs.evaluate_run import TruthOptions, evaluate
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from vplog import logs
+
+_LIMIT = re.compile(r"([a-z_]+)([<>]=?)([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,2})?)(%?)")
+_SCORES = {
+    "ate_m": ("ate_after", "rmse_m"),
+    "rpe_m": ("rpe_after", "translation_rmse_m"),
+    "drift_m": ("drift_after", "translation_m"),
+    "precision": ("closures", "precision"),
+    "recall": ("closures", "recall"),
+    "average_precision": ("closures", "average_precision"),
+}
+"""Figures against a truth, and where `evaluate` has them."""
+_OF_RECORD = {
+    "candidates": ("counts", "candidates"),
+    "seconds": ("totals", "seconds"),
+    "memory_mb": ("totals", "peak_memory_mb"),
+}
+FIGURES = (*_SCORES, "accepted", "gained", "lost", "moved_m", "moved_deg", *_OF_RECORD)
+"""Names of the figures that limits are of."""
+
+
+def diff(
+    baseline: Path,
+    run: Path,
+    truth: str | None = None,
+    topics: logs.TopicChoice | None = None,
+    options: TruthOptions | None = None,
+) -> dict[str, Any]:
+    """How the run in a folder differs from the one of the same drive in `baseline`.
+
+    `settings` and `seconds` of stages hold pairs (baseline, run) by name. `closures` lists those gained and lost by the
+    stamps of their keyframes. `trajectory` is how far the run's is from the baseline's, aligned by its positions, in m
+    and degrees. `figures` are triples (baseline, run, change), with `truth`, as in `evaluate`, its scores among them.
+    Raises ResultError or TruthError.
+    """
+    folders = (baseline, run)
+    records = [run_record.read_single_run(folder) for folder in folders]
+    trees = [{"settings": one.get("settings"), "versions": {**mapping(one.get("versions")), "vplog": one.get("vplog")}}
+             for one in records]  # fmt: skip
+    stages = [mapping(one.get("stages")) for one in records]
+    ledgers = [_closures(folder) for folder in folders]
+    gained, lost = ([pair for pair in one if pair not in other] for one, other in (ledgers[::-1], ledgers))
+    moved = _moved(folders)
+    figures: dict[str, Sequence[Any]] = {
+        name: [mapping(one.get(part)).get(field) for one in records] for name, (part, field) in _OF_RECORD.items()
+    }
+    figures["accepted"] = [len(one) for one in ledgers]
+    changes = {"gained": len(gained), "lost": len(lost), "moved_m": moved["rmse_m"], "moved_deg": moved["rmse_deg"]}
+    figures |= {name: (0, change) for name, change in changes.items()}
+    if truth is not None:
+        scores = [evaluate(folder, truth, topics, options) for folder in folders]
+        figures |= {
+            name: [mapping(one.get(part)).get(field) for one in scores] for name, (part, field) in _SCORES.items()
+        }
+    return {
+        "baseline": str(baseline),
+        "run": str(run),
+        "settings": _differences(trees[0], trees[1]),
+        "closures": {"common": len(ledgers[1]) - len(gained), "gained": gained, "lost": lost},
+        "trajectory": moved,
+        "figures": {name: [*figures[name], _change(*figures[name])] for name in FIGURES if name in figures},
+        "seconds": {
+            name: [mapping(one.get(name)).get("seconds") for one in stages]
+            for name in dict.fromkeys([*stages[0], *stages[1]])
+        },
+    }
+
+
+def check_limits(limits: Sequence[str]) -> None:
+    """Raises SettingsError for the first limit that is none: a figure, < <= > or >=, and a number or percentage."""
+    for limit in limits:
+        found = _LIMIT.fullmatch(limit.replace(" ", ""))
+        if found is None or found[1] not in FIGURES:
+            near = "" if found is None else nearest(found[1], FIGURES)
+            raise SettingsError(
+                f"--fail-on {limit!r} is no limit of a change.{near} Write a figure, < <= > or >=, and a number, or a "
+                f"percentage of the baseline: 'recall<-0.01', 'seconds>20%'. Figures: {', '.join(FIGURES)}."
+            )
+
+
+def exceeded(found: dict[str, Any], limits: Sequence[str]) -> list[str]:
+    """A sentence for each limit that the changes of a diff fail. Raises SettingsError for one that cannot be judged."""
+    check_limits(limits)
+    sentences = []
+    for limit in limits:
+        name, operator, number, percent = _LIMIT.fullmatch(limit.replace(" ", "")).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        before, after, change = found["figures"].get(name, (None, None, None))
+        if change is None or (percent and not before):
+            why = " Give --truth." if name in _SCORES and name not in found["figures"] else ""
+            raise SettingsError(f"--fail-on {limit!r}: the change of {name} is not known ({before} to {after}).{why}")
+        value = 100.0 * change / abs(before) if percent else change
+        bound = float(number)
+        fails = {"<": value < bound, "<=": value <= bound, ">": value > bound, ">=": value >= bound}[operator]
+        if fails:
+            sentences.append(f"{name} changed by {value:+.4g}{percent}, from {before:.6g} to {after:.6g} ({limit}).")
+    return sentences
+
+
+def _closures(folder: Path) -> dict[tuple[int, int], None]:
+    """Stamps in ns of query and match of the closures in the solution, in order. JSON has them as pairs."""
+    closures = tables.read_closures(folder / "closures.parquet")
+    stamps = tables.read_keyframes(folder / "keyframes.parquet")[0].stamp_ns
+    used = closures.of(*USED)
+    pairs = zip(stamps[closures.query[used]].tolist(), stamps[closures.match[used]].tolist(), strict=True)
+    return dict.fromkeys(pairs)
+
+
+def _moved(folders: Sequence[Path]) -> dict[str, float | int]:
+    """Distance and angle between the trajectories of two runs where they have the same stamps."""
+    baseline, run = (tables.read_trajectory(folder / "trajectory.parquet")[0] for folder in folders)
+    stamps, one, other = np.intersect1d(baseline.stamp_ns, run.stamp_ns, return_indices=True)
+    if len(stamps) < 3:
+        raise ResultError(f"{folders[0]} and {folders[1]} share {len(stamps)} stamps: they are not of one drive.")
+    known, poses = baseline.world_from_body[one], run.world_from_body[other]
+    aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
+    apart = se3.between(known, aligned @ poses)
+    found: dict[str, float | int] = {"samples": len(stamps)}
+    for unit, values in (("m", np.linalg.norm(apart[:, :3, 3], axis=1)), ("deg", np.degrees(se3.angle(apart)))):
+        found |= {f"rmse_{unit}": float(np.sqrt((values**2).mean())), f"max_{unit}": float(values.max())}
+    return found
+
+
+def _change(before: Any, after: Any) -> float | None:
+    both = all(isinstance(one, int | float) and np.isfinite(one) for one in (before, after))
+    return after - before if both else None
+
+
+def _differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
+    """Leaves of two trees that differ, by their dotted names; None where one tree lacks it."""
+    if not (isinstance(one, dict) or isinstance(other, dict)):
+        return {} if one == other else {name.removeprefix("settings."): [one, other]}
+    left, right = mapping(one), mapping(other)
+    found: dict[str, list[Any]] = {}
+    for key in dict.fromkeys([*left, *right]):
+        found |= _differences(left.get(key), right.get(key), f"{name}.{key}" if name else key)
+    return found
