@@ -48,8 +48,6 @@ _VERY_STRONG = 5.0
 """Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
 a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. What another method that was chosen makes
 of them is used where the odds are even."""
-_ODOMETRY = (1.0, 0.5, 0.25)
-"""Factors of the odometry's sigmas by which closures are judged where none is true: nothing else checks it."""
 _FLIPS, _MOST_FLIPS = 4, 10
 """Runs of either kind that are tried at once, and turns."""
 _STEPS, _TOLERANCE = 100, 1e-4
@@ -85,9 +83,8 @@ def best_hypothesis(
         solution = optimiser(graph)
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
         found.append(_refit(graph, kept, solution.world_from_body, Sigmas()))
-    likeliest = max(found, key=lambda one: one.log_evidence).sigmas if found else Sigmas()
-    finer = [likeliest._replace(rotation=share, translation=share) for share in _ODOMETRY]
-    for sigmas in dict.fromkeys([Sigmas(), likeliest, *finer]):
+    likeliest = [one.sigmas for one in sorted(found, key=lambda one: -one.log_evidence)[:1]]
+    for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
         alone = _judged(graph, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))

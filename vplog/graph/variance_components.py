@@ -25,8 +25,11 @@ _SPREAD = 2.0 * math.log(4.0)
 """Sigma of the logarithm of a variance factor before anything was measured: drivers claim sigmas that are off by four
 and, now and then, by ten."""
 _LEAST_CLOSURES = 0.5
-"""Closures are not taken for much better than they claim, unless the odometry is, too: those of neighbouring keyframes
-share landmarks, so they agree with each other more than they are right."""
+"""Closures are not taken for much better than they claim: those of neighbouring keyframes share landmarks, so they
+agree with each other more than they are right."""
+_LEAST_OF_ODOMETRY = 2.0
+"""Nor for better than so many times what the odometry is, where that is less than a quarter of its claim: what is left
+of closures whose noise is too large would be taken from the odometry's, down to nothing."""
 _LEAST, _MOST = 2.0**-14, 2.0**10
 """Variance factors beyond which a claim is no longer one: sigmas 128 times too large, as of a log that tells none and
 of odometry far better than the model, or 32 times too small."""
@@ -102,7 +105,10 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
         for part, (factor, most) in enumerate(zip(present[:2], _most_factors(graph), strict=True))
     ]
     of_closures = (
-        max(math.sqrt(most_likely_variance(chi2 * factor**2, redundancy)), _LEAST_CLOSURES * min(noise, 1.0))
+        max(
+            math.sqrt(most_likely_variance(chi2 * factor**2, redundancy)),
+            min(_LEAST_OF_ODOMETRY * noise, _LEAST_CLOSURES),
+        )
         for chi2, redundancy, factor, noise in zip(closures, own, present[2:], odometry, strict=True)
     )
     return Sigmas(*odometry, *of_closures)
