@@ -88,10 +88,10 @@ def read_decisions(path: Path, keyframes: Keyframes) -> Decisions:
             )
         match, query = sorted(row for row in rows if row is not None)
         if query - match < 2:
-            raise SettingsError(f"{where}: keyframes {match} and {query} are joined by odometry. Remove the line.")
+            raise SettingsError(f"{where}: keyframes {match} and {query} are joined by odometry. Leave the line out.")
         accepted = cells[2] != "reject"
         if found.setdefault((query, match), (accepted, where))[0] is not accepted:
-            raise SettingsError(f"{where} decides otherwise than {found[query, match][1]} on one pair. Remove one.")
+            raise SettingsError(f"{where} decides otherwise than {found[query, match][1]} on one pair. Leave one out.")
     if not header:
         raise SettingsError(f"{path} is empty. {_FORM}")
     pairs = {choice: sorted(pair for pair, (one, _) in found.items() if one is choice) for choice in (True, False)}
