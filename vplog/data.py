@@ -335,8 +335,6 @@ class PoseGraph:
     @property
     def odometry(self) -> Bools:
         """(E,) whether each edge is odometry, not a closure."""
-        import numpy as np
-
         return np.array([kind == EdgeKind.ODOMETRY for kind in self.kind], bool)
 
 

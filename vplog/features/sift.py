@@ -28,7 +28,7 @@ would be features. Of a drive at 6 % of its light that recognises 23 of 24 revis
 _LEAST_LEVELS = 3
 """Smoothed, what has fewer is noise, as of a covered lens."""
 _CLIP, _TILES = 4.0, (8, 8)
-"""Of CLAHE (Zuiderveld 1994): how much the contrast of a tile grows at most, and tiles along each side, as usual."""
+"""Clip limit and tile grid of CLAHE (Zuiderveld 1994): the contrast of a tile grows by four at most."""
 
 
 class SiftSettings(Settings):
@@ -91,7 +91,7 @@ class SiftSettings(Settings):
         return np.asarray(cv2.resize(image, smaller, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _remedies(self, pixels: Bytes) -> Iterator[Bytes]:
-        """What may give a poor picture features: each with the one before."""
+        """The picture with its contrast stretched, then doubled in size, then equalised by tiles, in turn."""
         values, (dark, bright) = pixels, np.percentile(pixels, _TAILS)
         if bright - dark < _NOISY_LEVELS:
             values = np.asarray(cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), _NOISE_PX))

@@ -13,7 +13,7 @@ from vplog.data import THUMBNAIL_SIDE, Features
 from vplog.errors import ResultError
 
 SIFT_BYTES = 128
-"""Of a descriptor."""
+"""Bytes of a descriptor."""
 _FLOAT_BYTES = 4 * 4
 """x, y, size, depth as float32, before the descriptor."""
 _THUMBNAIL_BYTES = THUMBNAIL_SIDE**2

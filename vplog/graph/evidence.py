@@ -38,7 +38,7 @@ _RECENT = 10
 _SAMPLE = 200
 """Poses all pairs of which are looked at."""
 _CONCENTRATIONS = (2.0 ** np.arange(-4, 13)).tolist()
-"""Of families, from one to as many as there are runs."""
+"""Concentrations of the Chinese restaurant process of families: from one family to as many as there are runs."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""

@@ -297,7 +297,7 @@ def with_noise_of(fixes: Fixes, inlier: Floats, poses: Floats, checks: float) ->
 
 
 def noisier(fixes: Fixes, estimated: Fixes | None) -> Fixes:
-    """Those with the larger covariance of two that differ by a factor."""
+    """The fixes with the larger covariance, of two sets that differ by a factor."""
     return fixes if estimated is None or estimated.covariance[0, 0, 0] <= fixes.covariance[0, 0, 0] else estimated
 
 
