@@ -284,7 +284,6 @@ class Closures:
 
     def of(self, *verdicts: Verdict) -> Bools:
         """(C,) whether each candidate has one of these verdicts."""
-        import numpy as np  # only where arrays are at hand: the command line starts without it
 
         return np.array([verdict in verdicts for verdict in self.verdict], bool)
 
@@ -302,7 +301,6 @@ class Closures:
 
     def lines(self, positions: Floats, rows: Bools) -> Floats:
         """(S, 2, 3) from the match to the query of some candidates (C,), by positions of the keyframes (N, 3)."""
-        import numpy as np
 
         return np.stack([positions[self.match[rows]], positions[self.query[rows]]], axis=1)
 
