@@ -284,7 +284,6 @@ class Closures:
 
     def of(self, *verdicts: Verdict) -> Bools:
         """(C,) whether each candidate has one of these verdicts."""
-
         return np.array([verdict in verdicts for verdict in self.verdict], bool)
 
     def rows(self, rows: Ints) -> Closures:
@@ -301,7 +300,6 @@ class Closures:
 
     def lines(self, positions: Floats, rows: Bools) -> Floats:
         """(S, 2, 3) from the match to the query of some candidates (C,), by positions of the keyframes (N, 3)."""
-
         return np.stack([positions[self.match[rows]], positions[self.query[rows]]], axis=1)
 
 
