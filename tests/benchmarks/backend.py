@@ -51,7 +51,6 @@ Z = 1.96
 def main(arguments: Sequence[str]) -> int:
     """The exit status: 0 only where every goal is reached, or one world was shown."""
     given = _parser().parse_args(arguments)
-    logging.getLogger("vplog").setLevel(logging.ERROR)  # warnings of a hundred odometries
     if given.seed is not None:
         _one(given.seed, given.show)
         return 0
@@ -99,7 +98,7 @@ def measured(seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
 
 def _start() -> None:
     """What is compiled or loaded first is not counted."""
-    logging.getLogger("vplog").setLevel(logging.ERROR)
+    logging.getLogger("vplog").addHandler(logging.NullHandler())  # no warnings of a hundred odometries on stderr
     answers(world(0))
 
 

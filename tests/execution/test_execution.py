@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog.execution.execution import Execution
+from vplog.execution.execution import Execution, logged_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -74,3 +75,19 @@ def test_progress_of_parts_adds_up_to_that_of_the_whole() -> None:
     for before, count in ((0, 2), (2, 0), (2, 3)):
         list(execution.part(before, 5).counted("extract", range(count), count))
     assert reports == [("drive: extract", done, 5) for done in range(1, 6)]
+
+
+@pytest.mark.parametrize("level", [logging.NOTSET, logging.CRITICAL])
+def test_warnings_are_recorded_where_the_caller_silences_them(level: int, caplog: pytest.LogCaptureFixture) -> None:
+    logger = logging.getLogger("vplog")
+    before = logger.level
+    logger.setLevel(level)
+    try:
+        with logged_warnings(warnings := []):
+            logging.getLogger("vplog.run").warning("poor")
+        assert logger.level == level
+        assert logger.propagate
+    finally:
+        logger.setLevel(before)
+    assert warnings == ["poor"]
+    assert caplog.messages == (["poor"] if level == logging.NOTSET else [])

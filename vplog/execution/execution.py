@@ -75,12 +75,18 @@ def _one_thread_each() -> None:
 
 @contextmanager
 def logged_warnings(warnings: list[str]) -> Iterator[None]:
-    """Appends what the package logs as warnings within the block."""
+    """Appends what the package logs as warnings within the block, also where the caller has silenced its logger."""
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: warnings.append(record.getMessage())
     logger = logging.getLogger("vplog")
+    level, propagate = logger.level, logger.propagate
+    if not logger.isEnabledFor(logging.WARNING):
+        logger.setLevel(logging.WARNING)
+        logger.propagate = False
     logger.addHandler(handler)
     try:
         yield
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(level)
+        logger.propagate = propagate
