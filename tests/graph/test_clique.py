@@ -39,6 +39,14 @@ def test_a_hidden_clique_is_found_within_few_steps_and_twice_the_same() -> None:
         np.testing.assert_array_equal(members, hidden)
 
 
+def test_a_clique_larger_than_the_steps_is_found() -> None:
+    joined = random_matrix(400, 0.3, 0)
+    joined[:300, :300] = True
+    members, exact = largest_clique(joined, 50)
+    np.testing.assert_array_equal(members, np.arange(300))
+    assert not exact
+
+
 def test_a_cut_search_says_so() -> None:
     joined = random_matrix(120, 0.9, 0)
     members, exact = largest_clique(joined, 50)

@@ -14,8 +14,8 @@ def largest_clique(joined: Bools, most_steps: int) -> tuple[Ints, bool]:
     """Nodes of the largest clique of a symmetric (K, K) matrix, increasing, and whether it is sure to be the largest.
 
     Branch and bound with a greedy colouring as the bound (Tomita and Seki 2003), nodes in order of degeneracy, sets of
-    nodes as bits of one integer. After `most_steps` branches the best so far is taken; the first branch alone is a
-    greedy search. The same matrix gives the same set.
+    nodes as bits of one integer. After `most_steps` branches the branch begun is ended by a greedy search, and the best
+    so far is taken. The same matrix gives the same set.
     """
     count = len(joined)
     if count == 0:
@@ -44,6 +44,7 @@ def largest_clique(joined: Bools, most_steps: int) -> tuple[Ints, bool]:
             stack.pop()
             continue
         if steps == most_steps:
+            best = max(best, _extended(clique, open_, neighbours), key=len)
             break
         steps += 1
         node = nodes.pop()
@@ -55,6 +56,14 @@ def largest_clique(joined: Bools, most_steps: int) -> tuple[Ints, bool]:
         elif len(grown) > len(best):
             best = grown
     return np.sort(order[best]), not stack
+
+
+def _extended(clique: list[int], nodes: int, neighbours: list[int]) -> list[int]:
+    """The clique with the first of the nodes (bits), the densest part, that may join it, until none may."""
+    while nodes:
+        node = (nodes & -nodes).bit_length() - 1
+        clique, nodes = [*clique, node], nodes & neighbours[node]
+    return clique
 
 
 def _coloured(nodes: int, neighbours: list[int], enough: int) -> tuple[list[int], list[int]]:

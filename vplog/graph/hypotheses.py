@@ -212,10 +212,10 @@ def _from_start(graph: PoseGraph, gnc: GncSettings, sigmas: Sigmas, likely: Bool
 
     def solve() -> list[Hypothesis]:
         weight, poses = gnc.annealed(Factors.of(claimed_times(graph, sigmas)), likely)
-        found = sigmas
-        if weight.all():  # none is suspect: noise first, by which least squares finds its way
-            poses, found = _estimated(graph, weight, poses, sigmas)
-        return _tested(graph, gnc, weight, poses, found)
+        if not weight.all():
+            return _tested(graph, gnc, weight, poses, sigmas)
+        all_true = _refit(graph, weight, poses, sigmas)  # noise first, by which least squares finds its way
+        return [all_true, *_tested(graph, gnc, weight, all_true.poses, all_true.sigmas)]
 
     return _attempted(solve)
 
