@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.graph.drive import ODOMETRY_SIGMA, Drive, position_error, ring
+from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, position_error, ring
 from vplog.geometry import se3
 from vplog.graph.consistency import OdometryChain, is_loop
-from vplog.graph.evidence import log_evidence, log_partition, log_room, runs
+from vplog.graph.evidence import log_evidence, log_partition, log_room, log_tails, runs
 from vplog.graph.factors import Factors
 from vplog.graph.hypotheses import best_hypothesis, bounded
 from vplog.graph.least_squares import Objective, descend
@@ -46,6 +46,28 @@ def test_claimed_sigmas_decide_nothing(odometry: float, closures: float) -> None
     kept = decided(drive.graph, GncSettings()).solution.weight > 0.5
     assert not (kept & drive.false).any()
     assert (kept & loops & ~drive.false).sum() >= 39
+
+
+def test_true_closures_of_heavy_tails_are_kept_and_false_ones_left_out() -> None:
+    drive = ring(160, loops=250, false=5)
+    loops, random = np.flatnonzero(is_loop(drive.graph) & ~drive.false), np.random.default_rng(0)
+    # normal over the root of chi-square: Student's t of 3 degrees of freedom, at most 12 sigmas
+    residual = CLOSURE_SIGMA * random.normal(size=(250, 6)) / np.sqrt(random.chisquare(3, (250, 1)).clip(0.3) / 3.0)
+    measured = drive.graph.a_from_b.copy()
+    measured[loops] = se3.between(drive.true[drive.graph.a[loops]], drive.true[drive.graph.b[loops]])
+    measured[loops] @= se3.exp(residual)
+    solution = decided(replace(drive.graph, a_from_b=measured), GncSettings()).solution
+    assert (solution.weight[loops] > 0.5).sum() >= 249
+    assert not (solution.weight[drive.false] > 0.5).any()
+
+
+@pytest.mark.parametrize("shape", [5, None])
+def test_tails_are_told_from_a_gaussian_of_any_scale(shape: float | None) -> None:
+    random = np.random.default_rng(0)
+    chi2 = random.chisquare(6, 500) / (1.0 if shape is None else random.chisquare(shape, 500) / shape)
+    gain = log_tails(chi2, 6)
+    assert gain == 0.0 if shape is None else gain > 50.0
+    np.testing.assert_allclose(log_tails(4.0 * chi2, 6), gain, rtol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
