@@ -21,6 +21,7 @@ from vplog.cli.parser import (
     topics_of,
 )
 from vplog.cli.printing import Progress, print_result
+from vplog.errors import plural
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
         execution = Execution(arguments.threads, progress)
         options = BatchOptions(arguments.jobs, arguments.engine, arguments.address, arguments.retries, processes)
         found = redescribe(arguments.map, arguments.library, arguments.target, execution, options)
-    wrong = f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}."
+    wrong = f"{found['failed']} of {plural(len(found['drives']), 'drive')} missing in {found['map']}."
     _end(arguments, found, printing.print_redescribed, wrong)
 
 
@@ -84,7 +85,8 @@ def batch(arguments: argparse.Namespace) -> None:
             address=arguments.address, retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
             progress=progress, on_drive=progress.print_drive,
         )  # fmt: skip
-    wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json has the reasons."
+    drives = plural(len(found["drives"]), "drive")
+    wrong = f"{found['failed']} of {drives} failed; {arguments.map}/failures.json has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
 
 
@@ -113,7 +115,7 @@ def info_map(arguments: argparse.Namespace) -> None:
     print_result(arguments, found, printing.print_map)
     if wrong := found["damaged_files"]:
         raise ResultError(
-            f"{len(wrong)} damaged files in {arguments.map}: vplog batch LOG -o MAP computes drives again."
+            f"{plural(len(wrong), 'damaged file')} in {arguments.map}: vplog batch LOG -o MAP computes drives again."
         )
 
 

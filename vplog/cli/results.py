@@ -166,7 +166,8 @@ def add_results(
     sub = add("export", export, threads)
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    option(sub, "-o --output", local_file_or_stdout, "FILE|FOLDER", "what to write; - is stdout", required=True)
+    text = "what to write; - writes a file to stdout"
+    option(sub, "-o --output", local_file_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)
     option(sub, "graph", local_file, "GRAPH.g2o")

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.errors import plural
 from vplog.logs.continuity import without_jumps
-from vplog.logs.formats.container import Notes, plural
+from vplog.logs.formats.container import Notes
 from vplog.logs.gather import TopicCollector
 from vplog.logs.odometry_sources import choose_odometry, other_sources, rank_sources, read_sources
 from vplog.logs.recorder_clock import correct_clock_steps
@@ -123,7 +124,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         pairs = nearest(stamp_ns, other_ns)
         paired.append([None if pair < 0 else other_places[pair] for pair in pairs.tolist()])
         if images.channel and (alone := int((pairs < 0).sum())):
-            notes.add(f"{alone} of {plural(len(pairs), 'image')} have no {name} image within half a frame period.")
+            notes.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
         both = pairs >= 0
         late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
         if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:

@@ -10,14 +10,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.logs import image_folder
 from vplog.logs.datasets.find import find_roots, is_video, read_folder, read_video
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSetContainer
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
 from vplog.logs.formats.compression import fetched, unpacked
-from vplog.logs.formats.container import Notes, plural
+from vplog.logs.formats.container import Notes
 from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
 from vplog.logs.formats.ros2_folder import (

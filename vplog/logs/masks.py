@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog.errors import LogError
-from vplog.logs.formats.container import plural
+from vplog.errors import LogError, plural
 from vplog.logs.image_folder import is_image
 from vplog.storage.image_file import JPEG, BadImageError, decode_image, image_size
 

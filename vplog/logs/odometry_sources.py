@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Odometry, OdometrySource, Trajectory
+from vplog.errors import plural
 from vplog.logs.continuity import find_jumps
 from vplog.logs.dead_reckoning import dead_reckoned, odometry_of_fixes, turned_by_gyro
-from vplog.logs.formats.container import Channel, Notes, plural
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
 from vplog.logs.tf_odometry import FrameTree, clean
