@@ -24,8 +24,8 @@ from vplog.cli.parser import (
     at_least_one,
     flag,
     local,
-    local_file,
     option,
+    output_file,
     pipeline_of,
     place,
     resolved,
@@ -339,7 +339,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_info(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
     flag(sub, "--check", "print one line; exit status 1 if a run would fail")
-    option(sub, "--html", local_file, "FILE.html", "also write an HTML page with pictures of the drive")
+    option(sub, "--html", output_file, "FILE.html", "also write an HTML page with pictures of the drive")
 
 
 def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:

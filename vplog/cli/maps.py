@@ -14,8 +14,8 @@ from vplog.cli.parser import (
     at_least_one,
     cache_options,
     flag,
-    local_file,
     option,
+    output_file,
     place,
     settings_options,
     topics_of,
@@ -161,7 +161,7 @@ def add_maps(
     option(sub, "map", place, "MAP|RUN")
     option(sub, "pictures", place, "IMAGE|LOG", "images, a folder of them, or one log", nargs="+")
     option(sub, "--top", at_least_one, "K", "places that each picture is verified against (default: 10)", default=10)
-    option(sub, "-o --output", local_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
+    option(sub, "-o --output", output_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
     text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
 
@@ -195,7 +195,7 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
     option(sub, "--top", at_least_one, "K", "places for each view (default: 10)", default=10)
     option(sub, "--sequence", at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
-    option(sub, "-o --output", local_file, "FILE.parquet", "write the answers")
+    option(sub, "-o --output", output_file, "FILE.parquet", "write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
@@ -208,7 +208,7 @@ def _add_export(sub: argparse.ArgumentParser) -> None:
     text = "only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)"
     option(sub, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
-    option(sub, "-o --output", local_file, "FILE.parquet", "file to write", required=True)
+    option(sub, "-o --output", output_file, "FILE.parquet", "file to write", required=True)
 
 
 def _box(text: str) -> tuple[float, float, float, float]:

@@ -145,9 +145,22 @@ local_file = _local("file")
 """A single file that is written by those who do not send what they write."""
 
 
-def local_file_or_stdout(text: str) -> Path:
+def output_file(text: str) -> Path:
+    """A single local file that is written, and no input of anything."""
+    path = local_file(text)
+    if path.is_file():
+        from vplog.run.run_folder import check_output
+
+        try:
+            check_output(path)
+        except VplogError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+    return path
+
+
+def output_file_or_stdout(text: str) -> Path:
     """A single local file, or `-`, the standard output."""
-    return STDOUT if text == "-" else local_file(text)
+    return STDOUT if text == "-" else output_file(text)
 
 
 def _path(text: str) -> Path:

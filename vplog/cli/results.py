@@ -10,7 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.cli.parser import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
+from vplog.cli.parser import (
+    STDOUT,
+    flag,
+    local_file,
+    option,
+    output_file,
+    output_file_or_stdout,
+    place,
+    positive,
+    topics_of,
+)
 from vplog.cli.printing import (
     Progress,
     print_diff,
@@ -154,7 +164,7 @@ def add_results(
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
     option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
-    option(sub, "-o --output", local_file, "FILE.html", "page (default: RUN/report.html)")
+    option(sub, "-o --output", output_file, "FILE.html", "page (default: RUN/report.html)")
     sub = add("diff", diff, topics)
     sub.set_defaults(refuse=sub.error)
     option(sub, "runs", place, "RUN", nargs="+")
@@ -167,11 +177,11 @@ def add_results(
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
     text = "what to write; - writes a file to stdout"
-    option(sub, "-o --output", local_file_or_stdout, "FILE|FOLDER|-", text, required=True)
+    option(sub, "-o --output", output_file_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)
     option(sub, "graph", local_file, "GRAPH.g2o")
-    option(sub, "-o --output", place, "OUT", "the graph at its solved poses, as g2o", required=True)
+    option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
     text = "report whether the solution is the global optimum of the accepted edges, and look for a better one if not"
     sub.add_argument("--certify", action="store_true", help=text)
@@ -183,9 +193,13 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     text = "row of closures.parquet, or its two keyframes, by row or by stamp in ns"
     option(which, "--closure", _closure, "K|QUERY:MATCH", text)
     flag(which, "--worst", "the closure that the solved trajectory is furthest from")
-    option(sub, "-o --output", local_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
+    option(sub, "-o --output", output_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
     option(sub, "--log", place, "LOG", "the run's log, where it has moved since")
     flag(sub, "--no-picture", "no picture; the log is not needed")
+
+
+def _graph(text: str) -> Path:
+    return place(text) if "://" in text else output_file(text)
 
 
 def _seconds(text: str) -> float:

@@ -18,7 +18,7 @@ from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
 from vplog.results.staging import staged
 from vplog.run import provenance
-from vplog.storage.folders import check_regular
+from vplog.storage.folders import check_regular, check_replaceable
 from vplog.storage.remote_path import located, stands_for
 
 _RUN_FILES = (
@@ -29,6 +29,15 @@ _RUN_FILES = (
     *(f"closure-{'[0-9]' * digits}.png" for digits in range(1, 10)),
 )  # fmt: skip
 """Glob patterns of all files that runs and `explain` write into the folder of a run and into those of its drives."""
+_RECORDS = ("run.json", "drive.json", "library.json")
+
+
+def check_output(path: Path) -> None:
+    """Raises ResultError where a file to write is a recorded log, or one that a run or a library was written as."""
+    check_replaceable(path)
+    written = [*_RECORDS, *(PurePath(name).name for name in _RUN_FILES if not name.endswith((".html", ".png")))]
+    if path.is_file() and any((path.parent / name).exists() for name in _RECORDS) and any(map(path.match, written)):
+        raise ResultError(f"{path} is a file of the results in {path.parent}. Name another.")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vplog.errors import ResultError
-from vplog.storage.folders import is_below, regular_files
+from vplog.storage.folders import check_replaceable, is_below, regular_files
 
 Bytes = NDArray[np.uint8]
 
@@ -98,6 +98,7 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
         if parents:
             path.parent.mkdir(parents=True, exist_ok=True)
         path = path.resolve() if path.is_symlink() else path
+        check_replaceable(path)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             with part.open("wb") as stream:
