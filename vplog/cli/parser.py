@@ -247,7 +247,7 @@ def cache_options(sub: argparse.ArgumentParser, what: str) -> None:
 
 def resolved(text: str) -> Path:
     """A file that run.json names, so that the run is understood from any folder."""
-    return Path(text).resolve()
+    return local_file(text).resolve()
 
 
 def at_least(least: int) -> Callable[[str], int]:
