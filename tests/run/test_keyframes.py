@@ -165,8 +165,12 @@ def test_clocks_that_do_not_meet(offset_s: float) -> None:
 def test_too_little_odometry_or_frames() -> None:
     full = _drive(1.0)
     one = Odometry(full.stamp_ns[:1], full.odom_from_body[:1], None)
-    for stamps, odometry in ((_frames(), one), (_frames()[:1], full), (_frames()[:0], full)):
-        with pytest.raises(LogError, match="no two frames"):
+    few = "and a graph needs two"
+    for stamps, odometry, said in (
+        (_frames(), one, "no two frames have"), (_frames()[:1], full, f"1 frame, {few}"),
+        (_frames()[:0], full, f"0 frames, {few}"),
+    ):  # fmt: skip
+        with pytest.raises(LogError, match=said):
             _select(stamps, odometry)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.errors import plural
+from vplog.errors import LogError, plural
 from vplog.logs.continuity import without_jumps
 from vplog.logs.formats.container import Notes
 from vplog.logs.gather import TopicCollector
@@ -70,11 +70,13 @@ class Content:
         return self.frames[-1] if self.frames else ""
 
     def between(self, start_s: float | None, stop_s: float | None) -> Content:
-        """With the images from `start_s` up to `stop_s`, s after the first; all where None."""
+        """With the images from `start_s` up to `stop_s`, s after the first; all if None. Raises LogError for none."""
         if start_s is None and stop_s is None:
             return self
         since_s = (self.stamp_ns - self.stamp_ns[:1]) / 1e9
         inside = (since_s >= (start_s or 0.0)) & (since_s < (np.inf if stop_s is None else stop_s))
+        if len(inside) and not inside.any():
+            raise LogError(f"No image is left by --start and --stop: the last one is at {since_s[-1]:.1f} s.")
         return self.with_images(inside)
 
     def with_images(self, wanted: np.ndarray) -> Content:

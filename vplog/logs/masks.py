@@ -146,5 +146,5 @@ def _read(path: Path) -> Bytes:
     except OSError as error:
         raise LogError(f"Cannot read the mask {path}: {error.strerror or error}.") from None
     except BadImageError as error:
-        raise LogError(f"The mask {path} cannot be decoded: {error}.") from None
+        raise LogError(f"The mask {path} cannot be decoded: {error}. Write it as PNG.") from None
     return image >= _HALF if data[:2] == JPEG else image

@@ -39,6 +39,10 @@ def select_keyframes(
 
     Raises LogError where no two frames have odometry.
     """
+    if len(stamp_ns) < 2:
+        raise LogError(
+            f"{drive} has {plural(len(stamp_ns), 'frame')}, and a graph needs two. Give a longer part of it."
+        )
     warnings = []
     gap_ns = 3 * int(np.median(np.diff(odometry.stamp_ns))) if len(odometry.stamp_ns) > 1 else 0
     gap_ns = max(gap_ns, 10**9) if settings.max_odometry_gap_s is None else int(settings.max_odometry_gap_s * 1e9)
