@@ -36,7 +36,7 @@ from vplog.cli.parser import (
 )
 from vplog.cli.printing import Progress, print_json, print_result, print_status
 from vplog.cli.results import add_results
-from vplog.errors import LogError, VplogError, was_interrupted
+from vplog.errors import LogError, VplogError, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 
@@ -188,8 +188,9 @@ def library(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
         return
-    text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
-    printing.print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
+    references, features = (plural(record[f"{one}s"], one) for one in ("reference", "feature"))
+    text = f"{references}, {features}, {state.bits} bits a place, hash {state.hash[:12]}"
+    printing.print_line(f"{arguments.shown}:", text)
     printing.warn(warnings)
     print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
 

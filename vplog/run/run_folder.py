@@ -95,9 +95,10 @@ def staged_run(
         except BaseException as error:
             cached = set(folder.rglob(f"*{ENDING}")) - before if resumable else ()
             interrupted = was_interrupted(error)
-            if cached and (interrupted or isinstance(error, OSError | MemoryError | ResultError)):
-                error.add_note(_resume_note(out, cached))
-            else:
+            again = cached and (interrupted or isinstance(error, OSError | MemoryError | ResultError))
+            if cached:
+                error.add_note(f"{_kept(out, cached)}{f' Go on with: {_resume(out)}' if again else ''}")
+            if not again:
                 request.unlink(missing_ok=True)  # resumed, it would fail again
                 with suppress(OSError):  # not there, or it holds what was kept of this and other runs
                     folder.rmdir()
@@ -106,12 +107,12 @@ def staged_run(
             raise
 
 
-def _resume_note(out: Path, cached: Collection[Path]) -> str:
-    """Stages and bytes that an interrupted run leaves, and the command that resumes it."""
+def _kept(out: Path, cached: Collection[Path]) -> str:
+    """Stages and bytes that an unfinished run leaves."""
     stages = ", ".join(sorted({file.name.split("-")[0] for file in cached}))
     return (
         f"{sum(file.stat().st_size for file in cached) / 1e6:.1f} MB of results of stages ({stages}) are kept in "
-        f"{out / CACHE}. Go on with: {_resume(out)}"
+        f"{out / CACHE}."
     )
 
 
