@@ -378,8 +378,11 @@ def test_features_are_kept_between_calls(
     files = sorted((tmp_path / "cache" / "features").iterdir())
     files[0].write_bytes(files[0].read_bytes()[:-1])  # damaged: made again
     assert without_times(verb(*arguments, *cache).json) == without_times(before)
+    own = tmp_path / "cache" / "features" / "drive" / "own.bin"
+    own.parent.mkdir()
+    own.write_bytes(bytes(100_000))
     assert verb(*arguments, *cache, "--cache-gb", 0.00001).code == 0
-    assert not list((tmp_path / "cache" / "features").iterdir())
+    assert list((tmp_path / "cache" / "features").rglob("*.*")) == [own], "the user's, in a folder named by the user"
     assert verb(*arguments, "--cache", tmp_path / "none", "--cache-gb", 0).code == 0
     assert not (tmp_path / "none").exists()
 

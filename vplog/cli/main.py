@@ -75,7 +75,10 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     except MemoryError:
         _fail(arguments, "Out of memory. Use fewer --threads, or a shorter log.")
     except OSError as error:  # a full disk, a drive that went away
-        _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
+        _fail(
+            arguments,
+            f"Cannot read or write {error.filename or arguments.shown or 'a file'}: {error.strerror or error}.",
+        )
     except Exception as error:  # a fault of ours: still one line, and how to see more
         if was_interrupted(error):
             _interrupted(error)

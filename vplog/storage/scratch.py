@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,16 @@ def made_folder(folder: Path) -> Iterator[None]:
         with suppress(OSError):  # it holds something
             for one in made:
                 one.rmdir()
+
+
+def copy_folder(folder: Path, target: Path, what: str, **how: Any) -> None:
+    """Copy a folder, links as links; `how` is that of copytree. Raises ResultError, in one line, that names `what`."""
+    try:
+        shutil.copytree(folder, target, symlinks=True, **how)
+    except OSError as error:
+        shutil.rmtree(target, ignore_errors=True)
+        why = str(error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error)
+        raise ResultError(f"Cannot copy {what}: {why.rpartition('] ')[2].partition(': ')[0]}.") from None
 
 
 @contextmanager
