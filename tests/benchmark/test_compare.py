@@ -552,6 +552,15 @@ def test_what_cannot_be_compared_is_said_in_one_line(
     assert said in verb("compare", *named, *methods, *QUICK).error
 
 
+def test_another_programs_comparison_is_not_replaced(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    own = {"compare.json": '{"mine": 1}', "answers.csv": "mine", "curves.png": "mine"}
+    for name, text in own.items():
+        (tmp_path / name).write_text(text)
+    said = verb("compare", *traversals, "--truth", "index", "--methods", "thumbnail", "-o", tmp_path, *QUICK)
+    assert "a folder with other things in it, not a comparison" in said.error
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == own
+
+
 def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive: Drive) -> None:
     said = verb("compare", traversals[1], traversals[0], "--truth", drive.truth, "--methods", "bobb", *QUICK).error
     assert "covers none of the 16 frames of the query dusk" in said

@@ -99,9 +99,10 @@ def _colours(folder: Path, names: list[str], found: Structure) -> Bytes:
 def _export_in(out: Path) -> list[str]:
     """The files of an export in a folder, by its record, which a new one replaces: scenes of others have the same
     names. Raises SettingsError where it holds other things, and ResultError."""
-    record = run_record.read_run_json(out / _RECORD) if (out / _RECORD).is_file() else {}
-    if "vplog" not in record and any(not file.name.startswith(".") for file in out.iterdir()):
+    known = run_record.is_ours(out / _RECORD)
+    if not known and any(not file.name.startswith(".") for file in out.iterdir()):
         raise SettingsError(f"{out} is a folder with other things in it, not an export. Choose another with -o.")
     check_regular(out, _RECORD)
-    names = found if isinstance(found := record.get("files"), list) else []
+    found = run_record.read_run_json(out / _RECORD).get("files") if known else []
+    names = found if isinstance(found, list) else []
     return [_RECORD, *(escape(name) for name in names if is_below(name))]
