@@ -153,6 +153,7 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("compare A --methods bobb --truth gps --distance-m near", "must be a number above 0, not 'near'"),
         ("export RUN --format kity -o FILE", "'kity' is none of tum, kitti, euroc,"),
         ("export RUN --format kity -o FILE", "Did you mean kitti?"),
+        ("evaluate RUN --truth gps --truth-offset-s soon", "must be a number between -1e+09 and 1e+09, not 'soon'"),
         ("explain RUN --closure Q:M", "not 'Q:M'"),
         ("explain RUN --closure 1:2:3", "(QUERY:MATCH)"),
         ("explain RUN --closure 3,4", "(QUERY:MATCH)"),

@@ -266,8 +266,8 @@ def at_least(least: int) -> Callable[[str], int]:
 at_least_one = at_least(1)
 
 
-def _number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]:
-    def number(text: str) -> float:
+def number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]:
+    def parsed(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
@@ -276,9 +276,9 @@ def _number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]
             raise argparse.ArgumentTypeError(f"must be a number {words}, not {text!r}")
         return value
 
-    return number
+    return parsed
 
 
-not_negative = _number(lambda value: 0 <= value < math.inf, "of 0 or more")
-positive = _number(lambda value: 0 < value < math.inf, "above 0")
-share = _number(lambda value: 0 < value < 1, "between 0 and 1")
+not_negative = number(lambda value: 0 <= value < math.inf, "of 0 or more")
+positive = number(lambda value: 0 < value < math.inf, "above 0")
+share = number(lambda value: 0 < value < 1, "between 0 and 1")

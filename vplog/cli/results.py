@@ -14,6 +14,7 @@ from vplog.cli.parser import (
     STDOUT,
     flag,
     local_file,
+    number,
     option,
     output_file,
     output_file_or_stdout,
@@ -42,6 +43,7 @@ _ALIGNMENTS = ("se3", "sim3", "origin")
 """Those of evaluate/trajectory.py, here too since that imports numpy."""
 _MOST_OFFSET_S = 1e9
 """s; thirty years, from any clock that starts at zero to one of today."""
+_seconds = number(lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
 _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
 """Those of export.py, here too since that imports numpy."""
@@ -200,13 +202,6 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
 
 def _graph(text: str) -> Path:
     return place(text) if "://" in text else output_file(text)
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not abs(value) <= _MOST_OFFSET_S:
-        raise argparse.ArgumentTypeError(f"must be seconds between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
-    return value
 
 
 def _closure(text: str) -> tuple[int, ...]:
