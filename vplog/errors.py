@@ -49,6 +49,10 @@ def was_interrupted(error: BaseException | None) -> bool:
     return False
 
 
+def plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, cutoff: float = 0.6) -> str:
     """` Did you mean X?`, X the choice whose spelling (by `key`) is nearest to a mistyped name; empty where none is.
 

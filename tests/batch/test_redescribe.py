@@ -57,7 +57,7 @@ def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Drive, verb:
         again = ("map", "redescribe", old, "-o", new, "--json", "--library")
         assert "already" in verb(*again, f"{old}/libraries/{library}").error
         said = verb(*again, drive.log)
-        assert (said.code, "1 of 2 drives are not" in said.err) == (1, True)
+        assert (said.code, "1 of 2 drives missing in" in said.err) == (1, True)
         told = json.loads(said.out)
         fate = [(one["was"], one["drive"], one["state"]) for one in told["drives"]]
         assert fate == [("drive", "drive", "computed"), ("lost", "lost", "failed")]

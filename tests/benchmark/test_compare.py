@@ -378,8 +378,11 @@ def test_features_are_kept_between_calls(
     files = sorted((tmp_path / "cache" / "features").iterdir())
     files[0].write_bytes(files[0].read_bytes()[:-1])  # damaged: made again
     assert without_times(verb(*arguments, *cache).json) == without_times(before)
+    own = tmp_path / "cache" / "features" / "drive" / "own.bin"
+    own.parent.mkdir()
+    own.write_bytes(bytes(100_000))
     assert verb(*arguments, *cache, "--cache-gb", 0.00001).code == 0
-    assert not list((tmp_path / "cache" / "features").iterdir())
+    assert list((tmp_path / "cache" / "features").rglob("*.*")) == [own], "the user's, in a folder named by the user"
     assert verb(*arguments, "--cache", tmp_path / "none", "--cache-gb", 0).code == 0
     assert not (tmp_path / "none").exists()
 
@@ -547,6 +550,15 @@ def test_what_cannot_be_compared_is_said_in_one_line(
     named = [folders.get(argument, argument) for argument in arguments]
     methods = () if "--methods" in arguments else ("--methods", "bobb")
     assert said in verb("compare", *named, *methods, *QUICK).error
+
+
+def test_another_programs_comparison_is_not_replaced(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    own = {"compare.json": '{"mine": 1}', "answers.csv": "mine", "curves.png": "mine"}
+    for name, text in own.items():
+        (tmp_path / name).write_text(text)
+    said = verb("compare", *traversals, "--truth", "index", "--methods", "thumbnail", "-o", tmp_path, *QUICK)
+    assert "a folder with other things in it, not a comparison" in said.error
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == own
 
 
 def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive: Drive) -> None:

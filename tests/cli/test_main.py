@@ -153,11 +153,14 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("compare A --methods bobb --truth gps --distance-m near", "must be a number above 0, not 'near'"),
         ("export RUN --format kity -o FILE", "'kity' is none of tum, kitti, euroc,"),
         ("export RUN --format kity -o FILE", "Did you mean kitti?"),
+        ("evaluate RUN --truth gps --truth-offset-s soon", "must be a number between -1e+09 and 1e+09, not 'soon'"),
         ("explain RUN --closure Q:M", "not 'Q:M'"),
         ("explain RUN --closure 1:2:3", "(QUERY:MATCH)"),
         ("explain RUN --closure 3,4", "(QUERY:MATCH)"),
         ("library A -o LIB --thread 3", "no option --thread. Did you mean --threads?"),
         ("info A B", "one argument too many: B"),
+        ("run --closuer none A", "no option --closuer. Did you mean --closure of vplog explain?"),
+        ("run A -o OUT --topic /cam", "Write it in full: --image-topic, --depth-topic,"),
         ("help fly", "Verbs: info"),
         ("run -o OUT", "LOG"),
     ],
@@ -170,6 +173,10 @@ def test_wrong_usage_says_what_is_meant_in_one_line(verb: Verb, arguments: str, 
     assert said in error
     assert error.split(": error: ")[1].count("All options: vplog") == 1
     assert "invalid" not in error
+
+
+def test_what_export_lacks_is_said_beside_what_its_output_may_be(verb: Verb) -> None:
+    assert "-o FILE|FOLDER|-" in verb("export", "RUN", "-o", "-").err
 
 
 def test_every_unknown_option_of_every_verb_is_named_before_anything_else(verb: Verb) -> None:

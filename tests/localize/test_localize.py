@@ -116,7 +116,7 @@ def test_the_verb_gives_a_record_and_a_table(
     folder = verb("localize", run, pictures / "pictures", "--calibration", calibration, "--json").json
     assert folder["answers"] == record["answers"]
     shown = verb("localize", run, files[0], "--calibration", calibration)
-    assert (shown.code, "1 of 1 pictures are localised in" in shown.out) == (0, True)
+    assert (shown.code, "1 of 1 picture localised in" in shown.out) == (0, True)
     one = vplog.open_run(run).localize(files[0], calibration).record()
     assert one["tx"] == record["answers"][0]["tx"]
 

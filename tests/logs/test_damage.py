@@ -47,9 +47,13 @@ def test_what_is_no_log(tmp_path: Path) -> None:
     text.write_text("not a log")
     assert "starts with b'not a lo', which no log does" in refusal(text)
     (tmp_path / "folder").mkdir()
-    assert "holds nothing" in refusal(tmp_path / "folder")
+    assert "holds nothing. A log is" in refusal(tmp_path / "folder")
     shutil.copy(text, tmp_path / "folder")
     assert "1 file, but no log and no images" in refusal(tmp_path / "folder")
+    for name, what in (("map.json", "a map"), ("library.json", "a library")):
+        (tmp_path / what).mkdir()
+        (tmp_path / what / name).write_text("{}")
+        assert f"{what} that vplog wrote, not a log" in refusal(tmp_path / what)
     with sqlite3.connect(tmp_path / "other.db3") as db:
         db.execute("CREATE TABLE other (x)")
     assert "not a ROS 2 bag" in refusal(tmp_path / "other.db3")

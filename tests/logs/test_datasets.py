@@ -353,6 +353,8 @@ def test_start_and_stop_leave_images_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.stamps(), stamps[1:4])
     right = [frame.decode().right for frame in log.frames(log.stamps())]
     np.testing.assert_array_equal(np.array(right), images(1)[1:4])
+    with pytest.raises(LogError, match="No image is left by --start and --stop: the last one is at 0"):
+        logs.open(tmp_path, TopicChoice(start_s=9)).stamps()
 
 
 def test_what_is_cut_from_a_video_is_one_line(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_masks_of_a_topic_are_paired_by_stamp(encoding: str, tmp_path: Path) -> 
     found = masks_of(log)
     assert found[2] is None
     assert all(mask is not None and (mask == (ZERO_BELOW > 0)).all() for mask in found[:2] + found[3:])
-    assert "1 of 5 images have no mask image" in " ".join(log.warnings)
+    assert "1 of 5 images without a mask image" in " ".join(log.warnings)
     parts = {topic.name: topic.part for topic in log.info().topics}
     assert (parts["/segments"], parts[TOPIC], parts["/cam/depth"]) == ("mask", "image", "depth")
 

@@ -315,6 +315,16 @@ def test_fixes_alone_are_odometry_with_their_noise(sigma_m: float, tmp_path: Pat
     assert np.sqrt(((error / sigma) ** 2).mean()) < 2.0  # as sure as it is good
 
 
+@pytest.mark.parametrize("kind", [None, "gps"])
+def test_fixes_that_stand_still_are_not_called_the_odometry(kind: str | None, tmp_path: Path) -> None:
+    still = [one for one in fixes(0.5) if one[3] < START_NS + int(0.5 * STANDS_S * 1e9)]
+    log = opened(tmp_path, still, *([] if kind else [planar()]), odometry=kind)
+    said = " ".join([*log.info().warnings, *log.warnings])
+    assert (log.odometry() is None) == (kind == "gps")
+    assert "The odometry is the fixes" not in said
+    assert ("do not go far enough for a heading: they are no odometry" in said) == (kind == "gps")
+
+
 def test_velocities_have_the_noise_that_they_claim(tmp_path: Path) -> None:
     log = opened(tmp_path, twists_with_covariance())
     odometry = log.odometry()

@@ -236,7 +236,7 @@ def test_right_images_pair_by_stamp_and_a_missing_one_is_said(tmp_path: Path) ->
     frames = [frame.decode() for frame in log.frames(log.stamps())]
     assert [frame.right is not None for frame in frames] == [True, False, True]
     np.testing.assert_array_equal(frames[0].image, frames[1].image)  # rectified all the same
-    assert "1 of 3 images have no right image" in " ".join(log.warnings)
+    assert "1 of 3 images without a right image" in " ".join(log.warnings)
     assert "ms off" not in " ".join(log.warnings)
     late = logs.open(drive(tmp_path / "late", PINHOLES, RIGHT_FROM_LEFT, tf=True, late_ns=20_000_000))
     late.stamps()

@@ -50,6 +50,16 @@ def test_calibration_of_the_same_namespace_then_of_the_same_frame() -> None:
     assert pick(*realsense)["camera_info"] == "/device_0/Color_0/info/camera_info"
 
 
+@pytest.mark.parametrize("role", ["depth", "right", "mask"])
+@pytest.mark.parametrize("given", [{}, {"image": "/a/image"}])
+def test_one_topic_is_not_asked_to_be_two_things(role: str, given: dict[str, str]) -> None:
+    if role == "mask" and not given:
+        assert pick(topic("/a/image"), topic("/b/image"), mask="/a/image")["image"] == "/b/image"
+        return
+    with pytest.raises(LogError, match=f"/a/image is the image topic of run.mcap. Choose another with --{role}-topic"):
+        pick(topic("/a/image"), info("/a/camera_info"), **given, **{role: "/a/image"})
+
+
 def test_depth_in_the_frame_of_the_image_first() -> None:
     image = topic("/camera/color/image", frame="color")
     aligned = topic("/camera/aligned_depth/image", "depth", 5, frame="color")

@@ -3,6 +3,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
+from vplog.errors import ResultError
 from vplog.pipeline import pipeline_schema
 from vplog.results import messages
 from vplog.results.contracts import table_schemas, write_schemas
@@ -57,3 +60,11 @@ def test_columns_change_only_with_the_version() -> None:
         assert kept == columns, f"{name}: a column was removed or changed"
         added = {column: about for column, about in now[name].items() if column not in columns}
         assert all(nullable for _, nullable in added.values()), f"{name}: a column was added that may not be null"
+
+
+@pytest.mark.parametrize("name", ["map.json", "pipeline.schema.json", "vplog.LoopClosure.proto"])
+def test_what_is_no_schema_is_not_replaced(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text('{"format": 1}')
+    with pytest.raises(ResultError, match="is no schema, and is not replaced"):
+        write_schemas(tmp_path, pipeline_schema())
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: '{"format": 1}'}

@@ -106,7 +106,7 @@ def test_frames_before_and_after_the_odometry_are_left_out() -> None:
     keyframes, warnings = _select(stamps, odometry)
     outside = int(((stamps < odometry.stamp_ns[0]) | (stamps > odometry.stamp_ns[-1])).sum())
     assert outside == 100
-    assert warnings == [f"{outside} of {len(stamps)} frames have no odometry at their stamp and were left out."]
+    assert warnings == [f"{outside} of {len(stamps)} frames without odometry at its stamp left out."]
     assert keyframes.stamp_ns[0] == START  # the first sample's own stamp has odometry
     assert keyframes.stamp_ns[-1] <= odometry.stamp_ns[-1]
     inside = stamps[(stamps >= odometry.stamp_ns[0]) & (stamps <= odometry.stamp_ns[-1])]
@@ -127,7 +127,7 @@ def test_frames_in_a_gap_of_the_odometry_are_left_out() -> None:
     seconds = (keyframes.stamp_ns - START) / 1e9
     assert not ((seconds > 20.0) & (seconds < 25.0)).any()
     assert (seconds >= 25.0).any()
-    assert warnings == ["49 of 601 frames have no odometry at their stamp and were left out."]
+    assert warnings == ["49 of 601 frames without odometry at its stamp left out."]
     _, none = _select(_frames(), odometry, max_odometry_gap_s=5.0)
     assert none == []
 
@@ -165,8 +165,12 @@ def test_clocks_that_do_not_meet(offset_s: float) -> None:
 def test_too_little_odometry_or_frames() -> None:
     full = _drive(1.0)
     one = Odometry(full.stamp_ns[:1], full.odom_from_body[:1], None)
-    for stamps, odometry in ((_frames(), one), (_frames()[:1], full), (_frames()[:0], full)):
-        with pytest.raises(LogError, match="no two frames"):
+    few = "and a graph needs two"
+    for stamps, odometry, said in (
+        (_frames(), one, "no two frames have"), (_frames()[:1], full, f"1 frame, {few}"),
+        (_frames()[:0], full, f"0 frames, {few}"),
+    ):  # fmt: skip
+        with pytest.raises(LogError, match=said):
             _select(stamps, odometry)
 
 

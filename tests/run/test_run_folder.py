@@ -26,6 +26,7 @@ from vplog.run.provenance import head
 from vplog.run.reference_library import build_library
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.sessions.joint_run import _names
+from vplog.verbs.export import export
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -219,7 +220,7 @@ def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: P
     with pytest.raises(LogError) as failed, staged_run(out, asked, [log, other], drives=["a", "b"]):
         written(out / ".cache" / "extract-0.stage", b"a result")
         raise LogError
-    assert not hasattr(failed.value, "__notes__")
+    assert failed.value.__notes__ == [f"0.0 MB of results of stages (extract) are kept in {out}/.cache."]
     assert [path.name for path in out.rglob("*") if path.is_file()] == ["extract-0.stage"]
     complete(out, log)
 
@@ -272,6 +273,37 @@ def test_a_folder_with_other_things_stays(
         assert "a folder with other things in it, not a run. Choose another with -o." in error
         assert tree(out) == before
         assert not list(out.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["export RUN --format tum -o", "report RUN -o", "optimize RUN/graph.g2o -o", "info LOG --html",
+     "localize RUN LOG -o", "map export RUN -o", "map query RUN LOG -o"],
+)  # fmt: skip
+def test_logs_and_results_are_not_replaced_by_a_single_file(
+    command: str, finished: Path, drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    out = shutil.copytree(finished, tmp_path / "run")
+    logs = {"a.mcap": drive.log.read_bytes(), "a.bag": b"#ROSBAG V2.0\n", "a.db3": b"SQLite format 3\0"}
+    for name, data in logs.items():
+        (tmp_path / name).write_bytes(data)
+    results = [out / name for name in ("run.json", "closures.parquet", "result.mcap", "library/library.json")]
+    before = tree(tmp_path)
+    words = command.replace("RUN", str(out)).replace("LOG", str(drive.log)).split()
+    for path in [*results, *(tmp_path / name for name in logs)]:
+        said = verb(*words, path)
+        assert said.code == 2
+        assert f"{path} is a " in said.err.splitlines()[-1]
+    assert tree(tmp_path) == before
+
+
+def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Drive, tmp_path: Path) -> None:
+    log = Path(shutil.copy(drive.log, tmp_path))
+    (tmp_path / "link").symlink_to(log)
+    for path in (log, tmp_path / "link"):
+        with pytest.raises(ResultError, match="is a recorded log, which is not replaced"):
+            export(finished, "tum", path)
+    assert log.read_bytes() == drive.log.read_bytes()
 
 
 def test_libraries_and_demos_take_no_other_folder(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:

@@ -155,6 +155,18 @@ def test_what_fails_is_said_without_secrets(words: list[str], verb: Verb, tmp_pa
     check(tmp_path, said)
 
 
+def test_a_file_that_a_server_lacks_is_said(server: str, verb: Verb, finished: Path) -> None:
+    error = verb("evaluate", finished, "--truth", f"{server}/none.tum?{QUERY}").error
+    assert f"Cannot read {server}/none.tum: the server has no such file." in error
+
+
+@pytest.mark.parametrize("option", ["--odometry-file", "--calibration", "--decisions", "--mask"])
+def test_a_url_where_a_local_file_is_wanted_is_said(option: str, verb: Verb, tmp_path: Path) -> None:
+    said = verb("run", "a.mcap", option, f"https://host/a.tum?{SECRET}", "-o", tmp_path / "out")
+    assert said.code == 2
+    assert "must be a local file, not https://host/a.tum" in said.err
+
+
 def test_a_redirection_is_said_without_secrets(verb: Verb) -> None:
     from tests.storage.test_http import saying
 

@@ -203,6 +203,7 @@ def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, t
 
     folder = tmp_path / "run"
     shutil.copytree(finished, folder)
+    (folder / "result.mcap").unlink()
     keyframes, world = tables.read_keyframes(folder / "keyframes.parquet")
     graph, _, _ = tables.read_edges(folder / "edges.parquet", world)
     ledger = tables.read_closures(folder / "closures.parquet")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -153,6 +154,20 @@ def test_an_export_replaces_an_export_and_nothing_else(verb: Verb, finished: Pat
     (tmp_path / "mine.txt").touch()
     assert "other things" in verb("export", finished, "--format", "colmap", "-o", tmp_path).error
     assert "folder" in verb("export", finished, "--format", "nerfstudio", "-o", "-").error
+    own = {"images/1.jpg": b"mine", "sparse/0/points3D.txt": b"mine", "transforms.json": b"{}"}
+    for name, data in own.items():
+        (tmp_path / "scene" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "scene" / name).write_bytes(data)
+    for _ in range(2):
+        error = verb("export", finished, "--format", "colmap", "-o", tmp_path / "scene").error
+        assert "other things in it, not an export" in error
+        assert {name: (tmp_path / "scene" / name).read_bytes() for name in own} == own
+    again = shutil.copytree(scene, tmp_path / "again")
+    (again / "images" / "mine.jpg").touch()
+    verb("export", finished, "--format", "nerfstudio", "-o", again)
+    assert (again / "transforms.json").is_file()
+    assert not (again / "sparse").exists()
+    assert (again / "images" / "mine.jpg").exists(), "no file of the export before"
     gone = verb("export", finished, "--format", "colmap", "-o", tmp_path / "x", "--log", tmp_path / "no.mcap")
     assert "There is no log at" in gone.error
 

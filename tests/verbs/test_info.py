@@ -172,7 +172,7 @@ def test_a_folder_of_images_with_files_beside_it(tmp_path: Path) -> None:
     poses.write_text("1001 0 0 0 0 0 0 1\n1002 2 0 0 0 0 0 1\n")
     short = preflight(folder, TopicChoice(odometry_file=poses)).record
     assert short["frames"]["keyframes"] == 2
-    assert any("2 of 4 frames have no odometry" in line for line in short["warnings"])
+    assert any("2 of 4 frames without odometry" in line for line in short["warnings"])
     poses.write_text("5 0 0 0 0 0 0 1\n6 2 0 0 0 0 0 1\n")
     apart = preflight(folder, TopicChoice(odometry_file=poses)).record
     assert any("no two frames have odometry" in line for line in apart["problems"])

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog import logs
 from vplog.data import Ints
-from vplog.errors import LibraryError, LogError, ResultError, VplogError
+from vplog.errors import LibraryError, LogError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
 from vplog.places.library_files import read_library_record
 from vplog.places.reference_choice import PAPER_SIZE, evenly
 from vplog.run.reference_library import build_library, check_library
+from vplog.storage.scratch import copy_folder
 
 if TYPE_CHECKING:
     from vplog.logs import TopicChoice
@@ -53,12 +53,7 @@ def map_library(
             )
         if known is None:
             digest = pipeline.places.load(given, Execution(execution.threads)).hash  # checked against its record
-            try:
-                shutil.copytree(given, made, symlinks=True)
-            except (OSError, shutil.Error) as error:
-                shutil.rmtree(made, ignore_errors=True)
-                why = error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error
-                raise ResultError(f"Cannot copy the library {given} into {store}: {why}.") from None
+            copy_folder(given, made, f"the library {given} into {store}")
     elif known is None:
         digest = build_library(_decodable(paths, topics), made, pipeline, topics, execution).hash
     else:

@@ -295,7 +295,7 @@ def same_drive(a: Path, b: Path) -> bool:
 
 def _comparison_in(out: Path) -> list[str]:
     """The files of a comparison in a folder that a new one replaces. Raises SettingsError where there are others."""
-    if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "compare.json").is_file():
+    if any(not file.name.startswith(".") for file in out.iterdir()) and not run_record.is_ours(out / "compare.json"):
         raise SettingsError(f"{out} is a folder with other things in it, not a comparison. Choose another with -o.")
     return ["compare.json", "answers.csv", "scores-[0-9][0-9]-*.npz", *FIGURES]
 

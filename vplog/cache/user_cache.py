@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterable
@@ -18,6 +19,10 @@ DEFAULT_GB = 20.0
 60,000 images, and little of today's disks."""
 _LEFT_OVER_S = 86_400.0
 """Age of a half-written file of a process that was killed: no download takes a day."""
+
+
+_OURS = re.compile(r"\.?([a-z]+-)?[0-9a-f]{32}([0-9a-f]{32})?(\..*)?")
+"""Names of what is kept: by a hash. All else in the folders of a cache that a user named is the user's."""
 
 
 def max_bytes(max_gb: float | None) -> int:
@@ -66,6 +71,8 @@ def trim(folders: Iterable[Path], most_bytes: int) -> None:
         with suppress(OSError):
             free = shutil.disk_usage(folder).free
         for path in folder.rglob("*"):
+            if not _OURS.fullmatch(path.relative_to(folder).parts[0]):
+                continue
             with suppress(OSError):
                 about = path.stat()
                 if path.suffix == ".part" and about.st_mtime < time.time() - _LEFT_OVER_S:

@@ -24,8 +24,8 @@ from vplog.cli.parser import (
     at_least_one,
     flag,
     local,
-    local_file,
     option,
+    output_file,
     pipeline_of,
     place,
     resolved,
@@ -36,7 +36,7 @@ from vplog.cli.parser import (
 )
 from vplog.cli.printing import Progress, print_json, print_result, print_status
 from vplog.cli.results import add_results
-from vplog.errors import LogError, VplogError, was_interrupted
+from vplog.errors import LogError, VplogError, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 
@@ -75,7 +75,10 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     except MemoryError:
         _fail(arguments, "Out of memory. Use fewer --threads, or a shorter log.")
     except OSError as error:  # a full disk, a drive that went away
-        _fail(arguments, f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.")
+        _fail(
+            arguments,
+            f"Cannot read or write {error.filename or arguments.shown or 'a file'}: {error.strerror or error}.",
+        )
     except Exception as error:  # a fault of ours: still one line, and how to see more
         if was_interrupted(error):
             _interrupted(error)
@@ -188,8 +191,9 @@ def library(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
         return
-    text = f"{record['references']} references, {record['features']} features, {state.bits} bits a place"
-    printing.print_line(f"{arguments.shown}:", f"{text}, hash {state.hash[:12]}")
+    references, features = (plural(record[f"{one}s"], one) for one in ("reference", "feature"))
+    text = f"{references}, {features}, {state.bits} bits a place, hash {state.hash[:12]}"
+    printing.print_line(f"{arguments.shown}:", text)
     printing.warn(warnings)
     print(f"next      vplog run LOG -o OUT --library {shlex.quote(str(arguments.shown))}")
 
@@ -339,7 +343,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_info(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
     flag(sub, "--check", "print one line; exit status 1 if a run would fail")
-    option(sub, "--html", local_file, "FILE.html", "also write an HTML page with pictures of the drive")
+    option(sub, "--html", output_file, "FILE.html", "also write an HTML page with pictures of the drive")
 
 
 def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:

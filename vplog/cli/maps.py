@@ -14,13 +14,14 @@ from vplog.cli.parser import (
     at_least_one,
     cache_options,
     flag,
-    local_file,
     option,
+    output_file,
     place,
     settings_options,
     topics_of,
 )
 from vplog.cli.printing import Progress, print_result
+from vplog.errors import plural
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
         execution = Execution(arguments.threads, progress)
         options = BatchOptions(arguments.jobs, arguments.engine, arguments.address, arguments.retries, processes)
         found = redescribe(arguments.map, arguments.library, arguments.target, execution, options)
-    wrong = f"{found['failed']} of {len(found['drives'])} drives are not in {found['map']}."
+    wrong = f"{found['failed']} of {plural(len(found['drives']), 'drive')} missing in {found['map']}."
     _end(arguments, found, printing.print_redescribed, wrong)
 
 
@@ -84,7 +85,8 @@ def batch(arguments: argparse.Namespace) -> None:
             address=arguments.address, retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
             progress=progress, on_drive=progress.print_drive,
         )  # fmt: skip
-    wrong = f"{found['failed']} of {len(found['drives'])} drives failed; {arguments.map}/failures.json has the reasons."
+    drives = plural(len(found["drives"]), "drive")
+    wrong = f"{found['failed']} of {drives} failed; {arguments.map}/failures.json has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
 
 
@@ -113,7 +115,7 @@ def info_map(arguments: argparse.Namespace) -> None:
     print_result(arguments, found, printing.print_map)
     if wrong := found["damaged_files"]:
         raise ResultError(
-            f"{len(wrong)} damaged files in {arguments.map}: vplog batch LOG -o MAP computes drives again."
+            f"{plural(len(wrong), 'damaged file')} in {arguments.map}: vplog batch LOG -o MAP computes drives again."
         )
 
 
@@ -159,7 +161,7 @@ def add_maps(
     option(sub, "map", place, "MAP|RUN")
     option(sub, "pictures", place, "IMAGE|LOG", "images, a folder of them, or one log", nargs="+")
     option(sub, "--top", at_least_one, "K", "places that each picture is verified against (default: 10)", default=10)
-    option(sub, "-o --output", local_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
+    option(sub, "-o --output", output_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
     text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
 
@@ -193,7 +195,7 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
     option(sub, "--top", at_least_one, "K", "places for each view (default: 10)", default=10)
     option(sub, "--sequence", at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
-    option(sub, "-o --output", local_file, "FILE.parquet", "write the answers")
+    option(sub, "-o --output", output_file, "FILE.parquet", "write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
@@ -206,7 +208,7 @@ def _add_export(sub: argparse.ArgumentParser) -> None:
     text = "only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)"
     option(sub, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
-    option(sub, "-o --output", local_file, "FILE.parquet", "file to write", required=True)
+    option(sub, "-o --output", output_file, "FILE.parquet", "file to write", required=True)
 
 
 def _box(text: str) -> tuple[float, float, float, float]:

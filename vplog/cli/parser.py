@@ -67,11 +67,14 @@ class Parser(argparse.ArgumentParser):
             if name[:1] != "-" or name in ("-", "--") or name in known or short or " " in text or _is_number(text):
                 continue
             others = [one.prog for one in self._family if name in one._option_string_actions]
-            near = nearest(name, known, cutoff=0.75)
+            of_family = (f"{option} of {one.prog}" for one in self._family for option in one._option_string_actions)
+            near = nearest(name, known, cutoff=0.75) or nearest(name, of_family, _option, cutoff=0.75)
             if self._subparsers is not None and others:
                 self.error(f"{name} goes after the verb: {self.prog} VERB {name}")
             where = f" It is an option of {', '.join(others[:3])}." if others else ""
-            longer = [one for one in known if one.startswith(f"{name}-")]
+            longer = [
+                one for one in known if one.startswith(f"{name}-") or (name[:2] == "--" and one.endswith(name[1:]))
+            ]
             meant = f" Write it in full: {', '.join(longer)}." if longer else ""
             self.error(f"no option {name}.{meant or where or near}")
 
@@ -100,6 +103,10 @@ class Parser(argparse.ArgumentParser):
         usage = self._get_formatter()
         usage.add_usage(None, [one for one in self._actions if one.required or not one.option_strings], [])
         return usage.format_help()
+
+
+def _option(of_verb: str) -> str:
+    return of_verb.partition(" ")[0]
 
 
 def _is_number(text: str) -> bool:
@@ -138,9 +145,22 @@ local_file = _local("file")
 """A single file that is written by those who do not send what they write."""
 
 
-def local_file_or_stdout(text: str) -> Path:
+def output_file(text: str) -> Path:
+    """A single local file that is written, and no input of anything."""
+    path = local_file(text)
+    if path.is_file():
+        from vplog.run.run_folder import check_output
+
+        try:
+            check_output(path)
+        except VplogError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+    return path
+
+
+def output_file_or_stdout(text: str) -> Path:
     """A single local file, or `-`, the standard output."""
-    return STDOUT if text == "-" else local_file(text)
+    return STDOUT if text == "-" else output_file(text)
 
 
 def _path(text: str) -> Path:
@@ -227,7 +247,7 @@ def cache_options(sub: argparse.ArgumentParser, what: str) -> None:
 
 def resolved(text: str) -> Path:
     """A file that run.json names, so that the run is understood from any folder."""
-    return Path(text).resolve()
+    return local_file(text).resolve()
 
 
 def at_least(least: int) -> Callable[[str], int]:
@@ -246,8 +266,8 @@ def at_least(least: int) -> Callable[[str], int]:
 at_least_one = at_least(1)
 
 
-def _number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]:
-    def number(text: str) -> float:
+def number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]:
+    def parsed(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
@@ -256,9 +276,9 @@ def _number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]
             raise argparse.ArgumentTypeError(f"must be a number {words}, not {text!r}")
         return value
 
-    return number
+    return parsed
 
 
-not_negative = _number(lambda value: 0 <= value < math.inf, "of 0 or more")
-positive = _number(lambda value: 0 < value < math.inf, "above 0")
-share = _number(lambda value: 0 < value < 1, "between 0 and 1")
+not_negative = number(lambda value: 0 <= value < math.inf, "of 0 or more")
+positive = number(lambda value: 0 < value < math.inf, "above 0")
+share = number(lambda value: 0 < value < 1, "between 0 and 1")

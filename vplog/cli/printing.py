@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
+from vplog.errors import plural
 from vplog.storage.urls import without_secrets
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def print_info(found: dict[str, Any]) -> None:
 
     seconds = max(found["end_ns"] - found["start_ns"], 0) / 1e9
     print(f"log       {found['path']}")
-    print_line("kind", f"{found['kind']}, {found['messages']} messages over {seconds:.1f} s")
+    print_line("kind", f"{found['kind']}, {plural(found['messages'], 'message')} over {seconds:.1f} s")
     rows = []
     for topic in found["topics"]:
         rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f}"
@@ -138,7 +139,8 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
 
     counts, totals, named = record["counts"], record["totals"], shlex.quote(str(out))
     print_line(f"{out}:", _outcome_text(outcome, record))
-    print_line("", f"{counts['keyframes']} keyframes of {counts['frames']} frames, {counts['candidates']} candidates:")
+    keyframes, frames, candidates = (plural(counts[f"{one}s"], one) for one in ("keyframe", "frame", "candidate"))
+    print_line("", f"{keyframes} of {frames}, {candidates}:")
     for name, count in counts["verdicts"].items():
         print_line(f"{count:9d}", f"{name}: {Verdict(name).sentence}")
     warn(record["warnings"])
@@ -152,9 +154,7 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
 def _outcome_text(outcome: Outcome, record: dict[str, Any]) -> str:
     if outcome.moved_m < _UNMOVED_M:  # the reason is what the user needs, whatever its words
         return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
-    closures = f"{outcome.closures} closure{'' if outcome.closures == 1 else 's'}"
-    places = f"{outcome.places} place{'' if outcome.places == 1 else 's'}"
-    causes = [f"{closures} at {places}"] if outcome.closures else []
+    causes = [f"{plural(outcome.closures, 'closure')} at {plural(outcome.places, 'place')}"] if outcome.closures else []
     causes += ["the satellite fixes"] if record["gps"] else []
     return f"the trajectory moved by up to {outcome.moved_m:.2f} m{', by ' if causes else ''}{' and '.join(causes)}"
 
@@ -164,7 +164,7 @@ def print_joint(out: Path, record: dict[str, Any]) -> None:
         several = f" in one frame, map{number}.g2o" if len(found["drives"]) > 1 else " by itself"
         print_line(f"{out}:", f"{', '.join(found['drives'])}{several}")
     for tie in record["joins"]:
-        text = f"{tie['kept']} closures of {tie['candidates']} candidates"
+        text = f"{plural(tie['kept'], 'closure')} of {plural(tie['candidates'], 'candidate')}"
         print_line("", f"{tie['query_drive']} to {tie['match_drive']}: {text}")
     warn(record["warnings"])
     totals, named = record["totals"], shlex.quote(str(out))
@@ -279,10 +279,10 @@ def print_batch(found: dict[str, Any]) -> None:
         rows.append((drive["drive"], drive["state"], *counts, drive["worker"], drive["error"]))
     titles = ("drive", "state", "keyframes", "closures", "attempts", "seconds", "peak MB", "worker", "error")
     print_table(titles, rows)
+    drives, threads = plural(len(found["drives"]), "drive"), plural(found["threads_per_job"], "thread")
     print_line(
         f"{found['map']}:",
-        f"{len(found['drives'])} drives, {found['failed']} failed, {found['seconds']:.1f} s, {found['jobs']} at once, "
-        f"{found['threads_per_job']} threads each",
+        f"{drives}, {found['failed']} failed, {found['seconds']:.1f} s, {found['jobs']} at once, {threads} each",
     )
     for component in (found["joined"] or {}).get("components", []):
         print_line("together", ", ".join(component["drives"]))
@@ -298,19 +298,18 @@ def print_batch(found: dict[str, Any]) -> None:
 def print_map(found: dict[str, Any]) -> None:
     known = found["library"]
     each = "" if found["bytes_per_place"] is None else f", {found['bytes_per_place']:g} bytes a place"
-    print(
-        f"{found['map']}: {len(found['drives'])} drives, {found['places']} places{each}, {found['bytes'] / 1e6:.1f} MB"
-    )
-    print(f"library   {known['hash'] or 'none yet'}, {known['references'] or 0} references")
+    drives, places = plural(len(found["drives"]), "drive"), plural(found["places"], "place")
+    print(f"{found['map']}: {drives}, {places}{each}, {found['bytes'] / 1e6:.1f} MB")
+    print(f"library   {known['hash'] or 'none yet'}, {plural(known['references'] or 0, 'reference')}")
     boxes = [drive["bounds"] for drive in found["drives"] if drive["bounds"]]
     sides = zip((min, min, max, max), zip(*boxes, strict=True), strict=False)  # no side where there is no box
     where = ",".join(f"{most(side):.5f}" for most, side in sides)
     around = f", within {where} (south, west, north, east)" if boxes else ""
-    print(f"on earth  {found['on_earth']} of {len(found['drives'])} drives{around}")
+    print(f"on earth  {found['on_earth']} of {drives}{around}")
     if found["components"] is not None:
         joined = sum(len(one["drives"]) for one in found["components"])
         groups = len(found["components"])
-        print(f"joined    {joined} drives in {groups} group{'' if groups == 1 else 's'}, each in one frame")
+        print(f"joined    {plural(joined, 'drive')} in {plural(groups, 'group')}, each in one frame")
     rows = []
     for drive in found["drives"]:
         counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
@@ -330,11 +329,11 @@ def print_export(found: dict[str, Any]) -> None:
             f"warning: {drive} is left out: it has no place on earth, as its log has fewer than three satellite fixes."
         )
     warn(found.get("warnings", ()))
-    print(f"{found['written']}: {found['places']} places of {len(found['drives'])} drives")
+    print(f"{found['written']}: {plural(found['places'], 'place')} of {plural(len(found['drives']), 'drive')}")
 
 
 def print_joined(found: dict[str, Any]) -> None:
-    print(f"{found['map']}: {found['pairs']} pairs of drives compared, {found['pairs_computed']} of them now")
+    print(f"{found['map']}: {plural(found['pairs'], 'pair')} of drives compared, {found['pairs_computed']} of them now")
     for component in found["components"]:
         print_line("together", f"{', '.join(component['drives'])}, in joint/{component['folder']}")
     if found["alone"]:
@@ -350,13 +349,13 @@ def print_merge(found: dict[str, Any]) -> None:
         print(f"{one['state']:14}{one['drive']}{other}, from {one['from']}")
     warn(found["warnings"])
     taken = sum(one["state"] != "there already" for one in found["drives"])
-    print(f"{found['map']}: {taken} of {len(found['drives'])} drives taken")
+    print(f"{found['map']}: {taken} of {plural(len(found['drives']), 'drive')} taken")
     if any(one["state"] == "taken" for one in found["drives"]):
         print(f"next      vplog map join {shlex.quote(str(found['map']))}")
 
 
 def print_removed(found: dict[str, Any]) -> None:
-    print(f"{found['map']}: {len(found['removed'])} removed, {len(found['drives'])} drives left")
+    print(f"{found['map']}: {len(found['removed'])} removed, {plural(len(found['drives']), 'drive')} left")
     if found["still_joined"]:
         print_line("to solve", f"{', '.join(found['still_joined'])} were joined with what is removed")
         print(f"next      vplog map join {shlex.quote(str(found['map']))}")
@@ -364,8 +363,9 @@ def print_removed(found: dict[str, Any]) -> None:
 
 
 def print_index(found: dict[str, Any]) -> None:
-    places = f"{found['places']} places of {len(found['drives'])} drives in {len(found['segments'])} files"
-    print(f"{found['map']}: {places}, {found['bytes'] / 1e6:.1f} MB")
+    places, drives = plural(found["places"], "place"), plural(len(found["drives"]), "drive")
+    files = plural(len(found["segments"]), "file")
+    print(f"{found['map']}: {places} of {drives} in {files}, {found['bytes'] / 1e6:.1f} MB")
     warn(found["warnings"])
 
 
@@ -373,7 +373,7 @@ def print_redescribed(found: dict[str, Any]) -> None:
     for one in found["drives"]:
         other = "" if one["was"] == one["drive"] else f", was {one['was']}"
         print(f"{one['state']:10}{one['drive']}{other}{': ' if one['error'] else ''}{one['error']}")
-    print(f"{found['map']}: {len(found['drives']) - found['failed']} drives, library {found['library']}")
+    print(f"{found['map']}: {plural(len(found['drives']) - found['failed'], 'drive')}, library {found['library']}")
     warn((found["joined"] or {}).get("warnings", []))
     print(f"next      vplog map query {shlex.quote(str(found['map']))} LOG")
 
@@ -393,7 +393,8 @@ def print_answers(found: dict[str, Any]) -> None:
     ]
     print_table(("view", "drive", "keyframe", "score", "support"), rows)
     warn(found["warnings"])
-    print(f"{found['log']}: {found['answered']} of {found['views']} views match a place of {found['map']}")
+    views = plural(found["views"], "view")
+    print(f"{found['log']}: {found['answered']} of {views} matched to a place of {found['map']}")
     if found["written"]:
         print(f"written   {found['written']}")
 
@@ -414,7 +415,7 @@ def print_localized(found: dict[str, Any]) -> None:
         if not one["localized"]:
             print_line(f"{one['picture']}:", one["sentence"])
     warn(found["warnings"])
-    print(f"{found['localized']} of {found['pictures']} pictures are localised in {found['map']}")
+    print(f"{found['localized']} of {plural(found['pictures'], 'picture')} localised in {found['map']}")
     if found["written"]:
         print(f"written   {found['written']}")
 

@@ -10,7 +10,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.cli.parser import STDOUT, flag, local_file, local_file_or_stdout, option, place, positive, topics_of
+from vplog.cli.parser import (
+    STDOUT,
+    flag,
+    local_file,
+    number,
+    option,
+    output_file,
+    output_file_or_stdout,
+    place,
+    positive,
+    topics_of,
+)
 from vplog.cli.printing import (
     Progress,
     print_diff,
@@ -32,6 +43,7 @@ _ALIGNMENTS = ("se3", "sim3", "origin")
 """Those of evaluate/trajectory.py, here too since that imports numpy."""
 _MOST_OFFSET_S = 1e9
 """s; thirty years, from any clock that starts at zero to one of today."""
+_seconds = number(lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
 _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
 """Those of export.py, here too since that imports numpy."""
@@ -154,7 +166,7 @@ def add_results(
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
     option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
-    option(sub, "-o --output", local_file, "FILE.html", "page (default: RUN/report.html)")
+    option(sub, "-o --output", output_file, "FILE.html", "page (default: RUN/report.html)")
     sub = add("diff", diff, topics)
     sub.set_defaults(refuse=sub.error)
     option(sub, "runs", place, "RUN", nargs="+")
@@ -166,11 +178,12 @@ def add_results(
     sub = add("export", export, threads)
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    option(sub, "-o --output", local_file_or_stdout, "FILE|FOLDER", "what to write; - is stdout", required=True)
+    text = "what to write; - writes a file to stdout"
+    option(sub, "-o --output", output_file_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)
     option(sub, "graph", local_file, "GRAPH.g2o")
-    option(sub, "-o --output", place, "OUT", "the graph at its solved poses, as g2o", required=True)
+    option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
     text = "report whether the solution is the global optimum of the accepted edges, and look for a better one if not"
     sub.add_argument("--certify", action="store_true", help=text)
@@ -182,16 +195,13 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     text = "row of closures.parquet, or its two keyframes, by row or by stamp in ns"
     option(which, "--closure", _closure, "K|QUERY:MATCH", text)
     flag(which, "--worst", "the closure that the solved trajectory is furthest from")
-    option(sub, "-o --output", local_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
+    option(sub, "-o --output", output_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
     option(sub, "--log", place, "LOG", "the run's log, where it has moved since")
     flag(sub, "--no-picture", "no picture; the log is not needed")
 
 
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not abs(value) <= _MOST_OFFSET_S:
-        raise argparse.ArgumentTypeError(f"must be seconds between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
-    return value
+def _graph(text: str) -> Path:
+    return place(text) if "://" in text else output_file(text)
 
 
 def _closure(text: str) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vplog.data import Floats, Ints, Trajectory
-from vplog.errors import TruthError
+from vplog.errors import TruthError, plural
 from vplog.geometry import se3
 
 MAX_DIFFERENCE_S = 0.01
@@ -145,7 +145,7 @@ def aligned_error(estimate: Floats, truth: Floats, alignment: str = "se3") -> At
     """ATE of positions (T, 3) that belong together. Raises TruthError where T is less than three."""
     if len(estimate) < 3:
         raise TruthError(
-            f"Only {len(estimate)} poses have a truth; an alignment needs 3. Give a truth that covers the drive."
+            f"Only {plural(len(estimate), 'pose')} with a truth; an alignment needs 3. Give one that covers the drive."
         )
     truth_from_estimate, scale = se3.umeyama(estimate, truth, alignment == "sim3")
     return _ate(se3.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.errors import LogError, plural
 from vplog.logs.continuity import without_jumps
-from vplog.logs.formats.container import Notes, plural
+from vplog.logs.formats.container import Notes
 from vplog.logs.gather import TopicCollector
 from vplog.logs.odometry_sources import choose_odometry, other_sources, rank_sources, read_sources
 from vplog.logs.recorder_clock import correct_clock_steps
@@ -69,11 +70,13 @@ class Content:
         return self.frames[-1] if self.frames else ""
 
     def between(self, start_s: float | None, stop_s: float | None) -> Content:
-        """With the images from `start_s` up to `stop_s`, s after the first; all where None."""
+        """With the images from `start_s` up to `stop_s`, s after the first; all if None. Raises LogError for none."""
         if start_s is None and stop_s is None:
             return self
         since_s = (self.stamp_ns - self.stamp_ns[:1]) / 1e9
         inside = (since_s >= (start_s or 0.0)) & (since_s < (np.inf if stop_s is None else stop_s))
+        if len(inside) and not inside.any():
+            raise LogError(f"No image is left by --start and --stop: the last one is at {since_s[-1]:.1f} s.")
         return self.with_images(inside)
 
     def with_images(self, wanted: np.ndarray) -> Content:
@@ -123,7 +126,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         pairs = nearest(stamp_ns, other_ns)
         paired.append([None if pair < 0 else other_places[pair] for pair in pairs.tolist()])
         if images.channel and (alone := int((pairs < 0).sum())):
-            notes.add(f"{alone} of {plural(len(pairs), 'image')} have no {name} image within half a frame period.")
+            notes.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
         both = pairs >= 0
         late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
         if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from vplog.errors import plural
 from vplog.geometry import se3
-from vplog.logs.formats.container import plural
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints, Odometry

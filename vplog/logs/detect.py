@@ -10,14 +10,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.logs import image_folder
 from vplog.logs.datasets.find import find_roots, is_video, read_folder, read_video
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSetContainer
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
 from vplog.logs.formats.compression import fetched, unpacked
-from vplog.logs.formats.container import Notes, plural
+from vplog.logs.formats.container import Notes
 from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
 from vplog.logs.formats.ros2_folder import (
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from vplog.logs.topic_selection import TopicChoice
     from vplog.stages import Log
 
+_RESULTS = {"run.json": "a run", "map.json": "a map", "library.json": "a library"}
 _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}
 _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
@@ -209,6 +210,8 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
             problem = str(error)
     files = sorted((file for file in path.iterdir() if file.is_file()), key=_by_name)
     logs = [file for file in files if _magic(file) in (*_READERS, "zstd")]
+    if [log.name for log in logs] == ["result.mcap"] and (path / "run.json").is_file():
+        raise LogError(_no_folder(path, files))
     if logs:
         return _open_found(path, logs, problem or f"{path.name} has no metadata.yaml", choice, notes)
     if problem:
@@ -320,8 +323,10 @@ def _magic(path: Path) -> str:
 
 
 def _no_folder(path: Path, files: list[Path]) -> str:
-    found = plural(len(files), "file") if files else "nothing"
-    return f"{path} holds {found}, but no log and no images. A log is {_KNOWN}."
+    if ours := [what for name, what in _RESULTS.items() if (path / name).is_file()]:
+        return f"{path} is {ours[0]} that vplog wrote, not a log. Give the log of a drive."
+    found = f"{plural(len(files), 'file')}, but no log and no images" if files else "nothing"
+    return f"{path} holds {found}. A log is {_KNOWN}."
 
 
 def _no_log(path: Path) -> str:

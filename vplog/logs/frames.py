@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from vplog.data import Frame
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.logs.cameras import camera_from_image
-from vplog.logs.formats.container import plural
 from vplog.logs.masks import resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode

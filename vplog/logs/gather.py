@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.logs.formats.container import Block, Notes, plural
+from vplog.errors import plural
+from vplog.logs.formats.container import Block, Notes
 from vplog.logs.formats.loss_account import LossRuns
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (

@@ -78,6 +78,8 @@ def stamps_of(names: list[str]) -> list[int] | None:
 
 
 Group = dict[str, list["Path"]]
+_NUMBER = re.compile(r"(cam(?:era)?[_-]?\d(?!\d))|(\d+)", re.IGNORECASE)
+"""The number of a camera, with its word, or any other."""
 
 
 def select_camera(folder: Path, files: list[Path], choice: str | None) -> list[Path]:
@@ -118,16 +120,21 @@ def _by_folder(root: Path, files: list[Path]) -> Group:
 def _by_name(files: list[Path]) -> Group:
     """Groups whose names differ in more than numbers and whose numbers run side by side: `left_*.png`, `right_*.png`.
     Empty where there is one, or one follows the other."""
-    groups = _grouped(files, lambda file: re.sub(r"\d+", "*", file.name))
+    groups = _grouped(files, lambda file: _pattern(file.name))
     groups = {name: group for name, group in groups.items() if len(group) >= _LEAST}
     parallel = {a for a in groups for b in groups if a != b and _are_parallel(groups[a], groups[b])}
     found = {name: group for name, group in groups.items() if name in parallel}
     return found if sum(map(len, found.values())) >= _IN_GROUPS * len(files) else {}
 
 
+def _pattern(name: str) -> str:
+    """With `*` for the numbers that tell the images of one camera apart."""
+    return _NUMBER.sub(lambda found: found[1] or "*", name)
+
+
 def _are_parallel(a: list[Path], b: list[Path]) -> bool:
-    x, y = ([tuple(map(int, re.findall(r"\d+", file.stem))) for file in group] for group in (a, b))
-    if re.sub(r"\d+", "*", a[0].stem) == re.sub(r"\d+", "*", b[0].stem):  # one camera's, in two formats
+    x, y = ([tuple(int(n) for _, n in _NUMBER.findall(file.stem) if n) for file in group] for group in (a, b))
+    if _pattern(a[0].stem) == _pattern(b[0].stem):  # one camera's, in two formats
         return len({*x} & {*y}) >= _SHARE * min(len(x), len(y))
     within = [sum(min(other) <= one <= max(other) for one in own) / len(own) for own, other in ((x, y), (y, x))]
     return max(within) >= _SHARE

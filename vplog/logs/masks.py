@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog.errors import LogError
-from vplog.logs.formats.container import plural
+from vplog.errors import LogError, plural
 from vplog.logs.image_folder import is_image
 from vplog.storage.image_file import JPEG, BadImageError, decode_image, image_size
 
@@ -147,5 +146,5 @@ def _read(path: Path) -> Bytes:
     except OSError as error:
         raise LogError(f"Cannot read the mask {path}: {error.strerror or error}.") from None
     except BadImageError as error:
-        raise LogError(f"The mask {path} cannot be decoded: {error}.") from None
+        raise LogError(f"The mask {path} cannot be decoded: {error}. Write it as PNG.") from None
     return image >= _HALF if data[:2] == JPEG else image

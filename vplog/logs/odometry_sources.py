@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Odometry, OdometrySource, Trajectory
+from vplog.errors import plural
 from vplog.logs.continuity import find_jumps
 from vplog.logs.dead_reckoning import dead_reckoned, odometry_of_fixes, turned_by_gyro
-from vplog.logs.formats.container import Channel, Notes, plural
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
 from vplog.logs.tf_odometry import FrameTree, clean
@@ -159,7 +160,10 @@ def other_sources(gps: Gps | None, contents: Contents, chosen: Selection) -> dic
     found = {}
     if gps is not None and chosen.gps is not None and chosen.kind in ("", "gps"):
         odometry, notes = odometry_of_fixes(gps), Notes()
-        notes.add(f"The odometry is the fixes of {chosen.gps.topic}, which are constraints of the graph, too.")
+        if odometry is not None:
+            notes.add(f"The odometry is the fixes of {chosen.gps.topic}, which are constraints of the graph, too.")
+        elif chosen.kind:
+            notes.add(f"The fixes of {chosen.gps.topic} do not go far enough for a heading: they are no odometry.")
         found[chosen.gps] = SourceOdometry(odometry, ["enu", ""], notes, "gps")
     if isinstance(truth := contents.truth, Trajectory) and chosen.kind in ("", "truth"):
         odometry = Odometry(truth.stamp_ns, truth.world_from_body, None)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.logs.clocks import (
     GAP_NS,
     GAP_PERIODS,
@@ -20,7 +20,6 @@ from vplog.logs.clocks import (
     Clock,
     align_clock,
 )
-from vplog.logs.formats.container import Notes, plural
 from vplog.logs.formats.loss_account import runs_of
 
 if TYPE_CHECKING:
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
 
     from vplog.data import Floats, Ints
     from vplog.logs.clocks import Repaired
+    from vplog.logs.formats.container import Notes
 
 NONE: Ints = np.zeros(0, np.int64)
 _LAST_NS = 2**63 - 1

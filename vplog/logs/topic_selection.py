@@ -192,7 +192,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
         return not c.supported, sixteen_bits, uncalibrated, _partner(c, candidates, back=True) is not None, *_by_size(c)
 
-    image = pick("image", as_image, "depth")
+    image = _image_alone(pick("image", as_image, "depth"), choice, log)
     depth = calibration = right = right_info = None
     if image is not None:
         if choice.depth is not None or not choice.right:
@@ -239,6 +239,15 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     return Selection(
         **found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
     )
+
+
+def _image_alone(image: Candidate | None, choice: TopicChoice, log: str) -> Candidate | None:
+    """The image. Raises LogError where the image topic is asked to be another part, too."""
+    for role in ("depth", "right", "mask"):
+        if image is not None and getattr(choice, role) == image.channel.topic:
+            option = f"--{role}-topic"
+            raise LogError(f"{getattr(choice, role)} is the image topic of {log}. Choose another with {option}.")
+    return image
 
 
 def _sources(

@@ -21,6 +21,7 @@ from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive, read_places_header
 from vplog.storage.remote_path import local_copy, original
+from vplog.storage.scratch import copy_folder
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
@@ -120,7 +121,7 @@ def _copy_library(store: Store, other: Store, library: str) -> None:
         return
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
-    shutil.copytree(other.library(library), made, symlinks=True)
+    copy_folder(other.library(library), made, f"the library of {other} to {store}")
     settings = other.head().settings
     store.write_head(map_store.Head(None, settings))  # a folder that holds a library alone is no map
     map_store.add_library(store, made, library)
@@ -170,11 +171,9 @@ def _merge_drive(
 
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
-        try:
-            ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-            shutil.copytree(other.full_run(drive), made, symlinks=True, copy_function=layout.link, ignore=ignored)
-        except (OSError, shutil.Error) as error:
-            raise ResultError(f"Cannot copy {drive} of {other}: {str(error).splitlines()[0][:200]}") from None
+        ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
+        what = f"{drive} of {other} to {store}"
+        copy_folder(other.full_run(drive), made, what, copy_function=layout.link, ignore=ignored)
 
     other.read(drive, copied, ())
     if taken != drive:

@@ -193,7 +193,7 @@ def read_sources(folder: Path) -> set[tuple[str, int]]:
         table = _table(folder / "references.parquet", _REFERENCES)
         return set(zip(table["drive"].to_pylist(), table["stamp_ns"].to_pylist(), strict=True))
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0]}.") from None
+        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from None
 
 
 def load_references(folder: Path, execution: Execution = Execution()) -> list[Reference]:
@@ -208,7 +208,7 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
         entries = references.to_pylist()
     except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
         raise LibraryError(
-            f"{folder} cannot be read: {str(error).splitlines()[0]}. Build it again with `vplog library`."
+            f"{folder} cannot be read: {str(error).splitlines()[0].rstrip('.')}. Build it again with `vplog library`."
         ) from None
     owners = features["reference"].to_numpy()
     start = np.searchsorted(owners, np.arange(len(references) + 1))

@@ -8,6 +8,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from vplog.errors import ResultError
 from vplog.results import feature_table, landmark_table, localized_table, messages, places_map, tables
 from vplog.results.mcap import TOPICS
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
@@ -75,9 +76,13 @@ _OF_TABLE: dict[str, dict[str, Any]] = {
 """Fields of the contract of a table that differ from those of most."""
 
 
+_HEAD = 14
+"""Characters by which a schema is known: as far as the name of its first key's value."""
+
+
 def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
     """Write the contracts into a folder; the files written, in order. The pipeline's JSON Schema comes from outside:
-    the settings of all stages are known only to the pipeline."""
+    the settings of all stages are known only to the pipeline. Raises ResultError where other files have their names."""
     topics = [{"topic": name, "schema": kind, "description": about} for name, (kind, about) in TOPICS.items()]
     texts = {
         "vplog.LoopClosure.proto": messages.loop_closure_proto(),
@@ -86,6 +91,9 @@ def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
     }
     for name, schema in table_schemas().items():
         texts[f"{name}.json"] = json.dumps(_contract(name, schema), indent=2, ensure_ascii=False) + "\n"
+    for name, text in texts.items():
+        if (folder / name).exists() and not (folder / name).read_bytes().startswith(text[:_HEAD].encode()):
+            raise ResultError(f"{folder / name} is no schema, and is not replaced. Choose another folder with -o.")
     for name, text in texts.items():
         with replacing(folder / name) as stream:
             stream.write(text.encode())

@@ -91,7 +91,7 @@ class FeatureTable:
             held = int(header.get(b"vplog.most_features", b"0")[:9])
             self._descriptor_bytes = int(header.get(b"vplog.descriptor_bytes", b"128")[:9])
         except (OSError, ValueError, pa.ArrowException) as error:
-            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}.") from None
+            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from None
         self._path, self._lock = path, threading.Lock()
         self._read = lru_cache(_IN_MEMORY)(self._from_file)
         if header.get(b"vplog.made_from") != made_from.encode() or held < most:
@@ -122,5 +122,7 @@ class FeatureTable:
             if not len(y) == len(size) == len(depth) == len(x):
                 raise ValueError("columns of different length")
         except (OSError, ValueError, IndexError, pa.ArrowException) as error:
-            raise ResultError(f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0]}.") from None
+            raise ResultError(
+                f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0].rstrip('.')}."
+            ) from None
         return Features(points, size.astype(np.float32), descriptors, depth.astype(np.float32), width, height)

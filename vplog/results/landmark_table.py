@@ -133,7 +133,7 @@ class LandmarkTable:
             self.camera = camera_from(json.loads(header["vplog.camera"]), "Run `vplog localize` again.")
             self.scale = header["vplog.scale"]
         except (OSError, ValueError, KeyError, RecursionError, pa.ArrowException) as error:
-            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0]}.") from None
+            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from None
         self._path, self._lock = path, threading.Lock()
         self._read = lru_cache(_IN_MEMORY)(self._group)
         if header.get("vplog.made_from") != made_from:
@@ -152,7 +152,9 @@ class LandmarkTable:
         try:
             return self._read(row // _KEYFRAMES_PER_GROUP)[row % _KEYFRAMES_PER_GROUP]
         except (OSError, ValueError, IndexError, pa.ArrowException) as error:
-            raise ResultError(f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0]}.") from None
+            raise ResultError(
+                f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0].rstrip('.')}."
+            ) from None
 
     def _group(self, number: int) -> list[tuple[Features, Floats]]:
         with self._lock:

@@ -37,6 +37,14 @@ def write_run_json(path: Path, record: dict[str, Any], checksum: bool = True) ->
         stream.write(text.encode())
 
 
+def is_ours(path: Path) -> bool:
+    """Whether a file is a sound record that vplog wrote: others may have one of the same name."""
+    try:
+        return "vplog" in read_run_json(path)
+    except ResultError:
+        return False
+
+
 def read_run_json(path: Path) -> dict[str, Any]:
     """A record of a run or a map, without its checksum and without retired settings. Raises ResultError where the file
     is missing, is no JSON object or does not have its checksum, and NewerError where it is of a newer version."""

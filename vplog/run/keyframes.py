@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Floats, Ints, Keyframes, Odometry
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.geometry import se3
 from vplog.settings import Settings
 
@@ -39,12 +39,16 @@ def select_keyframes(
 
     Raises LogError where no two frames have odometry.
     """
+    if len(stamp_ns) < 2:
+        raise LogError(
+            f"{drive} has {plural(len(stamp_ns), 'frame')}, and a graph needs two. Give a longer part of it."
+        )
     warnings = []
     gap_ns = 3 * int(np.median(np.diff(odometry.stamp_ns))) if len(odometry.stamp_ns) > 1 else 0
     gap_ns = max(gap_ns, 10**9) if settings.max_odometry_gap_s is None else int(settings.max_odometry_gap_s * 1e9)
     covered = _has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
     if missing := int((~covered).sum()):
-        warnings.append(f"{missing} of {len(stamp_ns)} frames have no odometry at their stamp and were left out.")
+        warnings.append(f"{missing} of {plural(len(stamp_ns), 'frame')} without odometry at its stamp left out.")
     stamp_ns = np.unique(stamp_ns[covered])
     if len(stamp_ns) < 2:
         raise LogError(

@@ -18,7 +18,7 @@ from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
 from vplog.results.staging import staged
 from vplog.run import provenance
-from vplog.storage.folders import check_regular
+from vplog.storage.folders import check_regular, check_replaceable
 from vplog.storage.remote_path import located, stands_for
 
 _RUN_FILES = (
@@ -29,6 +29,15 @@ _RUN_FILES = (
     *(f"closure-{'[0-9]' * digits}.png" for digits in range(1, 10)),
 )  # fmt: skip
 """Glob patterns of all files that runs and `explain` write into the folder of a run and into those of its drives."""
+_RECORDS = ("run.json", "drive.json", "library.json")
+
+
+def check_output(path: Path) -> None:
+    """Raises ResultError where a file to write is a recorded log, or one that a run or a library was written as."""
+    check_replaceable(path)
+    written = [*_RECORDS, *(PurePath(name).name for name in _RUN_FILES if not name.endswith((".html", ".png")))]
+    if path.is_file() and any((path.parent / name).exists() for name in _RECORDS) and any(map(path.match, written)):
+        raise ResultError(f"{path} is a file of the results in {path.parent}. Name another.")
 
 
 @dataclass(frozen=True)
@@ -86,9 +95,10 @@ def staged_run(
         except BaseException as error:
             cached = set(folder.rglob(f"*{ENDING}")) - before if resumable else ()
             interrupted = was_interrupted(error)
-            if cached and (interrupted or isinstance(error, OSError | MemoryError | ResultError)):
-                error.add_note(_resume_note(out, cached))
-            else:
+            again = cached and (interrupted or isinstance(error, OSError | MemoryError | ResultError))
+            if cached:
+                error.add_note(f"{_kept(out, cached)}{f' Go on with: {_resume(out)}' if again else ''}")
+            if not again:
                 request.unlink(missing_ok=True)  # resumed, it would fail again
                 with suppress(OSError):  # not there, or it holds what was kept of this and other runs
                     folder.rmdir()
@@ -97,12 +107,12 @@ def staged_run(
             raise
 
 
-def _resume_note(out: Path, cached: Collection[Path]) -> str:
-    """Stages and bytes that an interrupted run leaves, and the command that resumes it."""
+def _kept(out: Path, cached: Collection[Path]) -> str:
+    """Stages and bytes that an unfinished run leaves."""
     stages = ", ".join(sorted({file.name.split("-")[0] for file in cached}))
     return (
         f"{sum(file.stat().st_size for file in cached) / 1e6:.1f} MB of results of stages ({stages}) are kept in "
-        f"{out / CACHE}. Go on with: {_resume(out)}"
+        f"{out / CACHE}."
     )
 
 

@@ -16,6 +16,8 @@ from vplog.errors import ResultError
 _KINDS = {
     stat.S_IFLNK: "link", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device",
 }  # fmt: skip
+_LOGS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
+"""What recorded drives begin with, those that zstd packed too."""
 
 
 def regular_files(folder: Path) -> Iterator[str]:
@@ -43,6 +45,15 @@ def regular_files(folder: Path) -> Iterator[str]:
 def is_below(name: object) -> bool:
     """Whether a name that a record has is that of something below its folder."""
     return isinstance(name, str) and not {"", ".", ".."} & {*name.split("/")} and not {"\\", "\0"} & {*name}
+
+
+def check_replaceable(path: Path) -> None:
+    """Raises ResultError where a file to write is a recorded log, which nothing brings back."""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(max(map(len, _LOGS)))
+        if head.startswith(_LOGS):
+            raise ResultError(f"{path} is a recorded log, which is not replaced. Name another file.")
 
 
 def check_regular(folder: Path, record: str = "") -> None:

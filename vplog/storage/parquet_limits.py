@@ -152,6 +152,8 @@ def _check_version(path: Path, schema: pa.Schema) -> None:
 
 def check_version(path: Path, version: object, newest: int, maker: object = None) -> None:
     """Raises NewerError where the version of a file is newer than the newest that is read."""
+    if version is None:
+        raise NewerError(f"{path} names no version of its format, so vplog did not write it. Name another folder.")
     if type(version) is not int or not 0 < version <= newest:
         by = f"by vplog {maker}" if isinstance(maker, str) and maker else "by another vplog"
         raise NewerError(

@@ -210,7 +210,7 @@ class RemotePath:
             return int(self._info.size or 0)
         length = self._head.get("Content-Length", "")
         if not length.isdigit():
-            raise OSError("the server does not say how long the file is")
+            raise OSError(f"the server {'does not say how long the file is' if self._head else 'has no such file'}")
         return int(length)
 
 

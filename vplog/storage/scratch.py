@@ -9,13 +9,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vplog.errors import ResultError
-from vplog.storage.folders import is_below, regular_files
+from vplog.storage.folders import check_replaceable, is_below, regular_files
 
 Bytes = NDArray[np.uint8]
 
@@ -80,6 +80,16 @@ def made_folder(folder: Path) -> Iterator[None]:
                 one.rmdir()
 
 
+def copy_folder(folder: Path, target: Path, what: str, **how: Any) -> None:
+    """Copy a folder, links as links; `how` is that of copytree. Raises ResultError, in one line, that names `what`."""
+    try:
+        shutil.copytree(folder, target, symlinks=True, **how)
+    except OSError as error:
+        shutil.rmtree(target, ignore_errors=True)
+        why = str(error.args[0][0][2] if isinstance(error, shutil.Error) else error.strerror or error)
+        raise ResultError(f"Cannot copy {what}: {why.rpartition('] ')[2].partition(': ')[0]}.") from None
+
+
 @contextmanager
 def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
     """A binary stream that becomes `path` when the block ends well; what was there before stays until then. With
@@ -98,6 +108,7 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
         if parents:
             path.parent.mkdir(parents=True, exist_ok=True)
         path = path.resolve() if path.is_symlink() else path
+        check_replaceable(path)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             with part.open("wb") as stream:

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
+import vplog
 from vplog import logs
 from vplog.data import Bytes, Features, Ints, Structure
 from vplog.errors import SettingsError
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
 from vplog.loops.structure import pairs_to_match, triangulate
-from vplog.results import colmap, tables
+from vplog.results import colmap, run_record, tables
 from vplog.results.staging import staged
 from vplog.run.provenance import reopened
-from vplog.storage.scratch import scratch
+from vplog.storage.folders import check_regular, is_below
+from vplog.storage.scratch import files_in, scratch
 from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
 _WRITERS = {"colmap": colmap.write_colmap, "nerfstudio": colmap.write_nerfstudio}
 FOLDERS = tuple(_WRITERS)
 """Formats that are a folder."""
+_RECORD = "export.json"
+"""What an export wrote, beside it."""
 _QUALITY = 95
 """Of the JPEGs: what they lose is below the camera's noise."""
 
@@ -54,6 +59,7 @@ def export_images(
             )
         images = colmap.PosedImages(names, camera, world_from_camera, found, _colours(made / "images", names, found))
         written = [path.relative_to(made) for path in _WRITERS[kind](made, images)]
+        run_record.write_run_json(made / _RECORD, {"vplog": vplog.__version__, "format": 1, "files": files_in(made)})
     return [str(out / path) for path in written]
 
 
@@ -91,8 +97,12 @@ def _colours(folder: Path, names: list[str], found: Structure) -> Bytes:
 
 
 def _export_in(out: Path) -> list[str]:
-    """The files of an export in a folder that a new one replaces. Raises SettingsError where there are others."""
-    ours = {"images", "sparse", "transforms.json", "points.ply"}
-    if any(not file.name.startswith(".") and file.name not in ours for file in out.iterdir()):
+    """The files of an export in a folder, by its record, which a new one replaces: scenes of others have the same
+    names. Raises SettingsError where it holds other things, and ResultError."""
+    known = run_record.is_ours(out / _RECORD)
+    if not known and any(not file.name.startswith(".") for file in out.iterdir()):
         raise SettingsError(f"{out} is a folder with other things in it, not an export. Choose another with -o.")
-    return ["images/*.jpg", "sparse/0/*.txt", "transforms.json", "points.ply"]
+    check_regular(out, _RECORD)
+    found = run_record.read_run_json(out / _RECORD).get("files") if known else []
+    names = found if isinstance(found, list) else []
+    return [_RECORD, *(escape(name) for name in names if is_below(name))]

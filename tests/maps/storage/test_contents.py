@@ -223,6 +223,13 @@ def test_a_newer_map_is_refused_in_one_line(root: Path, verb: Verb, tmp_path: Pa
             assert "version 2 of its format, and this vplog reads up to version 1. Update vplog" in said.error
 
 
+def test_what_another_program_calls_a_map_is_none(root: Path, verb: Verb, tmp_path: Path) -> None:
+    (tmp_path / "map.json").write_text('{"mine": 1}')
+    assert "map.json names no version of its format, so vplog did not write it" in verb("map", "info", tmp_path).error
+    assert "vplog did not write it" in verb("map", "merge", root, "-o", tmp_path).error
+    assert (tmp_path / "map.json").read_text() == '{"mine": 1}'
+
+
 def test_a_map_without_hashes_is_read(root: Path, verb: Verb, tmp_path: Path) -> None:
     """As an older vplog wrote it."""
     here = copied(root, tmp_path / "map")

@@ -181,13 +181,17 @@ def test_the_oldest_goes_first(tmp_path: Path) -> None:
     assert {path.name for path in (cache.root / "objects").iterdir()} == {names[0], names[3]}
     assert (tmp_path / "again").read_bytes() == bytes(1000)
     assert not cache.fetch_to(names[1], tmp_path / "gone")
-    left = cache.root / "objects" / ".half.part"
-    left.touch()
+    left, own = cache.root / "objects" / f".{names[1]}.1-1.part", cache.root / "objects" / "deep" / "own.part"
+    own.parent.mkdir()
+    for path in (left, own):
+        path.touch()
     cache.trim()
     assert left.exists()
-    os.utime(left, (0, 0))
+    for path in (left, own):
+        os.utime(path, (0, 0))
     cache.trim()
     assert not left.exists()
+    assert own.exists(), "no file of the cache"
 
 
 def test_several_read_and_trim_at_once(root: Any, cache: Cache) -> None:

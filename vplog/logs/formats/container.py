@@ -163,10 +163,6 @@ def messages_in(container: Container, channels: Collection[Channel]) -> Iterator
         yield from block.messages()
 
 
-def plural(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:
     """Counts of topics, whatever the types under one name."""
     result: Counter[str] = Counter()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from vplog.logs.formats.container import plural, topics_of
+from vplog.errors import plural
+from vplog.logs.formats.container import topics_of
 
 if TYPE_CHECKING:
     import re

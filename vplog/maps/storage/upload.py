@@ -120,7 +120,7 @@ def _rows(file: Path) -> int:
     try:
         return pq.read_metadata(file).num_rows
     except (OSError, pa.ArrowException) as error:
-        raise ResultError(f"{file} cannot be read: {str(error).splitlines()[0]}. Run again.") from None
+        raise ResultError(f"{file} cannot be read: {str(error).splitlines()[0].rstrip('.')}. Run again.") from None
 
 
 def _finish_publish(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> None:
