@@ -110,7 +110,7 @@ def test_a_drive_is_found_where_it_is(root: Path, drive: Drive, verb: Verb, tmp_
     best = [answer for answer in told["answers"] if answer["rank"] == 0]
     assert all(answer["query_stamp_ns"] == answer["stamp_ns"] for answer in best if answer["drive"] == "all")
     assert sum(answer["keyframe"] == answer["query"] for answer in best) >= 0.9 * len(best)
-    assert "views match a place" in verb(*query, "-o", out, "--threads", 1).out
+    assert "views matched to a place" in verb(*query, "-o", out, "--threads", 1).out
     assert hashlib.sha256(out.read_bytes()).hexdigest() == digest
 
 

@@ -215,6 +215,7 @@ def test_pictures_come_from_the_log_where_the_run_kept_none(
     keyframes, world = tables.read_keyframes(folder / "keyframes.parquet")
     graph, _, _ = tables.read_edges(folder / "edges.parquet", world)
     closures = tables.read_closures(folder / "closures.parquet")
+    (folder / "result.mcap").unlink()
     write_mcap(folder / "result.mcap", keyframes, world, graph, closures, tables.TableMetadata({}, ""))
     assert verb("report", folder).code == 0
     assert "<img loading" not in (folder / "report.html").read_text()

@@ -89,7 +89,7 @@ def test_messages_are_found_in_place_as_in_the_whole(
         there = walks[1].in_place(lambda start, length: data[start : start + length])
         assert defined[0] == defined[1]
         assert walks[0].__dict__.keys() == walks[1].__dict__.keys()
-        for name in ("position", "unknown", "last_ns", "counts"):
+        for name in ("position", "last_ns", "counts"):
             assert getattr(walks[0], name) == getattr(walks[1], name)
         assert (whole.channels, whole.log_ns, whole.places) == (there.channels, there.log_ns, there.places)
         for a, b in zip(whole.messages(), there.messages(), strict=True):

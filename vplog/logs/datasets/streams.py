@@ -72,7 +72,7 @@ class DataSetContainer:
             if len(one.stamp_ns) and (one.stamp_ns.min() < 0 or one.stamp_ns.max() >= _LATEST_NS):
                 raise LogError(f"The stamps of {one.channel.topic} lie outside 1970 to 2106; are they in another unit?")
         contents = self.contents()
-        notes.account.set_recorded(found.kind, by_topic(contents.counts), contents.start_ns)
+        notes.account.set_recorded(found.kind, by_topic(contents.counts), contents.start_ns, contents.end_ns)
 
     def contents(self) -> Contents:
         counts: Counter[Channel] = Counter()

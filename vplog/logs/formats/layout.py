@@ -48,6 +48,8 @@ class Chunk:
     """Messages per channel id by the index of a ROS 1 bag."""
     doubtful: bool = False
     """Damage lies between its indexes, so that they may not be all."""
+    disputed: bool = False
+    """Its own indexes and that of the bag count its messages differently."""
     damaged: bool = False
     """Not all of it could be unpacked and read."""
 
@@ -77,7 +79,7 @@ class Layout:
     def in_order(self) -> None:
         """Sort the chunks, and take back the counts of doubtful ones."""
         self.chunks.sort(key=lambda chunk: chunk.start)
-        for chunk in self.chunks:
+        for chunk in (*self.chunks, *self.missing):
             chunk.counts = {} if chunk.doubtful else chunk.counts
 
 
@@ -105,7 +107,7 @@ class ResyncSearch:
         self,
         pattern: re.Pattern[bytes],
         start: int,
-        accept: Callable[[int], bool] = lambda _: True,
+        accept: Callable[[int], bool | None] = lambda _: True,
         stop: int | None = None,
     ) -> int | None:
         """The first offset from `start` on, below `stop`, where the pattern, of at most 64 bytes, matches and
@@ -148,9 +150,8 @@ class ChunkLosses:
         self.notes.account.add("damaged_chunk", lost, (self.name, chunk.start), spans, detail)
 
     def add_unknown(self, chunk: Chunk, count: int, spans: list[Span]) -> None:
-        """Messages of channels that nothing defines."""
-        if count:
-            self.notes.account.add("unknown_channel", {"": count}, (self.name, chunk.start), spans)
+        """Messages of channels that nothing defines so far; none where they are defined by now."""
+        self.notes.account.add("unknown_channel", {"": count} if count else {}, (self.name, chunk.start), spans)
 
     def add_missing(self, found: Mapping[str, int], span: Span, detail: str) -> dict[str, int]:
         """The chunks in damaged bytes, of a file whose messages cover `span`. Messages by topic, found or lost."""

@@ -35,6 +35,8 @@ REASONS = {
 """Every reason a message is lost for, as it follows `3 messages`."""
 _MOST_SPANS = 64
 """Spans that one loss lists; the last of more reaches over the rest."""
+_FARTHEST_NS = 86_400 * 10**9
+"""ns before and behind a log in which messages may be lost that it began or ended with: a day."""
 _NAMED = 4
 """Topics that a sentence names."""
 
@@ -76,6 +78,8 @@ class LossAccount:
 
     start_ns: int | None = None
     """Log time that sentences count from."""
+    end_ns: int = 0
+    """Log time of the last message that was found."""
     _recorded: dict[str, dict[str, int]] = field(default_factory=dict)
     """Messages by topic of each file, as far as known."""
     _found: dict[tuple[str, str], dict[tuple[str, int], _Lost]] = field(default_factory=dict)
@@ -123,9 +127,11 @@ class LossAccount:
         """What was found so far; workers that decode images may add to it meanwhile."""
         return {key: places.copy() for key, places in self._found.copy().items()}
 
-    def set_recorded(self, file: str, recorded: Mapping[str, int], start_ns: int) -> None:
-        """Set how many messages of each topic a file recorded, by its own statistics, and the first log time."""
+    def set_recorded(self, file: str, recorded: Mapping[str, int], start_ns: int, end_ns: int = 0) -> None:
+        """Set how many messages of each topic a file recorded, by its own statistics, and the first and last log
+        time."""
         self._recorded[file] = dict(recorded)
+        self.end_ns = max(self.end_ns, end_ns)
         if start_ns:
             self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
 
@@ -155,7 +161,12 @@ class LossAccount:
         if reason == "cut" and spans and end_ns is not None:
             spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
         detail = " ".join(dict.fromkeys(lost.detail for _, _, lost in left_open))
-        self.add(reason, short or {"": 0}, key, spans, detail)
+        counted = {
+            topic: places[key].messages or 0
+            for (r, topic), places in self._found.items()
+            if r == reason and key in places
+        }  # of the same place
+        self.add(reason, Counter(short) + Counter(counted) or {"": 0}, key, spans, detail)
         self._settled.update((reason, key) for reason, key, _ in left_open)
         return {}
 
@@ -195,9 +206,21 @@ class LossAccount:
             lost = [places[key] for key in sorted(places)]
             if lost:
                 messages = None if None in (counts := [one.messages for one in lost]) else sum(n or 0 for n in counts)
-                spans = tuple(merged([span for one in lost for span in one.spans]))
+                spans = tuple(merged([span for one in lost for span in self._in_log(reason, one.spans)]))
                 result.append(Loss(reason, topic, messages, recorded.get(topic), spans, lost[0].detail))
         return result
+
+    def _in_log(self, reason: str, spans: list[Span]) -> list[Span]:
+        """The spans without what is far from the log: stamps that damage has changed."""
+        start, end = self.start_ns, max(self.start_ns or 0, self.end_ns)
+        if reason not in _HOW_MANY_OPEN:
+            return spans
+        spans = [(a or b, b) for a, b in spans if b]  # 0 is no time
+        if start is None:
+            return spans
+        least, most = start - _FARTHEST_NS, end + _FARTHEST_NS
+        ends = [(max(a, min(start, b)) if a < least else a, min(b, max(end, a)) if b > most else b) for a, b in spans]
+        return [(a, b) for a, b in ends if a <= most and b >= least]
 
     @property
     def sentences(self) -> list[str]:
@@ -231,6 +254,24 @@ def _count(loss: Loss) -> str:
     if loss.messages is None:
         return ""
     return f" {loss.messages}" + (f" of {loss.of}" if loss.of is not None else "")
+
+
+def sampled(log_ns: Collection[int]) -> list[int]:
+    """The first, the middle and the last time of a chunk, one of which may be damaged."""
+    ordered = sorted(log_ns)
+    return [ordered[at] for at in (0, len(ordered) // 2, -1)] if ordered else []
+
+
+def main_span(times: Collection[int]) -> Span:
+    """Where most of these log times lie, without a day between two of them: damage may have put others anywhere."""
+    runs: list[list[int]] = [[0]] if not times else []
+    for time_ns in sorted(times):
+        if runs and time_ns - runs[-1][-1] <= _FARTHEST_NS:
+            runs[-1].append(time_ns)
+        else:
+            runs.append([time_ns])
+    longest = max(runs, key=len)
+    return longest[0], longest[-1]
 
 
 def merged(spans: list[Span]) -> list[Span]:

@@ -44,8 +44,6 @@ class ChunkReader:
         all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
         `channels`."""
         self.position = 0
-        self.unknown = 0
-        """Messages of channels that nothing defined so far."""
         self.last_ns: int | None = None
         """Log time of the last message, on whatever channel."""
         self.number, self.end, self._channels, self._define = number, end, channels, define
@@ -110,8 +108,6 @@ class ChunkReader:
                 if channel_id in used:
                     place = self.number, base + start, base + stop
                     self._rows.append((used[channel_id], log_ns, shift + start, shift + stop, place))
-                elif channel_id not in self._channels:
-                    self.unknown += 1
             elif opcode in _DEFINES:
                 self._learn(opcode, data[at + RECORD.size : stop])
             at = stop

@@ -16,6 +16,7 @@ from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
 from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, topics_of
 from vplog.logs.formats.layout import ChunkLosses
+from vplog.logs.formats.loss_account import main_span, sampled
 from vplog.logs.formats.mcap_chunk import ChunkReader
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.storage.remote_path import RemotePath
@@ -44,6 +45,8 @@ class McapFile:
         self._schemas: dict[int, str] = {0: ""}
         self._doubtful: set[tuple[int, int]] = set()
         """Opcodes and ids of schemas and channels from damaged chunks, until a sound one repeats it."""
+        self._unread: dict[int, str] = {}
+        """What is said of each chunk that was found damaged."""
         self._layout = read_layout(self._file, length, self._define, self._name)
         self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
         self._local = not isinstance(path, RemotePath)
@@ -66,12 +69,11 @@ class McapFile:
         counts = dict.fromkeys(self._channels.values(), 0)
         for channel_id in by_id.keys() & self._channels.keys():
             counts[self._channels[channel_id]] += by_id[channel_id]
-        span = (times[0], times[1]) if times else (0, 0)
-        self._account_for(by_topic(counts), span)
-        return Contents(dict(sorted(counts.items())), *span)
+        self._account_for(by_topic(counts), main_span(times))
+        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
 
     def _counted(self, unpack_all: bool) -> tuple[Counter[int], list[int]]:
-        """Messages by channel id, and the first and last log time."""
+        """Messages by channel id, and log times of each chunk, the first and last among them."""
         counts: Counter[int] = Counter()
         times: list[int] = []
         for number, chunk in enumerate(self._layout.chunks):
@@ -81,10 +83,9 @@ class McapFile:
             else:
                 data = self._data(number)
                 reader = ChunkReader(number, len(data), self._channels, self._define, None, cut=chunk.cut)
-                times += reader.whole(data).log_ns
+                times += sampled(reader.whole(data).log_ns)
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
-            times = [min(times), max(times)] if times else []
         return counts, times
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
@@ -112,6 +113,8 @@ class McapFile:
     def _account_for(self, found: dict[str, int], span: tuple[int, int]) -> None:
         """What was not found, and how much of what was recorded that is."""
         layout, account, name = self._layout, self._notes.account, self._name
+        for number in self._unread:  # more channels may be defined by now
+            self._add_unread(number)
         recorded = topics_of(layout.recorded, self._channels)
         total = self._losses.add_missing(found, span, "")
         for start, stop in layout.gaps:
@@ -122,7 +125,7 @@ class McapFile:
             account.add("damaged_bytes", None, (name, layout.unknown_at), [span], detail)
         self._losses.add_end(sum(found.values()), [(span[1], span[1])])
         whole = layout.cut_at is None and not layout.gaps
-        account.set_recorded(name, recorded or (total if whole or layout.missing else {}), span[0])
+        account.set_recorded(name, recorded or (total if whole or layout.missing else {}), *span)
         unexplained = account.reconcile({name}, recorded, found)
         if unexplained and sum(recorded.values()) > sum(total.values()):  # else it names other topics
             detail = f"The statistics of {name} count more messages than it holds."
@@ -169,10 +172,10 @@ class McapFile:
         if damaged:
             last_ns = chunk.first_ns if reader.last_ns is None else reader.last_ns
             span = min(last_ns, chunk.last_ns), chunk.last_ns
-            short = {i: n - counts[i] for i, n in chunk.counts.items() if i in self._channels}
+            short = {i: n - counts[i] for i, n in chunk.counts.items()}
             self._losses.add_chunk(chunk, short, [span], "; the rest of it is left out")
-        else:
-            self._losses.add_unknown(chunk, reader.unknown, [(chunk.first_ns, chunk.last_ns)])
+        unknown = sum(count for channel_id, count in counts.items() if channel_id not in self._channels)
+        self._losses.add_unknown(chunk, unknown, [(chunk.first_ns, chunk.last_ns)])
         return damaged
 
     def _unpack(self, number: int) -> bytes:
@@ -197,9 +200,13 @@ class McapFile:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and at + length <= len(data):
                 self._define(opcode, data[at : at + length], doubtful=True)
             at += length
+        self._unread[number] = f", left out: {error}"
+        self._add_unread(number)
+
+    def _add_unread(self, number: int) -> None:
         chunk = self._layout.chunks[number]
         span = chunk.first_ns, max(chunk.first_ns, chunk.last_ns)
-        self._losses.add_chunk(chunk, chunk.counts, [span], f", left out: {error}")
+        self._losses.add_chunk(chunk, chunk.counts, [span], self._unread[number])
 
     def _is_cached(self, number: int) -> bool:
         """Parts of what is not packed can be read again by themselves, unless each costs a request."""

@@ -34,6 +34,8 @@ _FOOTER = struct.Struct("<BQQQI")
 """Opcode 2, length 20, starts of the summary and of its offsets, CRC; the magic follows it, and the file ends."""
 _ENTRY = 16
 """Bytes of an entry of a message index: time and offset, 8 each."""
+_LEAST_CHUNK = RECORD.size + _CHUNK_HEAD.size + 8
+"""Bytes of a chunk record without data."""
 _MAX_DEFINITION = 16 * 2**20
 """Bytes of a schema or channel record that are read; the largest real schemas are some 100 kB."""
 _MAX_SUMMARY = 64 * 2**20
@@ -67,8 +69,11 @@ _SHAPES: dict[int, tuple[int, ...]] = {
     Opcode.DATA_END: (4,),
 }
 """Fields of each kind of record but messages: bytes of numbers, or _U32, _U64."""
+_OUTSIDE = _SHAPES.keys() - {Opcode.SCHEMA, Opcode.CHANNEL}
 _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
+_CHUNKS = re.compile(rb"[\x06\x07].{5}\x00{3}", re.DOTALL)
+"""The opcode of a chunk or a message index, and a length below 2^40 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
 """The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
 
@@ -162,10 +167,10 @@ class _LayoutReader:
             counts[channel_id] = (stop - position - RECORD.size - 6) // _ENTRY
         return counts
 
-    def _bounds(self, position: int) -> tuple[int, int]:
+    def _bounds(self, position: int, damaged: int = 2) -> tuple[int, int]:
         """Opcode of the record at `position` and where it stops, either as what it must have been where one of them is
         damaged; opcode 0, which the specification has as invalid, where there is none. A chunk may go on behind the end
-        of the file."""
+        of the file. So many records behind it may be `damaged` too."""
         head = self.at(position, _INDEX_HEAD.size)
         if len(head) < RECORD.size:
             return 0, 0
@@ -184,12 +189,23 @@ class _LayoutReader:
             if agrees:
                 return kind, stop
         by_fields = start + (self._length_by_fields(opcode, start) or 0)
-        for end in sorted({stop, by_fields}):
+        ends = sorted({stop, by_fields, self._entries_stop(start) if opcode == _MESSAGE_INDEX else stop})
+        for end in ends:
             if ((opcode in _SHAPES and end > start) or end == stop) and self._is_record(end, behind=opcode):
+                return opcode, end
+        for end in ends if damaged and opcode in _SHAPES else ():
+            if end > start and self._bounds(end, damaged - 1)[0] in (_OUTSIDE if self._chunked else _SHAPES):
                 return opcode, end
         if (0 < by_fields < stop or opcode >= _PRIVATE) and self._is_record(stop, behind=opcode, longer=True):
             return opcode, stop  # with fields of a later version, which are ignored
         return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
+
+    def _entries_stop(self, start: int) -> int:
+        """Where the entries of a message index stop, by their times, which are those of its chunk."""
+        chunk, at = self._indexing, start + 6
+        while chunk and chunk.first_ns <= int.from_bytes(self.at(at, 8), "little") <= chunk.last_ns > 0:
+            at += _ENTRY
+        return at
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
         """Bytes of a record whose fields begin at `start`, by the lengths among them."""
@@ -287,6 +303,7 @@ class _LayoutReader:
         if self._summary_start is not None and not self._indexed:
             self._read_summary(self._summary_start)
         chunks, found = self.layout.chunks, None
+        self._chunked |= not chunks and self._search.first(_CHUNKS, position + 1, self._is_record) is not None
         if not self._chunked and chunks and chunks[-1].stop > before and not self._is_message_head(position):
             chunks[-1].stop, position = before, before
             if chunks[-1].start == before:
@@ -308,7 +325,8 @@ class _LayoutReader:
         if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
             self._indexing = Chunk(position, found)
             self.layout.missing.append(self._indexing)
-        self.layout.gaps.append((position, found))
+        if found - position >= (_LEAST_CHUNK if self._chunked else RECORD.size + _MESSAGE_HEAD.size):
+            self.layout.gaps.append((position, found))  # else no message has room in it
         return found
 
     def check_summary(self) -> None:

@@ -9,6 +9,7 @@ from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
 from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, topics_of
 from vplog.logs.formats.layout import ChunkLosses
+from vplog.logs.formats.loss_account import main_span, sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
 
@@ -41,13 +42,23 @@ class Ros1Bag:
         self._data = Chunks(self._unpack, self._add_damaged_chunk, sizes.__getitem__, lambda _: True, local)
 
     def contents(self) -> Contents:
-        """Counted by the indexes; a chunk without is unpacked."""
-        if self._doubtful.keys() - self._channels.keys():
+        """Counted by the indexes; a chunk without is unpacked, as all are where a connection is not defined."""
+        by_id, times = self._counted()
+        if (by_id.keys() | self._doubtful.keys()) - self._channels.keys():
             for row in range(len(self._layout.chunks)):  # which define their connections too
                 self._messages(row, self._data(row))
             for connection, channel in self._doubtful.items():
                 self._channels.setdefault(connection, channel)
-        counts: Counter[Channel] = Counter()
+            by_id, times = self._counted()
+        counts = Counter(dict.fromkeys(self._channels.values(), 0))
+        for connection in by_id.keys() & self._channels.keys():
+            counts[self._channels[connection]] += by_id[connection]
+        self._account_for(by_topic(counts), main_span(times))
+        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
+
+    def _counted(self) -> tuple[Counter[int], list[int]]:
+        """Messages by connection, and log times of each chunk, the first and last among them."""
+        counts: Counter[int] = Counter()
         times: list[int] = []
         for row, chunk in enumerate(self._layout.chunks):
             if chunk.counts and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
@@ -59,18 +70,13 @@ class Ros1Bag:
                 own = [log_ns for _, log_ns, _, _ in messages]
                 chunk.first_ns = min([*own, chunk.first_ns] if chunk.first_ns else own, default=0)
                 chunk.last_ns = max([*own, chunk.last_ns])
-                times += [min(own), max(own)] if own else []
+                times += sampled(own)
             if chunk.damaged:
                 found = Counter(found) | Counter(chunk.counts)
-            if chunk.listed and not chunk.damaged and found != chunk.listed:
+            if chunk.listed and (chunk.disputed or not chunk.damaged) and found != chunk.listed:
                 self._layout.recorded = {}  # the bag's index is what is damaged
-            for connection in found.keys() & self._channels.keys():
-                counts[self._channels[connection]] += found[connection]
-        span = min(times, default=0), max(times, default=0)
-        counted = dict.fromkeys(self._channels.values(), 0) | counts
-        result = Contents(dict(sorted(counted.items())), *span)
-        self._account_for(by_topic(result.counts), span)
-        return result
+            counts.update(found)
+        return counts, times
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
         wanted, chunks = set(channels), self._layout.chunks
@@ -93,7 +99,7 @@ class Ros1Bag:
         self._losses.add_end(sum(found.values()), [(span[1], span[1])] if span[1] else [])
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         listed = topics_of(layout.recorded, self._channels)
-        self._account.set_recorded(self._name, listed or (total if whole else {}), span[0])
+        self._account.set_recorded(self._name, listed or (total if whole else {}), *span)
         self._account.reconcile({self._name}, listed, found)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:

@@ -45,6 +45,8 @@ _HEAD = 256
 """Bytes in which the head of a record ends, but for a connection's of a long topic."""
 _NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn_count|chunk_count|chunk_pos)=")
 """Names in the header of a chunk, and those that no chunk has."""
+_HEADS = re.compile(rb"compression=|(?<!_)count=")
+"""A name in the header of every chunk, and of every index; neither is in the records that lie in chunks."""
 
 
 _Head = tuple[dict[bytes, bytes] | None, int, int]
@@ -79,7 +81,7 @@ class _LayoutReader:
     def records(self, position: int) -> None:
         while position < self._length or position == len(MAGIC):
             header, start, stop = self._head(position)
-            inside = header is not None and number(header, b"op") == _CHUNK
+            found, inside = None, header is not None and number(header, b"op") == _CHUNK
             if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
                 found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
                 if header is None or not self._is_sound(header):
@@ -95,6 +97,8 @@ class _LayoutReader:
                     continue
                 stop = self._stop(header, start, stop, found)
             self._record(number(header, b"op"), header, position, start, stop)
+            if stop == found:
+                self._miss_chunk(start, stop, self._heads(start, stop))
             position = stop
         if position > self._length or (self._index_at > self._length and not self._infos):
             self.layout.cut_at = self._length
@@ -107,7 +111,7 @@ class _LayoutReader:
             return start + length
         if found is None or (stop < found and self._is_damaged_head(stop)):
             return stop
-        self.layout.gaps.append((stop, found))
+        self.layout.gaps.append((start, found))
         return found
 
     def _is_damaged_head(self, position: int) -> bool:
@@ -120,11 +124,23 @@ class _LayoutReader:
         """Take note of bytes without a record, and of the chunk that may lie in them."""
         self.layout.gaps.append((position, found))
         named = _NAME.search(self.at(position, min(_HEAD, found - position)))
-        if self._indexing is not None and named is not None and named[1] is None:
+        in_chunk = named is None or named[1] is not None
+        self._miss_chunk(position, found, self._heads(position, found), in_chunk)
+
+    def _miss_chunk(self, position: int, found: int, heads: list[int], in_chunk: bool = False) -> None:
+        """Doubt the chunk before damaged bytes, unless they begin in the next one, and take note of one in them."""
+        if self._indexing is not None and not in_chunk:
             self._indexing.doubtful = True
-        if named is None or named[1] is not None:
-            self._indexing = Chunk(position, found, record=position)
+        if in_chunk or _CHUNK in heads:
+            own = heads[heads.index(_CHUNK) + 1 :] if _CHUNK in heads else heads
+            self._indexing = Chunk(position, found, record=position, doubtful=bool(own))
             self.layout.missing.append(self._indexing)
+
+    def _heads(self, start: int, stop: int) -> list[int]:
+        """Kinds of the chunks and indexes in damaged bytes, by the names that are left of them."""
+        found: list[int] = []
+        self._search.first(_HEADS, start, lambda at: found.append(_CHUNK if self.at(at, 3) == b"com" else _INDEX), stop)
+        return found
 
     def finish(self) -> None:
         """Hold what was found against the bag's index."""
@@ -135,27 +151,31 @@ class _LayoutReader:
         for offset, info in sorted(self._infos.items()):
             if (chunk := found.get(offset)) is not None:
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
-                chunk.doubtful |= bool(chunk.counts) and chunk.counts != info.counts
+                if chunk.counts and chunk.counts != info.counts and not chunk.doubtful:
+                    chunk.doubtful = chunk.disputed = True
                 chunk.listed = info.counts
-                chunk.counts = chunk.counts or info.counts
+                chunk.counts = chunk.counts or ({} if info.doubtful else info.counts)
             elif self._is_chunk(offset):  # it was jumped over
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
             elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
-                skipped.pop(gaps[0], None)  # by the index records behind it, the last chunk in the gap
+                own = skipped.pop(gaps[0], None)  # by the index records behind it, the last chunk in the gap
+                if own and own.counts and not own.doubtful and own.counts != info.counts:
+                    info.doubtful, self._index_sound = True, False
                 skipped[offset] = info
             else:
                 listed = False
         if self._index_sound and len(self._infos) == self._chunk_count:
             layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
-        layout.in_order()
         layout.missing = [
             chunk
             for offset, chunk in sorted(skipped.items())
             if offset in self._infos or not self._infos or (chunk.counts and not listed)
         ]
-        if layout.cut_at is not None and self._index_at and layout.cut_at >= self._index_at and not layout.missing:
+        layout.in_order()
+        ended = self._infos or 0 < self._index_at <= (layout.cut_at or 0)
+        if layout.cut_at is not None and ended and not layout.missing:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at
 
     def _head(self, position: int) -> _Head:
@@ -240,7 +260,8 @@ class _LayoutReader:
         for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
             if 0 < count <= self._length:
                 info.counts[connection] = count
-        self._index_sound &= len(info.counts) == number(header, b"count") and position not in self._infos
+        info.doubtful = len(info.counts) != number(header, b"count")
+        self._index_sound &= not info.doubtful and position not in self._infos
         self._infos[position] = info
 
 

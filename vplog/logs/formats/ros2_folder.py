@@ -68,7 +68,7 @@ class Chain:
         spans = [(contents.start_ns, contents.end_ns) for contents in found if contents.messages]
         start_ns = min((start for start, _ in spans), default=0)
         if self._metadata is not None and self._metadata.recorded:
-            self._reconcile(self._metadata, by_topic(counts), start_ns)
+            self._reconcile(self._metadata, by_topic(counts))
         return Contents(dict(sorted(counts.items())), start_ns, max((end for _, end in spans), default=0))
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
@@ -79,7 +79,7 @@ class Chain:
     def read(self, place: Place) -> Octets:
         return self._parts[place[0]].read(place[1:])
 
-    def _reconcile(self, known: Metadata, found: dict[str, int], start_ns: int) -> None:
+    def _reconcile(self, known: Metadata, found: dict[str, int]) -> None:
         """Count what is lost by what the metadata say."""
         account, files = self._notes.account, [*(file.name for file in known.files), *known.missing]
         unexplained = account.reconcile(files, known.recorded, found, known.end_ns or None)
@@ -88,8 +88,8 @@ class Chain:
             self._notes.add(f"metadata.yaml counts {more} messages more than its undamaged storage files hold.")
         elif account.losses:
             for file in files:
-                account.set_recorded(file, {}, start_ns)
-            account.set_recorded("metadata.yaml", known.recorded, start_ns or known.start_ns)
+                account.set_recorded(file, {}, 0)
+            account.set_recorded("metadata.yaml", known.recorded, account.start_ns or known.start_ns)
 
 
 class ZstdMessages:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks
 from vplog.logs.formats.layout import ResyncSearch
+from vplog.logs.formats.loss_account import main_span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -60,7 +61,7 @@ class SqliteBag:
 
     def contents(self) -> Contents:
         by_id = Counter(dict.fromkeys(self._topics, 0))
-        times: list[int] = []
+        times: dict[int, list[int]] = {}
         query = "SELECT topic_id, count(*), min(timestamp), max(timestamp), max(rowid) FROM messages GROUP BY topic_id"
         try:
             found = self._db.execute(query).fetchall()
@@ -72,9 +73,10 @@ class SqliteBag:
             rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
         for topic, count, first, last in rows:
             by_id[topic] += count
-            if topic in self._topics:
-                times = [min(*times, _integer(first), 2**63), max(*times, _integer(last), -(2**63))]
-        start_ns, end_ns = times or (0, 0)
+            known = [time_ns for time_ns in (*times.get(topic, []), first, last) if isinstance(time_ns, int)]
+            times[topic] = [min(known), max(known)] if known else []
+        log_span = main_span([time_ns for known in times.values() for time_ns in known])
+        ends = [time_ns for topic in times.keys() & self._topics.keys() for time_ns in times[topic]]
         account, name = self._notes.account, self._name
         if missing := 0 if self._damaged else self._missing_by_index(by_id.total()):
             self._damaged = True
@@ -85,8 +87,8 @@ class SqliteBag:
             counts[channel] += by_id.pop(topic)
         if unknown := by_id.total():
             account.add("unknown_channel", {"": unknown}, (name, 0), [])
-        account.set_recorded(name, {} if self._damaged else by_topic(counts), start_ns)
-        return Contents(dict(sorted(counts.items())), start_ns, end_ns)
+        account.set_recorded(name, {} if self._damaged else by_topic(counts), *log_span)
+        return Contents(dict(sorted(counts.items())), min(ends, default=0), max(ends, default=0))
 
     def _missing_by_index(self, rows: int) -> int:
         """Messages that an index of the table lists and the table, in which `rows` are found, has not."""
@@ -111,7 +113,8 @@ class SqliteBag:
             if isinstance(data, bytes) and isinstance(time_ns, int):
                 yield Message(self._topics[topic], time_ns, data, (row, time_ns))
             else:
-                self._add_damaged_row(row, f"{self._name} is damaged: row {row} holds no message.")
+                detail = f"{self._name} is damaged: row {row} holds no message."
+                self._add_damaged_row(row, detail, (row, topic, time_ns))
 
     def read(self, place: Place) -> bytes:
         found = self._row(place[0], "data", " AND timestamp = ?", place[1])
@@ -210,9 +213,10 @@ class SqliteBag:
         except _DAMAGE:
             return None
 
-    def _add_damaged_row(self, row: int, detail: str) -> bool:
-        """A message whose topic and time can be read, but not the rest; others were missed when they were counted."""
-        found = self._row(row, "rowid, topic_id, timestamp")
+    def _add_damaged_row(self, row: int, detail: str, found: tuple | None = None) -> bool:
+        """A message whose topic and time can be read, but not the rest; others were missed when they were counted.
+        `found` are its number, topic and time, where known."""
+        found = found or self._row(row, "rowid, topic_id, timestamp")
         if found is not None and found[1] in self._topics:
             span, lost = (_integer(found[2]), _integer(found[2])), {self._topics[found[1]].topic: 1}
             self._notes.account.add("damaged_chunk", lost, (self._name, row), [span], detail)
