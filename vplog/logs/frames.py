@@ -241,7 +241,7 @@ class ImageReader:
     def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
         """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
         self._container, self._image = container, image
-        self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
+        self._video = None if image is None or not codec else self._stream(image, codec, content)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """What was read, without the images before a video's first key frame."""
 
@@ -304,10 +304,15 @@ class ImageReader:
             raise failures[0]
         return None
 
-    def _stream(self, image: Channel, codec: str, places: list[Place]) -> VideoStream:
-        def payload(row: int) -> bytes:
+    def _stream(self, image: Channel, codec: str, content: Content) -> VideoStream:
+        places, images = content.stream, {*content.stream_rows.tolist()}
+
+        def payload(row: int) -> bytes | None:
+            message = self._container.read(places[row])
+            if row and row not in images and message == self._container.read(places[row - 1]):
+                return None  # recorded twice: a decoder must not have it twice
             with suppress(BadMessageError):
-                return bytes(image_in(image, self._container.read(places[row])).data)
+                return bytes(image_in(image, message).data)
             return b""
 
         return VideoStream(codec, image.topic, payload, len(places))
