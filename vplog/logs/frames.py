@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 _HALF = 127
 """Of a mask of 0 and 255 that was resampled."""
 _TRIED = 10
-"""Images tried for the size of all; a drive whose first second is damaged is not usable."""
+"""Images tried for the size of all, the first ones and as many spread over the drive: a video whose first key frame is
+damaged has none before the next."""
 
 
 def image_in(channel: Channel, data: Octets) -> ImageMessage:
@@ -279,17 +280,18 @@ class ImageReader:
         """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
         does, and where it is a video that needs PyAV."""
         stream, reason = self._video if channel == self._image else None, ""
-        for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
+        found = [(row, place) for row, place in enumerate(places) if place is not None]
+        for row, place in [*found[:_TRIED], *found[_TRIED :: max(len(found) // _TRIED, 1)]]:
             try:
                 message = image_in(channel, self._container.read(place))
                 if stream is not None:
-                    frame = stream.frame(int(self.content.stream_rows[i]))
+                    frame = stream.frame(int(self.content.stream_rows[row]))
                     return message.frame, (frame.width, frame.height)
                 image = pixels.grey(message)
                 return message.frame, (image.shape[1], image.shape[0])
             except BadMessageError as error:
                 reason = str(error)
-        raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another --image-topic.")
+        raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another with --image-topic.")
 
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""

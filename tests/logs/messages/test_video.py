@@ -194,8 +194,9 @@ def test_damage_ends_at_the_next_key_frame() -> None:
     assert lost == [*range(GROUP + 3, 2 * GROUP), *range(2 * GROUP + 5, 3 * GROUP)]
 
 
-@pytest.mark.parametrize("codec", ["h264", "hevc"])
-@pytest.mark.parametrize("b_frames", [0, 3])
+@pytest.mark.parametrize(
+    ("codec", "b_frames"), [("h264", 0), ("h264", 3), ("hevc", 0), ("hevc", 3), ("vp9", 0), ("av1", 0)]
+)
 def test_a_missing_packet_gives_no_wrong_picture(codec: str, b_frames: int) -> None:
     payloads = packets(codec, b_frames)
     order = shown(codec, b_frames)
@@ -326,6 +327,32 @@ def test_frames_before_the_first_key_frame_are_left_out_and_counted(codec: str, 
     log = logs.open(write_raw(tmp_path / "none.mcap", group))
     with pytest.raises(LogError, match="No image of /video can be read"):
         log.stamps()
+
+
+@pytest.mark.parametrize("codec", ["h264", "vp9", "av1"])  # FFmpeg's H.265 does not tell
+def test_half_a_packet_is_no_picture(codec: str) -> None:
+    payloads = list(packets(codec))
+    for row in (GROUP + 3, 2 * GROUP):
+        payloads[row] = payloads[row][: len(payloads[row]) // 2]
+    video, lost = stream(codec, payloads), []
+    for row in range(COUNT):
+        try:
+            assert close(video.frame(row), row), row
+        except BadMessageError:
+            lost.append(row)
+    assert {*lost} <= {*range(GROUP + 3, 3 * GROUP)}
+    assert {GROUP + 3, 2 * GROUP} <= {*lost}
+
+
+@pytest.mark.parametrize("codec", ENCODERS)
+def test_a_damaged_first_group_costs_no_other(codec: str, tmp_path: Path) -> None:
+    payloads = list(packets(codec))
+    payloads[0] = payloads[0][: len(payloads[0]) * 3 // 4]
+    log = logs.open(write_raw(tmp_path / "drive.mcap", messages("foxglove", payloads, codec=codec)))
+    assert (log.camera().width, log.camera().height) == (WIDTH, HEIGHT)
+    sound = log.stamps()[log.stamps() >= START_NS + GROUP * PERIOD_NS]
+    for frame, row in zip(log.frames(sound), range(GROUP, COUNT), strict=True):
+        assert close(frame.decode().image, row)
 
 
 def test_undecodable_frames_say_why_and_the_rest_goes_on(tmp_path: Path) -> None:

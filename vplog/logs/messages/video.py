@@ -1,8 +1,8 @@
 """Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
 
 Decoding runs forward only: for frames in order of time every packet is decoded at most once, and stretches between key
-frames without a frame of interest not at all. Behind a damaged or missing packet, which VP9 and AV1 do not show,
-nothing is decoded up to the next key frame.
+frames without a frame of interest not at all. Behind a damaged or missing packet nothing is decoded up to the next key
+frame.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ _CODECS = {
 }
 """What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
 _NAMES = dict(_CODECS.values())
-_DECODERS = {"av1": "libdav1d"}
-"""FFmpeg's decoder where that of the codec's own name needs hardware: its `av1` is for graphics cards alone."""
+_DECODERS = {"av1": "libdav1d", "vp9": "libvpx-vp9"}
+"""FFmpeg's decoder where that of the codec's own name does not do: its `av1` is for graphics cards alone, and its `vp9`
+shows a wrong picture behind a damaged or missing packet."""
 MAX_PIXELS = 2**25
 """px of a video frame that is decoded: 8K (7680 x 4320); a decoder keeps up to 16 of them."""
 _DELAY = 64
