@@ -16,7 +16,7 @@ from vplog.logs.cameras import camera_from_image
 from vplog.logs.masks import resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.pixels import depth_m, drive_levels, spread
+from vplog.logs.messages.pixels import depth_m, levels_of, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
 from vplog.masking import filled
@@ -269,7 +269,7 @@ class ImageReader:
     def _levels(self) -> Levels | None:
         """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
         places = self.content.places
-        return None if self._image is None else drive_levels(self._sampled(self._image, places[:: spread(len(places))]))
+        return None if self._image is None else levels_of(self._sampled(self._image, places[:: spread(len(places))]))
 
     def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
         for place in places:
