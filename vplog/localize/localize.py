@@ -1,4 +1,4 @@
-"""Localisation of pictures: the likeliest places, the pose by their landmarks, and what is said of each picture."""
+"""Localisation of pictures: the likeliest places, and the pose by their landmarks."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class _View:
 
     world_from_camera: Floats
     row: int
-    """Of its frame among those with a pose."""
+    """Row of its frame among those with a pose."""
     motion: Floats
     """(6, 6) covariance of the motion since the reference before it."""
 
@@ -131,7 +131,7 @@ class _Tracker:
         self.reference = self._reference(frame)
 
     def _usable(self, frame: Frame, px: np.ndarray) -> Points:
-        """Those of the points that have a ray and a depth."""
+        """The points that have a ray and a depth."""
         points = self.sensor.measure(frame, px)
         return points.rows(np.isfinite(points.rho) & np.isfinite(points.noise).all(axis=(1, 2)))
 

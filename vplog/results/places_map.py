@@ -164,8 +164,7 @@ def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
     """The columns of a drive's places."""
     number = names.index(part.drive)
     drive = pa.DictionaryArray.from_arrays(pa.array([number] * len(part.keyframe), pa.int32()), pa.array(names))
-    quaternions = se3.quaternion(part.world_from_body[:, :3, :3])
-    where = np.ascontiguousarray(np.concatenate([part.world_from_body[:, :3, 3], quaternions], axis=1).T)
+    where = np.ascontiguousarray(se3.vectors(part.world_from_body).T)
     packed = [_packed(one) for one in _values(part.descriptors)]
     return [drive, pa.array(part.keyframe), pa.array(part.stamp_ns), *map(pa.array, where), *packed]
 
@@ -179,7 +178,7 @@ class PlacesHeader:
     descriptor: str
     """Names and types of its columns, as JSON."""
     drives: dict[str, dict[str, Any]]
-    """What is known of each drive, in order: `inputs`, `topics`, `earth`."""
+    """By drive, in order: its `inputs`, `topics` and `earth`, as far as known."""
 
 
 def read_places_header(path: Path) -> PlacesHeader:

@@ -54,7 +54,7 @@ class Outcome:
     closures: int
     """Loop closures with more than half their weight."""
     places: int
-    """Those of them that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
+    """Closures that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
 
 
 def outcome_of(folder: Path, spacing: int) -> Outcome:

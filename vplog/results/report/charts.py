@@ -32,7 +32,7 @@ class Chart:
     """An SVG picture."""
 
     label: str
-    """What it shows, for who cannot see it."""
+    """Text alternative, for screen readers."""
     paths: list[tuple[str, str]]
     """Classes and data of each path, in the order they are painted."""
     texts: list[Label]
@@ -46,7 +46,7 @@ def subsampled(rows: NDArray[Any], most: int) -> NDArray[Any]:
 
 
 def map_view(points: Floats) -> tuple[Floats, str]:
-    """(2, 3) from the world to the right and up of the map, and what that is in words.
+    """(2, 3) from the world to the right and up of the map, and its axes in words.
 
     From above where the ground is flat, else without the shortest axis; the longer of both goes to the right, which
     turns the map by 90 degrees and never mirrors it.
