@@ -84,7 +84,7 @@ def _by_odometry(
     none = np.zeros_like(step)
     known = np.ones(len(poses), bool)
     query, match = TruthAt(poses, known, settings.sigmas * np.stack(drift, 1)), TruthAt(poses, known, none)
-    cameras = (drive.camera.body_from_camera,) * 2
+    cameras = drive.camera.body_from_camera, drive.camera.body_from_camera
     posed, _, wrong, _ = pose_errors(certain, query, match, pose_bounds(poses[:, :3, 3]), cameras)
     rows = posed & certain.of(Verdict.ACCEPTED)
     return evidence(certain)[rows], wrong[rows]
