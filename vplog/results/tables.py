@@ -64,6 +64,9 @@ def column(name: str, kind: pa.DataType, unit: str, description: str, nullable: 
     return pa.field(name, kind, nullable, metadata={"unit": unit, "description": description})
 
 
+POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+
+
 def pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Field]:
     return [
         *(column(f"{prefix}t{axis}", pa.float64(), "m", f"{text}: position, {axis}.", nullable) for axis in "xyz"),
@@ -513,17 +516,14 @@ def _reading(path: Path) -> Iterator[None]:
         raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
 
 
-_POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
-
-
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
-    names = [f"{prefix}{name}" for name in _POSE_COLUMNS]
+    names = [f"{prefix}{name}" for name in POSE_COLUMNS]
     return dict(zip(names, np.ascontiguousarray(se3.vectors(poses).T), strict=True))
 
 
 def read_poses(table: pa.Table, prefix: str) -> Floats:
     """(R, 4, 4), all NaN where the row holds none."""
-    values = np.stack([_values(table, f"{prefix}{name}") for name in _POSE_COLUMNS], 1)
+    values = np.stack([_values(table, f"{prefix}{name}") for name in POSE_COLUMNS], 1)
     poses = se3.from_vectors(values)
     poses[~np.isfinite(poses).all((1, 2))] = np.nan
     return poses
