@@ -14,12 +14,12 @@ import pytest
 
 from vplog.data import ACCEPTED, Camera, Features, Keyframes, Verdict
 from vplog.execution.execution import Execution
-from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
+from vplog.run.figures.closure_view import find_agreement, find_boxes
 from vplog.verbs.explain_text import describe
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from vplog import logs
 from vplog.data import Closures, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
-from vplog.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.geometry import se3
 from vplog.results import run_record, tables
+from vplog.run.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.run.keyframes import row_of
 from vplog.run.provenance import reopened
 from vplog.stages import BoxState, Log

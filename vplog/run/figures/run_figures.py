@@ -9,12 +9,12 @@ import numpy as np
 
 from vplog.data import ACCEPTED, Verdict
 from vplog.errors import ResultError
-from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
 from vplog.results.collage import FramePanel, ReferencePanel, collage
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes
 from vplog.results.previews import jpeg, scaled_size, shrink
+from vplog.run.figures.closure_view import find_agreement, find_boxes
 from vplog.stages import BoxState
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from vplog.features.sift import SiftSettings
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
-from vplog.odometry.sensor import follow
+from vplog.run.visual_odometry.sensor import follow
 
 if TYPE_CHECKING:
     from vplog.data import Float32s, Floats, Frame
-    from vplog.odometry.sensor import Points, Sensor
+    from vplog.run.visual_odometry.sensor import Points, Sensor
 
 _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""
