@@ -442,6 +442,25 @@ def test_a_closure_is_selected_from_map_and_ledger_and_decisions_are_downloaded(
     assert fits
 
 
+def test_the_map_fits_a_window_that_becomes_narrower(browser: str, page: str, tmp_path: Path) -> None:
+    """As a phone that is turned; a map that was moved stays where it was put."""
+    fitted, moved = driven(
+        browser, page, tmp_path,
+        f"""{HELPERS} const narrow = (width) => {{
+          document.body.style.width = width + "px"; window.dispatchEvent(new Event("resize"));
+          const edge = document.createElement("canvas").getContext("2d", {{ willReadFrequently: true }});
+          edge.drawImage($("map"), 8 - $("map").width, 0);
+          return edge.getImageData(0, 0, 8, 150).data.filter((value, at) => at % 4 === 3 && value).length;
+        }};
+        const fitted = narrow(400);
+        narrow(900); pointer("pointerdown", 5, 5); pointer("pointermove", 15, 5); pointer("pointerup", 15, 5);
+        return [fitted, narrow(400)];""",
+        "--window-size=1200,900",
+    )  # fmt: skip
+    assert fitted == 0
+    assert moved > 0
+
+
 def test_a_browser_runs_nothing_of_a_strangers(verb: Verb, browser: str, hostile: Path, tmp_path: Path) -> None:
     assert verb("report", hostile).code == 0
     dom, console = opened(browser, hostile / "report.html", tmp_path, "--dump-dom")
