@@ -22,9 +22,7 @@ def predict(match_from_query: np.ndarray, points: np.ndarray) -> tuple[np.ndarra
     back = se3.inverse(match_from_query)
     here, by_pose, by_point = np.empty((len(points), 3)), np.empty((len(points), 3, 6)), np.empty((len(points), 3, 3))
     for row, point in enumerate(points):
-        assert pose_refinement._predict(
-            back[:3, :3].copy(), back[:3, 3].copy(), point, here[row], by_point[row], by_pose[row]
-        )
+        assert pose_refinement._predict(back, point, here[row], by_point[row], by_pose[row])
     return here, by_pose, by_point
 
 

@@ -181,7 +181,7 @@ def _is_rival(fit: _Fit, best: _Fit, places: Sequence[KeyframeLandmarks], settin
 def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[KeyframeLandmarks]) -> Localization:
     """The best fit, improved by the landmarks of all places that agree with it."""
     start, anchor = best.pose.match_from_query, places[best.place].world_from_camera
-    if start is None or best.pose.covariance is None:
+    if start is None:
         raise ValueError("only a pose is refined")
     agreeing = [_agreeing(query, fit, places[fit.place], anchor, start) for fit in fits if len(fit.mine)]
     points, covariance, mine = (np.concatenate([getattr(one, name) for one in agreeing]) for name in _Agreeing._fields)
