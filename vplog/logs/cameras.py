@@ -133,7 +133,8 @@ def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead
     is the image's frame_id."""
     if not body and _BODY in tree:
         body = _BODY
-        notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
+        if not ahead:
+            notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
     found = tree.between(body, frame) if body and frame else None
     if found is not None:
         return found
