@@ -32,9 +32,10 @@ from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
-from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
+from vplog.results.run_record import read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.storage.folders import check_regular
+from vplog.storage.json_records import canonical_json, plain
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
