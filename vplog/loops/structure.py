@@ -140,7 +140,7 @@ def _residuals(
     front = in_camera[:, 2] > 0
     depth = np.where(front, in_camera[:, 2], 1.0)[:, None]
     image = in_camera[:, :2] / depth
-    by_camera = np.concatenate([np.tile(np.eye(2), (len(in_camera), 1, 1)), -image[..., None]], axis=2) / depth[..., None]
+    by_camera = np.concatenate([np.tile(np.eye(2), (len(image), 1, 1)), -image[..., None]], axis=2) / depth[..., None]
     error = (px_from_ray @ (image - rays)[..., None])[..., 0]
     jacobian = px_from_ray @ by_camera @ rotation
     jacobian[~front] = 0.0
