@@ -269,7 +269,7 @@ def _grouped_bars(
             one.bar(at, mean, 0.92 * wide, color=colour, label=name)
             one.vlines(at, mean, [row[f"{score}_worst"] for row in some], color="black", linewidth=1.0)
         for x, row in zip(at, some, strict=True):
-            axes[0].annotate(mark(row), (x, row["r_at_1"]), (0, 1), textcoords="offset points", ha="center",
+            axes[0].annotate(mark(row), (x, row["r_at_1"]), (0, 2), textcoords="offset points", ha="center",
                              fontsize=6, color="#333333")  # fmt: skip
 
 
