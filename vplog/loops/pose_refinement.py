@@ -7,12 +7,13 @@ query as another such triple; poses move as match_from_query exp(d), d rotation 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numba
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from vplog.data import Floats
+from vplog.data import Bools, Floats
 from vplog.geometry import se3
 
 _HUBER = 1.5
@@ -23,33 +24,50 @@ _CONVERGED = 1e-3
 """Squared length of a step in sigmas of the pose: a thirtieth of a sigma decides nothing that follows."""
 
 
-def agreement(
-    match_from_query: Floats, points: Floats, covariance: Floats, rays: Floats, noise: Floats
-) -> tuple[Floats, Floats]:
-    """Squared Mahalanobis distances (K,) of the image errors of landmarks (K, 3), observed at (K, 2) with covariance
-    `noise` (K, 2, 2): with the landmarks' `covariance` (K, 3, 3), and without it. NaN behind the query."""
-    return _agreement(se3.inverse(match_from_query), points, covariance, rays, noise)
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """K landmarks (x, y, rho) of the match's camera, each observed by the query."""
+
+    points: Floats
+    """(K, 3)."""
+    covariance: Floats
+    """(K, 3, 3)."""
+    rays: Floats
+    """(K, 2) normalised image coordinates in the query."""
+    noise: Floats
+    """(K, 2, 2) covariance of the rays."""
+    rho: Floats
+    """(K,) inverse depth in 1/m that the query measured, NaN where it did not."""
+    variance: Floats
+    """(K,) of rho."""
+
+    def rows(self, rows: Bools) -> Matches:
+        """Some of the matches."""
+        return Matches(**{name: values[rows] for name, values in vars(self).items()})
+
+    @property
+    def cloud(self) -> Floats:
+        """(K, 3) m in the match's camera."""
+        return np.column_stack([self.points[:, :2], np.ones(len(self.points))]) / self.points[:, 2:]
 
 
-def fit(
-    match_from_query: Floats,
-    points: Floats,
-    covariance: Floats,
-    rays: Floats,
-    rho: Floats,
-    variance: Floats,
-    noise: Floats,
-) -> tuple[Floats, Floats, float]:
-    """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation.
+def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats]:
+    """Squared Mahalanobis distances (K,) of the image errors of matches: with the landmarks' covariance, and without
+    it. NaN behind the query."""
+    return _agreement(
+        se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise
+    )  # fmt: skip
 
-    Landmarks (K, 3) with covariance (K, 3, 3) were observed at (K, 2) with covariance `noise` (K, 2, 2), and where the
-    query measured them too at inverse depths `rho` (K,) with `variance` (K,), NaN elsewhere.
-    """
+
+def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
+    """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation."""
     hessian, excess = np.eye(6), 1.0
-    freedom = max(2.0 * len(points) + np.isfinite(rho).sum() - 6.0, 1.0)
+    freedom = max(2.0 * len(matches.points) + np.isfinite(matches.rho).sum() - 6.0, 1.0)
     for _ in range(_STEPS):
-        query_from_match = se3.inverse(match_from_query)
-        hessian, gradient, cost = _normal_equations(query_from_match, points, covariance, rays, rho, variance, noise)
+        hessian, gradient, cost = _normal_equations(
+            se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise,
+            matches.rho, matches.variance,
+        )  # fmt: skip
         excess = cost / freedom
         try:
             step = -np.asarray(cho_solve(cho_factor(hessian, check_finite=False), gradient), np.float64)
@@ -82,7 +100,7 @@ def _agreement(query_from_match, points, covariance, rays, noise):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(query_from_match, points, covariance, rays, rho, variance, noise):
+def _normal_equations(query_from_match, points, covariance, rays, noise, rho, variance):
     """Hessian (6, 6), gradient (6,) and robust cost of all matches in front of the query."""
     hessian, gradient, cost = np.zeros((6, 6)), np.zeros(6), 0.0
     predicted, by_point, by_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
