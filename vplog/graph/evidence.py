@@ -13,7 +13,6 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
@@ -109,7 +108,7 @@ def log_tails(chi2: Floats, d: int) -> float:
     wide = 0.5 * chi2 * (1.0 - _TAIL**-2) - d * math.log(_TAIL)
     with np.errstate(divide="ignore"):
         gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
-    return float(logsumexp(gain)) - math.log(len(gain))
+    return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:
