@@ -22,6 +22,7 @@ from vplog.execution.execution import Execution
 from vplog.settings import Settings
 from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image
+from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
 
@@ -149,7 +150,7 @@ def save_references(
             "settings": settings.model_dump(mode="json"),
         }
         part = folder / f".library.json.{os.getpid()}.part"
-        part.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(with_checksum(record), indent=2) + "\n", encoding="utf-8")
         sync_all(folder)
         put_in_place(part, folder / "library.json")
     except OSError as error:
@@ -181,6 +182,10 @@ def read_library_record(folder: Path) -> dict[str, Any]:
         ) from None
     if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
         raise LibraryError(f"{folder}/library.json lacks its hash or settings; build it again with `vplog library`.")
+    if not has_checksum(record):
+        raise LibraryError(
+            f"{folder}/library.json is damaged: its checksum does not match. Copy it back, or build it again."
+        )
     check_version(folder / "library.json", record.get("format", _FORMAT), _FORMAT, record.get("vplog"))
     return record
 

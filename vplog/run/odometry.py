@@ -14,9 +14,9 @@ from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Keyframes, Odometry
 from vplog.errors import LogError
 from vplog.masking import masked
-from vplog.odometry.visual import visual_odometry
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.run.visual_odometry.visual import visual_odometry
 
 if TYPE_CHECKING:
     from vplog.cache.stage_cache import Inputs

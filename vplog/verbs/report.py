@@ -14,12 +14,12 @@ from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
 from vplog.evaluate.closures import closure_sentences
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
-from vplog.figures.run_figures import ClosureInputs, choose_examples, draw_closures
 from vplog.geometry import se3
 from vplog.pipeline import Pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
 from vplog.results.report.page import TruthComparison
+from vplog.run.figures.run_figures import ClosureInputs, choose_examples, draw_closures
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
 from vplog.storage.remote_path import original

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.figures.canvas import as_text, saved_figure
+from vplog.run.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ import numpy as np
 from vplog.benchmark.study.charts import explain
 from vplog.benchmark.study.experiments import StudyOptions, box_methods
 from vplog.data import Boxes, Bytes, Floats
-from vplog.figures.canvas import as_text, saved_figure
+from vplog.run.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""What each section of report.html shows, computed from a finished run."""
+"""Content of each section of report.html, computed from a finished run."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class TruthComparison:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Where a run was, before and after."""
+    """Trajectories of a run before and after the solve."""
 
     keyframes: Keyframes
     world_from_body: Floats
@@ -73,7 +73,7 @@ class Tracks:
     """The odometry, laid on the first solved keyframe."""
     after: Trajectory
     found: McapContent
-    """What result.mcap holds beside."""
+    """Pictures, references and fixes in result.mcap."""
     earth: Earth | None
     """Where the trajectory is on earth, None without satellite fixes."""
 
@@ -83,7 +83,7 @@ class Content:
     """A finished run."""
 
     record: dict[str, Any]
-    """What run.json holds."""
+    """Content of run.json."""
     tracks: Tracks
     covariance: Floats
     """(N, 6, 6) of the solved keyframes, NaN where unknown."""
@@ -124,7 +124,7 @@ def page(content: Content) -> str:
 
 
 def _tiles(content: Content) -> list[tuple[str, str]]:
-    """The drive in seven numbers, each with what it counts."""
+    """The drive in seven numbers, each with its label."""
     path_m = float(np.linalg.norm(np.diff(content.tracks.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
     stamps = content.tracks.after.stamp_ns
     totals = mapping(content.record.get("totals"))
@@ -140,7 +140,7 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
 
 
 def _certainty(content: Content) -> list[str]:
-    """Whether the solution is the best there is for the closures kept, and how well keyframes are known."""
+    """The certificate of global optimality, and the uncertainty of the keyframes' positions."""
     found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
     known = content.covariance[np.isfinite(content.covariance).all((1, 2))]
     if len(known):
@@ -154,7 +154,7 @@ def _certainty(content: Content) -> list[str]:
 
 
 def _loss(loss: dict[str, Any], content: Content) -> list[str]:
-    """A row of what could not be read: how much, when, and why."""
+    """A row of the table of losses: messages, times in s, and the reason."""
     start_ns = int(content.tracks.keyframes.stamp_ns[0]) if len(content.tracks.keyframes.stamp_ns) else 0
     ends = [end for span in _list(loss.get("spans_ns")) for end in span]
     when = f"{(min(ends) - start_ns) / 1e9:.1f} to {(max(ends) - start_ns) / 1e9:.1f}" if ends else "-"
@@ -232,7 +232,7 @@ def _examples(content: Content) -> list[dict[str, Any]]:
 
 
 def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict[str, Any]:
-    """What the script of the page works on; `pictures` are the rows that have one in the page."""
+    """Data of the page's script; `pictures` are the ledger rows with a picture in the page."""
     closures, log = content.closures, content.record.get("log")
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
@@ -268,12 +268,12 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
 
 
 def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
-    """What JSON can hold: null where a value is not known."""
+    """Values for JSON: null where one is not known."""
     return [round(value, digits) if np.isfinite(value) else None for value in values.astype(np.float64).tolist()]
 
 
 def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
-    """What accepted and rejected candidates differ in, with the thresholds of the settings."""
+    """Distributions of accepted and rejected candidates, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
     taken = closures.of(*USED)

@@ -82,9 +82,10 @@
 
   // The map: metres to px by `view`; every closure is a dot of constant size at its query
   const canvas = $("map"), layer = document.createElement("canvas"), tip = $("tip"), xy = data.map.keyframes;
-  let view = null, hovered = -1, pen = null;
+  let view = null, fitted = true, hovered = -1, pen = null;
   const place = ([x, y]) => [view.x + x * view.scale, view.y - y * view.scale];
   const fit = () => {
+    fitted = true;
     const all = data.map.paths.flatMap((path) => path.points), width = canvas.clientWidth, height = canvas.clientHeight;
     const low = [0, 1].map((at) => all.reduce((least, p) => Math.min(least, p[at]), Infinity));
     const high = [0, 1].map((at) => all.reduce((most, p) => Math.max(most, p[at]), -Infinity));
@@ -92,6 +93,7 @@
     view = { scale, x: width / 2 - scale * (low[0] + high[0]) / 2, y: height / 2 + scale * (low[1] + high[1]) / 2 };
   };
   const zoom = (factor, x, y) => {
+    fitted = false;
     view = { scale: view.scale * factor, x: x + (view.x - x) * factor, y: y + (view.y - y) * factor };
     drawMap();
   };
@@ -184,7 +186,7 @@
       const apart = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);
       zoom(apart(event) / Math.max(apart(before), 1), other.clientX - left, other.clientY - top);
     } else if (moved > 4) {
-      view.x += event.clientX - before.clientX; view.y += event.clientY - before.clientY; drawMap();
+      fitted = false; view.x += event.clientX - before.clientX; view.y += event.clientY - before.clientY; drawMap();
     }
   });
   const lifted = (event) => {
@@ -259,7 +261,7 @@
   $("filter").addEventListener("change", order); $("search").addEventListener("input", order); $("colour").addEventListener("change", drawMap);
   for (const [id, factor] of [["zoom-in", 1.5], ["zoom-out", 1 / 1.5]]) $(id).addEventListener("click", () => zoom(factor, canvas.clientWidth / 2, canvas.clientHeight / 2));
   $("fit").addEventListener("click", () => { fit(); drawMap(); });
-  window.addEventListener("resize", () => { drawMap(); drawLedger(); });
+  window.addEventListener("resize", () => { if (fitted) fit(); drawMap(); drawLedger(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawMap);
   order();
 })();

@@ -15,11 +15,11 @@ from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.pose_refinement import Matches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
-from vplog.odometry.sensor import follow
+from vplog.run.visual_odometry.sensor import follow
 
 if TYPE_CHECKING:
     from vplog.data import Float32s, Floats, Frame
-    from vplog.odometry.sensor import Points, Sensor
+    from vplog.run.visual_odometry.sensor import Points, Sensor
 
 _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""
@@ -76,7 +76,7 @@ class Motion:
 
 
 def corners(frame: Frame, taken: Float32s) -> Float32s:
-    """(K, 2) px of corners away from those `taken`, the strongest first: as many as are left to _CORNERS."""
+    """(K, 2) px of corners at a distance from those `taken`, the strongest first: as many as are left to _CORNERS."""
     image = frame.image
     height, width = image.shape
     apart = _SPREAD * np.sqrt(width * height / _CORNERS)
@@ -118,8 +118,8 @@ def rematch(reference: Frame, frame: Frame, sensor: Sensor) -> tuple[Points, Poi
 def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion | None:
     """The motion by points `rows` (K,) of the reference, observed in a frame; None where they agree on none."""
     known = np.isfinite(np.column_stack([observed.rays, observed.noise.reshape(-1, 4)]))
-    seen = np.flatnonzero(known.all(axis=1))
-    rows, observed = rows[seen], observed.rows(seen)
+    valid = np.flatnonzero(known.all(axis=1))
+    rows, observed = rows[valid], observed.rows(valid)
     points = reference.points.rows(rows)
     near = _SETTINGS.ransac_px / sensor.focal_px
     found = find_pose(_cloud(points), observed.rays, near, _SETTINGS.ransac_rounds)
