@@ -94,7 +94,7 @@ def build_lists(references: Uint16s, weights: Bytes, boxes: Bytes, library_size:
     weight = weights.reshape(-1)[order]
     share = np.ceil(weight * np.float64(STEPS) / np.sqrt(square[row])).astype(np.uint8)
     offset = (row % block).astype(np.uint16)
-    return CodeLists(start, offset, weight, share, boxes.reshape(-1, windows)[order], square, block)
+    return CodeLists(start, offset, weight, share, np.take(boxes.reshape(-1, windows), order, 0), square, block)
 
 
 def check_lists(lists: CodeLists) -> None:
@@ -114,6 +114,7 @@ class CodeIndex:
     def __init__(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
         """`overlap` (256, 256) is the cells that two boxes share."""
         self._lists, self._overlap, self._windows = lists, overlap, lists.boxes.shape[1]
+        self._most = overlap.max(axis=1).astype(np.int64)
         self._comparison = (0,) * self._windows, _PAIRINGS[pairing], lists.block
         self._whole = int(overlap.max(initial=1)) * sum(_PAIRINGS[pairing]) * self._windows
         self._longest = int(np.diff(lists.start).max(initial=0))
@@ -157,29 +158,28 @@ class CodeIndex:
         lists = self._lists
         first, last = (0, self.blocks) if blocks is None else blocks
         extent = first, min(last, -(-self._end(stop) // lists.block)), self._end(stop)
-        query = self._query(descriptor)
-        _, weights, cells, _, scale = query
-        most = cells.max(axis=1, initial=0).sum(axis=1, dtype=np.int64)
-        # the query's side of the bound: each reference's weight times the most cells that its boxes can share
-        reach = np.ceil(weights * most * sum(self._comparison[1]) * STEPS / scale).astype(np.int32)
-        wanted = k, np.float32(least), reach
-        rows, score = _find_best(query, self._comparison, lists.parts, self._longest, extent, wanted, runs)
+        rows, score = _find_best(
+            self._query(descriptor), self._comparison, lists.parts, self._longest, extent, (k, np.float32(least)), runs
+        )
         order = np.lexsort((rows, -score))
         return Ranking(rows[order], score[order])
 
     def _end(self, stop: int | None) -> int:
         return len(self) if stop is None else max(min(stop, len(self)), 0)
 
-    def _query(self, descriptor: Place) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-        """The query's references in the library (Q,), their weights (Q,), the (Q, 256, words x 8) cells that a box of
-        any number shares with the box of each of the query's windows, their words, and what sums are divided by beside
-        the length of the place's own weights."""
+    def _query(self, descriptor: Place) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, float]:
+        """The query's references in the library (Q,), their weights (Q,), its side of the bound for each (Q,), the
+        (Q, 256, words x 8) cells that a box of any number shares with the box of each of the query's windows, their
+        words, and what sums are divided by beside the length of the place's own weights."""
         weights = descriptor.weights.astype(np.int64)
         used = np.flatnonzero(descriptor.references < len(self._lists.start))
-        cells = np.zeros((len(used), 256, -(-self._windows // _LANES) * _LANES), np.uint8)
-        cells[:, :, : self._windows] = self._overlap[descriptor.boxes[used]].transpose(0, 2, 1)
         scale = np.sqrt(max(int((weights**2).sum()), 1)) * self._whole
-        return descriptor.references[used].astype(np.int64), weights[used], cells, cells.view(np.uint64), scale
+        weights, boxes = weights[used], descriptor.boxes[used]
+        cells = np.zeros((len(used), 256, -(-self._windows // _LANES) * _LANES), np.uint8)
+        cells[:, :, : self._windows] = self._overlap[boxes].transpose(0, 2, 1)
+        most = self._most[boxes].sum(axis=1) * sum(self._comparison[1])
+        reach = np.ceil(weights * most * STEPS / scale).astype(np.int32)
+        return descriptor.references[used].astype(np.int64), weights, reach, cells, cells.view(np.uint64), scale
 
 
 @intrinsic
@@ -235,7 +235,7 @@ def _entries(start, offset, b, reference, rows):
 @numba.njit(cache=True, nogil=True)
 def _score_all(query, comparison, lists, result):
     """Write the scores of the first rows into `result`; `comparison` is windows, pairing and rows of a block."""
-    references, weights, cells, words, scale = query
+    references, weights, _, cells, words, scale = query
     windows, pairing, block = comparison
     start, offset, weight, _, coded, square = lists
     stop = result.shape[0]
@@ -259,11 +259,11 @@ def _score_all(query, comparison, lists, result):
 @numba.njit(cache=True, nogil=True)
 def _find_best(query, comparison, lists, longest, extent, wanted, drives):
     """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach the wanted score, in no order."""
-    references, weights, cells, words, scale = query
+    references, weights, reach, cells, words, scale = query
     windows, pairing, block = comparison
     start, offset, weight, share, coded, square = lists
     begin, end, stop = extent
-    k, worst, reach = wanted
+    k, worst = wanted
     runs, counts = drives
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
     bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores
