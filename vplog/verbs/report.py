@@ -76,6 +76,8 @@ def judge(
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
     path = se3.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
+    error_m = np.full(len(keyframes.stamp_ns), np.nan)
+    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, true) - solved, axis=1)
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,
@@ -85,6 +87,7 @@ def judge(
         judged.right | judged.wrong,
         judged.curves,
         judged.at_place,
+        error_m,
     )
 
 
