@@ -34,6 +34,7 @@ from vplog.results.landmark_table import LandmarkTable
 from vplog.run.landmarks import LANDMARKS, landmark_key, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
 from vplog.stages import CodedState, PlaceState
+from vplog.storage.json_records import plain
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
 from vplog.verbs.report import recorded_pipeline
@@ -200,7 +201,7 @@ def _map_landmarks(
     @contextmanager
     def drive() -> Iterator[Drive]:
         camera = known_camera(store, member, pipeline)
-        camera = camera or CameraTrust(run_record.plain(dict(vars(opened_log(member).camera()))), 0.0)
+        camera = camera or CameraTrust(plain(dict(vars(opened_log(member).camera()))), 0.0)
         with opened_drive(member, camera, member.pipeline.verify, execution) as (found, fetch):
             fetch(np.arange(len(found.keyframes.stamp_ns)))
             yield found

@@ -21,9 +21,9 @@ from vplog.data import ACCEPTED, Camera, Closures, Floats, Gps, Ints, Keyframes,
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
-from vplog.results.run_record import canonical_json
 from vplog.results.tables import TableMetadata, covariance_of
 from vplog.storage.image_file import image_size
+from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:

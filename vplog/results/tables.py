@@ -22,7 +22,7 @@ import vplog
 from vplog.data import Closures, EdgeKind, Floats, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
-from vplog.results.run_record import canonical_json
+from vplog.storage.json_records import canonical_json
 from vplog.storage.parquet_limits import (
     check_columns,
     filled,

@@ -5,17 +5,16 @@ from __future__ import annotations
 import struct
 from contextlib import suppress
 from functools import lru_cache
-from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from vplog.logs.messages.records import BadMessageError
-from vplog.storage.image_file import PNG, BadImageError, decode_image, image_size
+from vplog.storage.image_file import PNG, BadImageError, decode_image
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
     from vplog.data import Bytes, Float32s
     from vplog.logs.formats.container import Octets
@@ -131,22 +130,17 @@ def _grey_table(levels: Levels) -> Bytes:
     return np.clip(np.rint(spread), 0, 255).astype(np.uint8)
 
 
-def sixteen_bits(message: ImageMessage) -> bool:
-    """Whether its pixels have 16 bits, without decoding them."""
-    if not message.compressed:
-        return message.encoding in _LAYOUTS and _LAYOUTS[message.encoding][0] == "u2"
-    return message.data[:8] == PNG and bytes(message.data[24:25]) == b"\x10"
-
-
 def levels_of(messages: Iterable[ImageMessage]) -> Levels | None:
     """The levels that all but _CLIPPED of the pixels lie within; a grey is one value at least, so that noise is not
-    stretched. None where no image decodes to 16 bits."""
+    stretched. None where the first image that decodes has not 16 bits."""
     counts = np.zeros(2**16, np.int64)
     for message in messages:
         with suppress(BadMessageError):
             pixels, _ = _pixels(message)
             if pixels.dtype == np.uint16:
                 counts += np.bincount(pixels.ravel(), minlength=2**16)
+            elif not counts.any():
+                break
     if not counts.any():
         return None
     share = np.cumsum(counts) / counts.sum()
@@ -157,12 +151,6 @@ def levels_of(messages: Iterable[ImageMessage]) -> Levels | None:
 def spread(count: int) -> int:
     """The step at which _SAMPLED images, about, lie over a drive of `count`."""
     return max(-(-count // _SAMPLED), 1)
-
-
-def drive_levels(messages: Iterator[ImageMessage]) -> Levels | None:
-    """The levels of sampled images of a drive; None where the first whole one has not 16 bits."""
-    first = next((message for message in messages if not message.compressed or image_size(message.data)), None)
-    return levels_of(chain([first], messages)) if first is not None and sixteen_bits(first) else None
 
 
 def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:

@@ -13,6 +13,7 @@ from vplog.features.matching import MatchSettings, match_features
 from vplog.features.sift import SiftSettings
 from vplog.geometry import se3
 from vplog.loops import undistort
+from vplog.loops.pose_refinement import Matches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
 from vplog.run.visual_odometry.sensor import follow
 
@@ -125,10 +126,8 @@ def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sens
     if found is None:
         return None
     xyrho = np.column_stack([points.rays, points.rho])
-    matches = (
-        xyrho, reference.covariance[rows], observed.rays, observed.rho, np.nan_to_num(observed.variance),
-        observed.noise,
-    )  # fmt: skip
+    variance = np.nan_to_num(observed.variance)
+    matches = Matches(xyrho, reference.covariance[rows], observed.rays, observed.noise, observed.rho, variance)
     most = _SETTINGS.max_error_px / sensor.pixel_sigma
     pose, hessian, excess, inlier = refit(se3.inverse(found[0]), found[1], matches, most)
     count, area = int(inlier.sum()), float(sensor.camera.width * sensor.camera.height)
