@@ -10,12 +10,12 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Bytes, Features, Gps, Ints
-from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
+from vplog.errors import LibraryError, ResultError, TruthError
 from vplog.evaluate.closures import closure_sentences
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.geometry import se3
-from vplog.pipeline import Pipeline
+from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
 from vplog.results.report.page import TruthComparison
@@ -136,11 +136,3 @@ def recorded_places(
                 f"{original(library)} is not the library of the run in {folder}, so its boxes cannot be drawn."
             )
     return state, column
-
-
-def recorded_pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
-    """The settings of a run. Raises ResultError."""
-    try:
-        return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
-    except SettingsError as error:
-        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None
