@@ -147,7 +147,13 @@ local_file = _local("file")
 
 def output_file(text: str) -> Path:
     """A single local file that is written, and no input of anything."""
-    path = local_file(text)
+    path = _replaceable(local_file(text))
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{path} is a folder: name a file")
+    return path
+
+
+def _replaceable(path: Path) -> Path:
     if path.is_file():
         from vplog.run.run_folder import check_output
 
@@ -158,9 +164,9 @@ def output_file(text: str) -> Path:
     return path
 
 
-def output_file_or_stdout(text: str) -> Path:
-    """A single local file, or `-`, the standard output."""
-    return STDOUT if text == "-" else output_file(text)
+def output_or_stdout(text: str) -> Path:
+    """A single local file or a folder, or `-`, the standard output."""
+    return STDOUT if text == "-" else _replaceable(local(text))
 
 
 def _path(text: str) -> Path:
