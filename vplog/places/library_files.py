@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -49,11 +49,22 @@ def check_descriptors(references: Sequence[Reference], features: Features) -> No
 class RelearnedSettings(Settings):
     """Settings of a recogniser that is saved as its references."""
 
+    def prepare(self, references: Iterable[Reference], execution: Execution) -> Any:
+        """The state of a saved library."""
+        return self.learn(references, execution)  # pyright: ignore[reportAttributeAccessIssue]
+
     def load(self, folder: Path, execution: Execution) -> Any:
-        """A library saved by its state, whose own settings count, but for where files are now. Raises LibraryError
-        where it is damaged or gives another hash."""
+        """The state of a library saved by `save_references`, whose own settings count, but for where files are now.
+        Raises LibraryError where it is damaged or gives another hash."""
+        record = read_library_record(folder)
+        own = type(self).read(record["settings"], f"{folder}/library.json")
         here = {name: place for name in self.LOCATIONS if (place := getattr(self, name))}
-        return relearn(type(self), folder, execution, lambda own, *rest: own.model_copy(update=here).learn(*rest))
+        state = own.model_copy(update=here).prepare(load_references(folder, execution), execution)
+        if state.hash != record["hash"]:
+            raise LibraryError(
+                f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
+            )
+        return state
 
 
 class ReferencesState:
@@ -80,19 +91,6 @@ def keep_references(references: Iterable[Reference], features: int | None = None
     if not found:
         raise LibraryError("A library needs at least one reference image; none was given.")
     return found
-
-
-def relearn(settings: Any, folder: Path, execution: Execution, learn: Callable[..., Any] | None = None) -> Any:
-    """State of a folder written by `save_references`, whose own settings count; `settings` is their class, and `learn`
-    its method that makes the state. Raises LibraryError where the folder is damaged or gives another hash."""
-    record = read_library_record(folder)
-    own = settings.read(record["settings"], f"{folder}/library.json")
-    state = (learn or settings.learn)(own, load_references(folder, execution), execution)
-    if state.hash != record["hash"]:
-        raise LibraryError(
-            f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
-        )
-    return state
 
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:

@@ -49,7 +49,7 @@ _TWO_DRIVES = {
     "library": "which drive the library comes from",
     "conditions": "a change of condition between drives",
 }
-"""What these experiments need two drives for."""
+"""Subject of the experiments that need two drives."""
 _SCORES = ("vplog.benchmark.study.evaluation_store", "vplog.benchmark.recogniser_specs")
 """Modules that the scores of an evaluation depend on, with all that these import."""
 
@@ -92,8 +92,8 @@ def study(
             "min_gap": min_gap,
             "truth_hash": _truth_hash(truth),
         }
-        kept = options.cache.open() or scratch
-        folders = [FeatureFolder.of(kept, path, topics, pipeline.features) for path in drives]
+        cached = options.cache.open() or scratch
+        folders = [FeatureFolder.of(cached, path, topics, pipeline.features) for path in drives]
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
             {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
