@@ -162,6 +162,9 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("run --closuer none A", "no option --closuer. Did you mean --closure of vplog explain?"),
         ("run A -o OUT --topic /cam", "Write it in full: --image-topic, --depth-topic,"),
         ("help fly", "Verbs: info"),
+        ("query MAP LOG", "Did you mean vplog map query?"),
+        ("run A -o OUT \u2014resume", "\u2014resume begins with another dash. Write --resume"),
+        ("run A -o OUT --resume=yes", "argument --resume: takes no value, not 'yes'"),
         ("run -o OUT", "LOG"),
     ],
 )

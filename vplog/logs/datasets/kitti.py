@@ -47,7 +47,9 @@ def read(path: Path) -> DataSet:
         files = image_files(path / name)
         if rows := [int(file.stem) for file in files if file.stem.isdecimal()]:
             if max(rows) >= len(stamp_ns):
-                raise LogError(f"{path / name} has an image {max(rows)}, and times.txt {len(stamp_ns)} rows only.")
+                raise LogError(
+                    f"{path / name} has an image {max(rows)}, times.txt {len(stamp_ns)} rows. Copy it again."
+                )
             streams += camera_streams(name, stamp_ns[rows], files, cameras.get(name))
     return DataSet("kitti", streams, _truth(path, stamp_ns))
 
