@@ -179,6 +179,7 @@ def info(arguments: argparse.Namespace) -> None:
 
 def library(arguments: argparse.Namespace) -> None:
     """Build a reference library from frames of logs."""
+    from vplog.places.library_files import read_library_record
     from vplog.run.reference_library import build_library
 
     pipeline, warnings = pipeline_of(arguments), []
@@ -187,7 +188,7 @@ def library(arguments: argparse.Namespace) -> None:
             arguments.logs, arguments.output, pipeline, topics_of(arguments), Execution(arguments.threads, progress),
             warnings.append, force=arguments.force,
         )  # fmt: skip
-    record = json.loads((arguments.output / "library.json").read_text(encoding="utf-8"))
+    record = read_library_record(arguments.output)
     if arguments.json:
         print_json({"library": str(arguments.output), **record, "descriptor_bits": state.bits, "warnings": warnings})
         return

@@ -157,7 +157,13 @@ local_file = _local("file")
 
 def output_file(text: str) -> Path:
     """A single local file that is written, and no input of anything."""
-    path = local_file(text)
+    path = _replaceable(local_file(text))
+    if os.path.isdir(path):  # noqa: PTH112 (false for a name that is too long)
+        raise argparse.ArgumentTypeError(f"{path} is a folder: name a file")
+    return path
+
+
+def _replaceable(path: Path) -> Path:
     if os.path.isfile(path):  # noqa: PTH113
         from vplog.run.run_folder import check_output
 
@@ -168,9 +174,9 @@ def output_file(text: str) -> Path:
     return path
 
 
-def output_file_or_stdout(text: str) -> Path:
-    """A single local file, or `-`, the standard output."""
-    return STDOUT if text == "-" else output_file(text)
+def output_or_stdout(text: str) -> Path:
+    """A single local file or a folder, or `-`, the standard output."""
+    return STDOUT if text == "-" else _replaceable(local(text))
 
 
 def _path(text: str) -> Path:

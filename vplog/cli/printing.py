@@ -554,6 +554,6 @@ def print_result(
 
 
 def print_json(tree: dict[str, Any]) -> None:
-    from vplog.results.run_record import plain
+    from vplog.storage.json_records import plain
 
     print(json.dumps(plain(tree), indent=2, ensure_ascii=False, allow_nan=False))

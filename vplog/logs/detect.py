@@ -251,6 +251,7 @@ def _by_name(path: Path) -> tuple:
 def _images_in(path: Path, files: list[Path]) -> tuple[list[Path], set[Path]] | None:
     """The images among the files of a folder, or else of the folders below it, and those of them that are only named
     like images; None where there are none."""
+    files = [file for file in files if not file.name.startswith(".")]
     images = [file for file in files if image_folder.is_image(file)]
     if not images:
         files = [file for file in _files_below(path) if not file.name.startswith(".")]
