@@ -187,7 +187,7 @@ def test_a_name_that_is_too_long_or_has_line_ends_is_an_error_in_one_line(
     assert said.code == 2 or not usage
 
 
-@pytest.mark.parametrize("words", ["info s3://", "diff A gs:///run", "report A --truth http://", "run https://?a -o B"])
+@pytest.mark.parametrize("words", ["info s3://", "diff A gs:///run", "batch http:// -o B", "run https://?a -o B"])
 def test_a_url_without_a_server_is_refused(verb: Verb, words: str) -> None:
     said = verb(*words.split())
     assert said.code in (1, 2)
